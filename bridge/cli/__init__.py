@@ -1,0 +1,92 @@
+"""The command ``macs``: one module per verb, each with ``SUMMARY``, ``add_arguments(parser)`` and ``run(args)``.
+
+Data goes to stdout, logs to stderr. Exit code 0: done; 1: not found, unreachable, unhealthy; 2: wrong usage or
+configuration. A verb imports what is heavy (zenoh, rclpy, rosbags) inside ``run``, so that help is instant.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+
+from bridge.cli import agent, gateway, headset, keys, ls, options, router, up
+from macs_zenoh.errors import ConfigError, MacsError, UsageError
+
+VERBS = {
+    "up": up,
+    "router": router,
+    "gateway": gateway,
+    "agent": agent,
+    "headset": headset,
+    "ls": ls,
+    "keys": keys,
+}
+
+DESCRIPTION = """\
+ROS 2 robots and XR headsets on one Zenoh mesh, reached by id, by group or all at once.
+
+A robot joins with `macs agent` beside its ROS 2 graph. A headset opens a TCP connection
+to a `macs gateway`. Both find each other through a `macs router` (or any Zenoh router).
+`macs up` starts all three on this machine."""
+
+EXAMPLES = """\
+examples:
+  macs up --demo                                     everything on this machine, with a demo robot
+  macs agent --id 7 -e tcp/192.168.1.10:7447         this machine's ROS 2 graph is robot 7
+  macs ls -e tcp/192.168.1.10:7447                   who is online there
+
+`macs VERB --help` explains one verb."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="macs", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--version", action="version", version=f"macs-zenoh {_version()}")
+    verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True, title="verbs")
+    for name, module in VERBS.items():
+        verb = verbs.add_parser(
+            name,
+            help=module.SUMMARY,
+            description=module.__doc__,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        options.add_log_options(verb)
+        module.add_arguments(verb)
+        verb.set_defaults(run=module.run)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb; what a user can cause ends in one line on stderr, never in a traceback."""
+    args = build_parser().parse_args(argv)
+    options.start_logging(args)
+    try:
+        code: int = args.run(args)
+        sys.stdout.flush()
+    except (ConfigError, UsageError) as error:
+        return _fail(args.verb, error, 2)
+    except MacsError as error:
+        return _fail(args.verb, error, 1)
+    except BrokenPipeError:
+        # The reader of our output left, as `head` does. Python would complain once more at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return code
+
+
+def _fail(verb: str, error: Exception, code: int) -> int:
+    sys.stderr.write(f"macs {verb}: {error}\n")
+    return code
+
+
+def _version() -> str:
+    try:
+        return version("macs-zenoh")
+    except PackageNotFoundError:
+        return "(not installed)"

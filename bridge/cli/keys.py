@@ -1,0 +1,88 @@
+"""Print the key map: who puts what where on the mesh. With KEY, explain one concrete key.
+
+examples:
+  macs keys
+  macs keys macs/to/ros/0/7/unity/9
+  macs keys --json | jq -r '.[].key'"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from macs_zenoh import keyexpr
+from macs_zenoh.keyexpr import Key
+
+SUMMARY = "the key map, or what one key means"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("key", metavar="KEY", nargs="?", help="a concrete key, without wildcards and namespace")
+    parser.add_argument("--json", action="store_true", help="for programs")
+
+
+def run(args: argparse.Namespace) -> int:
+    if args.key is not None:
+        return _explain(args.key, as_json=args.json)
+    rows = [_row(plane, space) for plane, space in keyexpr.KEYS.items()]
+    if args.json:
+        _print(json.dumps(rows, indent=2))
+    else:
+        _print(_table(rows))
+    return 0
+
+
+def _row(plane: str, space: Key) -> dict[str, str]:
+    return {
+        "plane": plane,
+        "key": space.template,
+        "publisher": space.publisher,
+        "subscriber": space.subscriber,
+        "payload": space.payload,
+    }
+
+
+def _table(rows: list[dict[str, str]]) -> str:
+    """Plane and key in columns, the sentences below each: they do not fit beside it on a terminal."""
+    width = max(len(row["plane"]) for row in rows) + 2
+    blocks = (
+        "\n".join(
+            [
+                f"{row['plane']:{width}}{row['key']}",
+                f"{'':{width}}  from     {row['publisher']}",
+                f"{'':{width}}  to       {row['subscriber']}",
+                f"{'':{width}}  payload  {row['payload']}",
+            ]
+        )
+        for row in rows
+    )
+    return "\n".join(blocks)
+
+
+def _explain(key: str, *, as_json: bool) -> int:
+    known = keyexpr.parse(key)
+    if known is None:
+        sys.stderr.write(f"macs keys: {key!r} is no concrete key of this mesh (`macs keys` lists them)\n")
+        return 1
+    plane, fields = known
+    space = keyexpr.KEYS[plane]
+    if as_json:
+        _print(json.dumps({**_row(plane, space), "fields": fields}))
+        return 0
+    lines = [f"{plane}: {space.template}"]
+    lines += [f"  {name:10}{_shown(name, value)}" for name, value in fields.items()]
+    lines += [f"from {space.publisher}", f"to {space.subscriber}", f"payload: {space.payload}"]
+    _print("\n".join(lines))
+    return 0
+
+
+def _shown(name: str, value: int | str) -> str:
+    """A type by number as well, since that is what frames carry."""
+    if name.endswith("type") and isinstance(value, int):
+        return f"{keyexpr.type_name(value)} (type {value})"
+    return str(value)
+
+
+def _print(text: str) -> None:
+    sys.stdout.write(text + "\n")

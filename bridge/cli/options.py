@@ -1,0 +1,60 @@
+"""Options that several verbs share, and how they, a settings file and the environment become settings.
+
+The Zenoh options are spelled as Zenoh's own tools spell them. An option wins over the settings file; a Zenoh
+configuration file (``-c``) wins over our defaults, and ``--cfg`` over everything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+
+from macs_zenoh import config
+from macs_zenoh.config import Settings
+
+
+def add_log_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-v", "--verbose", action="store_true", help="log more (Zenoh's own log: RUST_LOG=debug)")
+
+
+def add_settings_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--settings", metavar="FILE", help="our settings file (TOML), see config/macs.toml")
+
+
+def add_mesh_options(parser: argparse.ArgumentParser, *, modes: tuple[str, ...] = ("client", "peer")) -> None:
+    """``modes``: those that make sense for the verb; none means that its mode is fixed."""
+    add_settings_option(parser)
+    zenoh = parser.add_argument_group("Zenoh options")
+    zenoh.add_argument("-c", "--config", metavar="FILE", help="Zenoh configuration (JSON5); default: $ZENOH_CONFIG")
+    if modes:
+        zenoh.add_argument("-m", "--mode", choices=modes, help="how to join the mesh (default: client)")
+    zenoh.add_argument(
+        "-e", "--connect", metavar="ENDPOINT", action="append", help="router, as tcp/HOST:7447; repeat for fail-over"
+    )
+    zenoh.add_argument("-l", "--listen", metavar="ENDPOINT", action="append", help="where to accept Zenoh sessions")
+    zenoh.add_argument(
+        "--cfg", metavar="PATH:JSON5", action="append", help="set one value, as transport/link/tx/lease:5000"
+    )
+    zenoh.add_argument("--namespace", metavar="KEY", help="put before every key: several meshes on one router")
+
+
+def settings(args: argparse.Namespace) -> Settings:
+    """The settings file, changed by the options given. Raises `ConfigError`."""
+    base = config.load(args.settings) if args.settings else Settings()
+    mesh = config.changed(
+        base.mesh,
+        mode=getattr(args, "mode", None),
+        connect=args.connect,
+        listen=args.listen,
+        config_file=args.config or base.mesh.config_file or os.environ.get("ZENOH_CONFIG"),
+        overrides=[*base.mesh.overrides, *args.cfg] if args.cfg else None,
+        namespace=args.namespace,
+    )
+    return config.changed(base, mesh=mesh)
+
+
+def start_logging(args: argparse.Namespace) -> None:
+    """Log ``macs.*`` to stderr, one short line each; other libraries only from WARNING on."""
+    logging.basicConfig(format="%(asctime)s %(levelname).1s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    logging.getLogger("macs").setLevel(logging.DEBUG if args.verbose else logging.INFO)

@@ -1,0 +1,63 @@
+"""Running a verb that goes on until somebody stops it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+STOP_WITH_STDIN = "MACS_STOP_WITH_STDIN"
+"""Set by ``macs up`` for its children: end of stdin means that it is gone, however it went."""
+
+
+def until_stopped(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
+    """Run ``work`` to its end and return its exit code; SIGINT and SIGTERM cancel it, which is a success (0).
+
+    A second Ctrl-C ends the process at once, for whoever does not want to wait for a clean close.
+    """
+    loop = _new_loop()
+    try:
+        asyncio.set_event_loop(loop)
+        return loop.run_until_complete(_stoppable(work))
+    finally:
+        loop.run_until_complete(loop.shutdown_asyncgens())
+        asyncio.set_event_loop(None)
+        loop.close()
+
+
+async def _stoppable(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
+    loop = asyncio.get_running_loop()
+    task = loop.create_task(work())
+
+    def interrupt() -> None:
+        loop.add_signal_handler(signal.SIGINT, os._exit, 130)
+        task.cancel()
+
+    loop.add_signal_handler(signal.SIGINT, interrupt)
+    # Not twice as for Ctrl-C: under systemd a child of `macs up` gets one SIGTERM from each of the two.
+    loop.add_signal_handler(signal.SIGTERM, task.cancel)
+    if os.environ.pop(STOP_WITH_STDIN, None):
+        loop.add_reader(sys.stdin.fileno(), _stop_at_end_of_stdin, loop, task)
+    try:
+        return await task
+    except asyncio.CancelledError:
+        return 0
+
+
+def _stop_at_end_of_stdin(loop: asyncio.AbstractEventLoop, task: asyncio.Task[int]) -> None:
+    if not os.read(sys.stdin.fileno(), 4096):
+        loop.remove_reader(sys.stdin.fileno())
+        task.cancel()
+
+
+def _new_loop() -> asyncio.AbstractEventLoop:
+    """uvloop where it exists: it doubles what a gateway can pass on."""
+    try:
+        import uvloop
+    except ImportError:
+        return asyncio.new_event_loop()
+    loop: asyncio.AbstractEventLoop = uvloop.new_event_loop()
+    return loop

@@ -1,0 +1,538 @@
+"""A headset as an asyncio client: it speaks over TCP exactly what the C# Unity program speaks.
+
+::
+
+    async with await Headset.connect("127.0.0.1", 7000, group=3) as headset:
+        robots = (await headset.online()).ros_agent_ids
+        images = await headset.subscribe("/camera", "sensor_msgs/CompressedImage", agents=robots)
+        await headset.publish("/cmd_vel", "geometry_msgs/Twist", cdr, agents=[1])
+        answer = await headset.call("/set", "std_srvs/SetBool", 1, request_cdr)
+        async for message in images:
+            print(message.sender_id, len(message.data))
+
+Messages of ROS are CDR bytes here; `bridge.headset.typed` turns them into Python and back. One task reads the
+socket and never waits for a slow taker: every queue is bounded and counts what it drops.
+
+Where the C# program is faulty this one is not: it takes groups off groups (the C# sends their numbers as
+agents), it survives bad messages (and counts them), it notices the end of a connection, and it can reconnect.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from types import TracebackType
+
+from macs_zenoh.errors import CallTimeout, Unreachable, UsageError, WireError
+from macs_zenoh.messages import BROADCAST, ROS, Metadata, NodeType, OnlineReply, Welcome, decode_data, node_name
+from macs_zenoh.wire import MAX_FRAME_BYTES, split_message
+
+from . import frames
+from .connection import Connection
+from .frames import DEFAULT_BUFFER_SIZE, NodeSpec
+from .mailbox import Mailbox
+from .nodes import (
+    REQUEST_IDS,
+    Incoming,
+    Node,
+    Publisher,
+    Service,
+    ServiceClient,
+    ServiceHandler,
+    Subscription,
+    fail_all,
+)
+
+log = logging.getLogger("macs.headset")
+
+HANDSHAKE_S = 5.0
+"""How long a headset waits for its connection and for the router's first message."""
+HEARTBEAT_S = 5.0
+"""After so long without other output a headset sends a heartbeat."""
+RETRY_S = (0.1, 0.2, 0.5, 1.0, 2.0)
+"""Waiting times between attempts to reconnect; the last one repeats."""
+INBOX_MESSAGES = 1000
+"""How many messages outside interface nodes are held for a taker."""
+
+_GOODBYE_S = 1.0
+
+
+@dataclass(frozen=True)
+class Link:
+    """What `Headset.on_link` hears: the connection came up (with this id) or ended (and why)."""
+
+    up: bool
+    agent_id: int
+    why: str = ""
+
+
+class Headset:
+    """One headset on one TCP connection to a router or gateway. Made by `connect`."""
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        group: int = 0,
+        reconnect: bool = False,
+        handshake_s: float = HANDSHAKE_S,
+        heartbeat_s: float = HEARTBEAT_S,
+        max_message_bytes: int = MAX_FRAME_BYTES,
+        on_link: Callable[[Link], object] | None = None,
+    ) -> None:
+        self.host = host
+        self.port = port
+        self.group = group
+        self.id = 0
+        self.bad_messages = 0
+        self._reconnect = reconnect
+        self._handshake_s = handshake_s
+        self._heartbeat_s = heartbeat_s
+        self._max_message_bytes = max_message_bytes
+        self._on_link = on_link
+        self._nodes: dict[tuple[int, str], Node] = {}
+        self._inbox: Mailbox[Incoming] = Mailbox(INBOX_MESSAGES)
+        self._connection: Connection | None = None
+        self._welcome_request = 0
+        self._next_request = 0
+        self._open: dict[int, asyncio.Future[bytes]] = {}
+        self._reading = asyncio.Event()
+        self._reading.set()
+        self._ended = asyncio.Event()
+        self._why = ""
+        self._tasks: list[asyncio.Task[None]] = []
+
+    @classmethod
+    async def connect(
+        cls,
+        host: str,
+        port: int,
+        *,
+        group: int = 0,
+        reconnect: bool = False,
+        handshake_s: float = HANDSHAKE_S,
+        heartbeat_s: float = HEARTBEAT_S,
+        max_message_bytes: int = MAX_FRAME_BYTES,
+        on_link: Callable[[Link], object] | None = None,
+    ) -> Headset:
+        """Connect, wait for the router's first message and answer it.
+
+        ``group`` 0 is none. With ``reconnect`` a lost connection is made again and again until `close`, and every
+        node is registered anew; the first connection is tried once. ``on_link`` hears every start and end.
+
+        Raises Unreachable when there is no connection, or no id as its first message within ``handshake_s``.
+        """
+        headset = cls(
+            host,
+            port,
+            group=group,
+            reconnect=reconnect,
+            handshake_s=handshake_s,
+            heartbeat_s=heartbeat_s,
+            max_message_bytes=max_message_bytes,
+            on_link=on_link,
+        )
+        await headset._join()
+        loop = asyncio.get_running_loop()
+        headset._tasks = [loop.create_task(headset._live()), loop.create_task(headset._beat())]
+        return headset
+
+    async def __aenter__(self) -> Headset:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    @property
+    def target(self) -> str:
+        """``host:port`` of the router."""
+        return f"{self.host}:{self.port}"
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a configured connection now."""
+        return self._connection is not None
+
+    @property
+    def nodes(self) -> list[Node]:
+        """The interface nodes that this headset has asked for."""
+        return list(self._nodes.values())
+
+    @property
+    def dropped(self) -> int:
+        """How many messages outside nodes were dropped because nobody took them."""
+        return self._inbox.dropped
+
+    # --- what a headset says ---
+
+    async def online(self, timeout_s: float = 5.0) -> OnlineReply:
+        """Ask who is online: ids of robots and of headsets. Raises CallTimeout or Unreachable."""
+        request_id = self._next_request
+        self._next_request = (request_id + 1) % REQUEST_IDS
+        answer = asyncio.get_running_loop().create_future()
+        self._open[request_id] = answer
+        try:
+            await self.send_frame(frames.online_request(self.id, request_id))
+            return decode_data(OnlineReply, await asyncio.wait_for(answer, timeout_s))
+        except asyncio.TimeoutError as error:
+            raise CallTimeout(f"router {self.target}", timeout_s) from error
+        finally:
+            del self._open[request_id]
+
+    async def subscribe(
+        self,
+        topic: str,
+        data_type: str,
+        *,
+        agents: Collection[int] = (),
+        groups: Collection[int] = (),
+        buffer_size: int = DEFAULT_BUFFER_SIZE,
+        drop_new: bool = False,
+        callback: Callable[[Incoming], object] | None = None,
+    ) -> Subscription:
+        """Receive a topic of these robots. ``callback`` runs in the reading task; without one, iterate.
+
+        ``buffer_size`` and ``drop_new`` go to robot and gateway and hold for the queue here. Raises UsageError
+        when this topic is subscribed already: `Node.register` adds robots to what is there.
+        """
+        spec = NodeSpec(NodeType.SUBSCRIBER, topic, data_type, buffer_size, drop_new)
+        node = Subscription(self, spec, callback)
+        self._add(node)
+        await node.register(agents=agents, groups=groups)
+        return node
+
+    async def advertise(
+        self,
+        topic: str,
+        data_type: str,
+        *,
+        agents: Collection[int] = (),
+        groups: Collection[int] = (),
+        buffer_size: int = DEFAULT_BUFFER_SIZE,
+        latched: bool = False,
+    ) -> Publisher:
+        """Ask these robots for a publisher of this topic. A topic advertised already gets the new robots added."""
+        node = self._nodes.get((NodeType.PUBLISHER, node_name(topic)))
+        if not isinstance(node, Publisher):
+            spec = NodeSpec(NodeType.PUBLISHER, topic, data_type, buffer_size, latched=latched)
+            node = Publisher(self, spec)
+            self._add(node)
+        await node.register(agents=agents, groups=groups)
+        return node
+
+    async def publish(
+        self,
+        topic: str,
+        data_type: str,
+        cdr: bytes,
+        *,
+        agents: Collection[int] = (),
+        groups: Collection[int] = (),
+    ) -> None:
+        """Publish one message, after registering where that is still to be done.
+
+        A robot needs a moment to make the publisher and ROS another to find its subscribers, so the very first
+        message may find nobody; keep an `advertise`d Publisher where that matters.
+        """
+        node = await self.advertise(topic, data_type, agents=agents, groups=groups)
+        await node.publish(cdr, agents=agents, groups=groups)
+
+    async def call(self, service: str, data_type: str, agent: int, request: bytes, *, timeout_s: float = 5.0) -> bytes:
+        """Call a service that runs on a robot; the response is CDR. Raises CallTimeout or Unreachable."""
+        node = self._nodes.get((NodeType.CLIENT, node_name(service)))
+        if not isinstance(node, ServiceClient):
+            # the C# program asks for dropNew with both kinds of services
+            node = ServiceClient(self, NodeSpec(NodeType.CLIENT, service, data_type, drop_new=True))
+            self._add(node)
+        await node.register(agents=(agent,))
+        return await node.call(agent, request, timeout_s)
+
+    async def serve(
+        self,
+        service: str,
+        data_type: str,
+        handler: ServiceHandler,
+        *,
+        agents: Collection[int] = (),
+        groups: Collection[int] = (),
+    ) -> Service:
+        """Run a service for ROS nodes on these robots. ``handler`` takes a request and gives the response's CDR."""
+        node = Service(self, NodeSpec(NodeType.SERVICE, service, data_type, drop_new=True), handler)
+        self._add(node)
+        await node.register(agents=agents, groups=groups)
+        return node
+
+    async def send(
+        self,
+        data: bytes,
+        *,
+        to: int = BROADCAST,
+        ids: Collection[int] = (),
+        groups: Collection[int] = (),
+        manager: str = "",
+        request_id: int = 0,
+    ) -> None:
+        """Send data to agents of type ``to`` (1 robots, 2 headsets, 0 everybody) by id and by group.
+
+        Raises Unreachable, TooManyDestinations or OutOfRange.
+        """
+        await self.send_frame(
+            frames.plain_data(
+                self.id, data, to_type=to, ids=ids, groups=groups, manager=manager, request_id=request_id
+            )
+        )
+
+    async def send_frame(self, frame: bytes) -> None:
+        """Send bytes as they are, also what no headset would say. Raises Unreachable without a connection."""
+        if self._connection is None:
+            raise Unreachable(self.target, self._why or "the connection is lost")
+        await self._connection.send(frame)
+
+    async def set_group(self, group: int) -> None:
+        """Move to another group: a second configuration reply on the same connection."""
+        self.group = group
+        await self.tell(lambda own_id: frames.configuration(own_id, group, self._welcome_request))
+
+    # --- what a headset hears ---
+
+    def __aiter__(self) -> Headset:
+        return self
+
+    async def __anext__(self) -> Incoming:
+        """The next message that belongs to no node and answers no request."""
+        return await self._inbox.__anext__()
+
+    async def receive(self, timeout_s: float | None = None) -> Incoming:
+        """The next message that belongs to no node and answers no request.
+
+        Raises CallTimeout after ``timeout_s``, Unreachable when the headset is closed and all is taken.
+        """
+        try:
+            return await asyncio.wait_for(self.__anext__(), timeout_s)
+        except asyncio.TimeoutError as error:
+            raise CallTimeout(f"a message from {self.target}", timeout_s or 0.0) from error
+        except StopAsyncIteration:
+            raise Unreachable(self.target, self._why) from None
+
+    def pause(self) -> None:
+        """Stop reading the socket, as a headset that renders no frames; heartbeats go on."""
+        self._reading.clear()
+
+    def resume(self) -> None:
+        """Read again after `pause`."""
+        self._reading.set()
+
+    # --- its end ---
+
+    async def wait_ended(self) -> str:
+        """Wait until the headset is closed, or has lost its connection for good; tells why."""
+        await self._ended.wait()
+        return self._why
+
+    async def go_offline(self) -> None:
+        """Say that we leave, and close."""
+        await self._stop(say_goodbye=True)
+
+    async def close(self) -> None:
+        """Go offline if there is a connection, and end every task. Can be called twice."""
+        await self._stop(say_goodbye=True)
+
+    async def abort(self) -> None:
+        """Vanish without a word, as a headset that lost power."""
+        await self._stop(say_goodbye=False)
+
+    def drop_connection(self) -> None:
+        """Cut the connection but live on: with ``reconnect`` a new one is made."""
+        if self._connection is not None:
+            self._connection.abort()
+
+    async def _stop(self, *, say_goodbye: bool) -> None:
+        if not self._ended.is_set():
+            self._finish("closed here")
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._tasks.clear()
+        connection, self._connection = self._connection, None
+        if connection is None:
+            return
+        if not say_goodbye:
+            connection.abort()
+            return
+        with contextlib.suppress(Unreachable, asyncio.TimeoutError):
+            await asyncio.wait_for(connection.send(frames.go_offline(self.id)), _GOODBYE_S)
+        await connection.close()
+
+    # --- inside ---
+
+    async def _join(self) -> None:
+        connection = await Connection.open(
+            self.host, self.port, timeout_s=self._handshake_s, max_message_bytes=self._max_message_bytes
+        )
+        try:
+            first = await asyncio.wait_for(connection.receive(), self._handshake_s)
+            metadata, data = split_message(first)
+            self._take_id(Metadata.decode(metadata), bytes(data))
+            await connection.send(frames.configuration(self.id, self.group, self._welcome_request))
+        except asyncio.TimeoutError as error:
+            connection.abort()
+            raise Unreachable(self.target, f"it sent no id within {self._handshake_s:g} s") from error
+        except WireError as error:
+            connection.abort()
+            raise Unreachable(self.target, f"its first message gives no id: {error}") from error
+        except BaseException:
+            connection.abort()
+            raise
+        self._connection = connection
+        log.info("online at %s with id %d", self.target, self.id)
+        self._tell_link(Link(True, self.id))
+
+    def _take_id(self, metadata: Metadata, data: bytes) -> None:
+        if metadata.message_manager != Welcome.manager:
+            raise WireError(f"it is {metadata.message_manager or metadata.node_name!r}, not {Welcome.manager!r}")
+        self.id = decode_data(Welcome, data).agent_id
+        self._welcome_request = metadata.request_id
+
+    async def _live(self) -> None:
+        """Read until the end; with ``reconnect`` join again and register everything."""
+        while True:
+            why = await self._read_to_end()
+            if self._connection is not None:
+                self._connection.abort()
+            self._connection = None
+            self._fail_open(Unreachable(self.target, why))
+            if not self._reconnect:
+                self._finish(why)
+                return
+            log.warning("connection to %s lost: %s", self.target, why)
+            self._tell_link(Link(False, self.id, why))
+            await self._rejoin()
+
+    async def _rejoin(self) -> None:
+        for attempt in range(1 << 30):
+            try:
+                await self._join()
+                for node in self.nodes:
+                    if node.agents or node.groups:
+                        await self.send_frame(
+                            frames.registration(self.id, node.spec, sorted(node.agents), sorted(node.groups))
+                        )
+            except Unreachable as error:
+                log.debug("%s", error)
+                self._connection = None
+            else:
+                return
+            await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
+
+    async def _read_to_end(self) -> str:
+        connection = self._connection
+        if connection is None:
+            return "no connection"
+        try:
+            while True:
+                await self._reading.wait()
+                raw = await connection.receive()
+                try:
+                    await self._take(raw)
+                except WireError as error:
+                    self.bad_messages += 1
+                    log.warning("a bad message from %s: %s", self.target, error)
+        except Unreachable as error:
+            return error.why
+        except WireError as error:  # framing is lost
+            return str(error)
+
+    async def _take(self, raw: bytes) -> None:
+        metadata_json, data = split_message(raw)
+        message = Incoming(Metadata.decode(metadata_json), bytes(data))
+        metadata = message.metadata
+        if metadata.node_name:  # receivers look at the node's name first: topic data also names a manager
+            mailbox = self._take_node_message(message)
+        elif metadata.message_manager == Welcome.manager:
+            self._take_id(metadata, message.data)
+            await self.send_frame(frames.configuration(self.id, self.group, self._welcome_request))
+            return
+        elif not metadata.message_manager and self._take_answer(message):
+            return
+        else:
+            mailbox = self._inbox
+        if mailbox is not None:
+            await mailbox.offer(message)
+
+    def _take_node_message(self, message: Incoming) -> Mailbox[Incoming] | None:
+        node = self._nodes.get((message.metadata.node_type, message.metadata.node_name))
+        if node is None:
+            return self._inbox
+        if message.sender_type != ROS:
+            raise WireError(f"data for {node.spec.tos_name} from agent type {message.sender_type}, not a robot")
+        return node.receive(message)
+
+    def _take_answer(self, message: Incoming) -> bool:
+        """Whether this answers an open request to the router."""
+        answer = self._open.get(message.metadata.request_id)
+        if answer is None or answer.done() or message.sender_type is not None:
+            return False
+        answer.set_result(message.data)
+        return True
+
+    async def _beat(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            connection = self._connection
+            due_s = (
+                self._heartbeat_s if connection is None else connection.last_output + self._heartbeat_s - loop.time()
+            )
+            if due_s > 0:
+                await asyncio.sleep(due_s)
+            elif connection is not None:
+                try:
+                    await connection.send(frames.heartbeat())
+                except Unreachable:
+                    await asyncio.sleep(self._heartbeat_s)  # the reading task sees the end as well
+
+    async def tell(self, frame: Callable[[int], bytes]) -> None:
+        """Send what a reconnection would repeat anyway: without a connection it waits for that."""
+        if self._connection is None and self._reconnect and not self._ended.is_set():
+            return
+        await self.send_frame(frame(self.id))
+
+    def _add(self, node: Node) -> None:
+        key = (node.spec.kind, node.spec.name)
+        taken = self._nodes.get(key)
+        if taken is not None:
+            raise UsageError(f"{node.spec.tos_name}: there is a node of this kind for {taken.spec.tos_name}")
+        self._nodes[key] = node
+
+    def forget(self, node: Node) -> None:
+        self._nodes.pop((node.spec.kind, node.spec.name), None)
+        node.end()
+
+    def _fail_open(self, error: Unreachable) -> None:
+        fail_all(self._open.values(), error)
+        for node in self.nodes:
+            if isinstance(node, ServiceClient):
+                node.fail(error)
+
+    def _finish(self, why: str) -> None:
+        self._why = why
+        self._ended.set()
+        self._fail_open(Unreachable(self.target, why))
+        self._inbox.close()
+        for node in self.nodes:
+            node.end()
+        log.info("offline: %s", why)
+        self._tell_link(Link(False, self.id, why))
+
+    def _tell_link(self, link: Link) -> None:
+        if self._on_link is None:
+            return
+        try:
+            self._on_link(link)
+        except Exception:  # our caller's code must not end our tasks
+            log.exception("on_link failed")

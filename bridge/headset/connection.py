@@ -1,0 +1,87 @@
+"""One TCP connection of a headset: whole messages in, frames out."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections import deque
+
+from macs_zenoh.errors import Unreachable
+from macs_zenoh.wire import MessageDecoder
+
+_READ_BYTES = 256 << 10
+_DRAIN_ABOVE_BYTES = 256 << 10
+_GOODBYE_S = 1.0
+
+
+class Connection:
+    """An open connection; it ends with Unreachable wherever it is used."""
+
+    def __init__(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, target: str, max_message_bytes: int
+    ) -> None:
+        self.target = target
+        self.last_output = 0.0
+        self._reader = reader
+        self._writer = writer
+        self._decoder = MessageDecoder(max_message_bytes)
+        self._whole: deque[bytes] = deque()
+        self._draining = asyncio.Lock()
+
+    @classmethod
+    async def open(cls, host: str, port: int, *, timeout_s: float, max_message_bytes: int) -> Connection:
+        """Connect. Raises Unreachable."""
+        target = f"{host}:{port}"
+        try:
+            reader, writer = await asyncio.wait_for(asyncio.open_connection(host, port), timeout_s)
+        except asyncio.TimeoutError as error:
+            raise Unreachable(target, f"no connection within {timeout_s:g} s") from error
+        except OSError as error:
+            raise Unreachable(target, error.strerror or str(error)) from error
+        raw = writer.get_extra_info("socket")
+        if raw is not None:
+            raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return cls(reader, writer, target, max_message_bytes)
+
+    async def receive(self) -> bytes:
+        """The next whole message. Raises Unreachable at the end of the connection, FrameTooLarge."""
+        while not self._whole:
+            try:
+                data = await self._reader.read(_READ_BYTES)
+            except OSError as error:
+                raise Unreachable(self.target, error.strerror or str(error)) from error
+            if not data:
+                raise Unreachable(self.target, "the router closed the connection")
+            self._whole.extend(self._decoder.feed(data))
+        return self._whole.popleft()
+
+    async def send(self, frame: bytes) -> None:
+        """Write one frame; wait only while much is unsent. Raises Unreachable when the connection is gone."""
+        if self._writer.is_closing():
+            raise Unreachable(self.target, "the connection is closed")
+        self._writer.write(frame)
+        self.last_output = asyncio.get_running_loop().time()
+        if self._writer.transport.get_write_buffer_size() <= _DRAIN_ABOVE_BYTES:
+            return
+        try:
+            async with self._draining:  # before Python 3.11 only one task may wait at a time
+                await self._writer.drain()
+        except OSError as error:
+            raise Unreachable(self.target, error.strerror or str(error)) from error
+
+    async def close(self) -> None:
+        """Send what is written, then close. Waits at most a second for a peer that does not take it."""
+        with contextlib.suppress(OSError, asyncio.TimeoutError, RuntimeError):
+            # Half-closing first: closing a socket with unread data would reset it and lose our last frames.
+            self._writer.write_eof()
+            await asyncio.wait_for(self._read_to_end(), _GOODBYE_S)
+        self.abort()
+
+    def abort(self) -> None:
+        """Drop the connection without a word, as a headset that lost power."""
+        self._writer.transport.abort()
+
+    async def _read_to_end(self) -> None:
+        while await self._reader.read(_READ_BYTES):
+            pass

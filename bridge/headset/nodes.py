@@ -1,0 +1,241 @@
+"""The interface nodes of a headset: topics it receives and publishes, services it calls and runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import inspect
+import logging
+from collections.abc import Awaitable, Callable, Collection
+from dataclasses import dataclass
+from typing import Protocol
+
+from macs_zenoh.errors import CallTimeout, Unreachable, UsageError
+from macs_zenoh.messages import Metadata
+
+from . import frames
+from .frames import NodeSpec
+from .mailbox import Mailbox
+
+log = logging.getLogger("macs.headset")
+
+MAX_OPEN_REQUESTS = 64
+"""How many requests a served service answers at a time; more are dropped and counted."""
+REQUEST_IDS = 1 << 31
+"""Request ids start again after so many: the C# program counts in an int."""
+
+
+@dataclass(frozen=True)
+class Incoming:
+    """A message from the router, as a headset receives it: metadata and raw data."""
+
+    metadata: Metadata
+    data: bytes
+
+    @property
+    def sender_type(self) -> int | None:
+        """1 for robots, 2 for headsets, None for the router itself."""
+        return self.metadata.sender_agent_type
+
+    @property
+    def sender_id(self) -> int | None:
+        """The id that the sender wrote; None for the router itself."""
+        return self.metadata.sender_agent_id
+
+
+@dataclass(frozen=True)
+class ServiceRequest:
+    """A request of a ROS node on robot ``robot`` to a service that runs on this headset."""
+
+    robot: int
+    request_id: int
+    data: bytes
+
+
+ServiceHandler = Callable[[ServiceRequest], "bytes | Awaitable[bytes]"]
+
+
+class Owner(Protocol):
+    """What a node needs of its headset."""
+
+    @property
+    def id(self) -> int:
+        """The headset's id now."""
+
+    async def send_frame(self, frame: bytes) -> None:
+        """Send a frame. Raises Unreachable without a connection."""
+
+    async def tell(self, frame: Callable[[int], bytes]) -> None:
+        """Send what a reconnection would repeat anyway: without a connection it waits for that."""
+
+    def forget(self, node: Node) -> None:
+        """The node is closed."""
+
+
+class Node:
+    """An interface node that this headset asked robots for. `agents` and `groups` are where it is registered."""
+
+    def __init__(self, owner: Owner, spec: NodeSpec) -> None:
+        self.spec = spec
+        self.agents: set[int] = set()
+        self.groups: set[int] = set()
+        self._owner = owner
+
+    async def register(self, *, agents: Collection[int] = (), groups: Collection[int] = ()) -> None:
+        """Register at these robots, and at the robots of these groups, where it is not registered yet."""
+        new_agents = [agent for agent in agents if agent not in self.agents]
+        new_groups = [group for group in groups if group not in self.groups]
+        self.agents.update(new_agents)
+        self.groups.update(new_groups)
+        if new_agents or new_groups:
+            await self._owner.tell(lambda own_id: frames.registration(own_id, self.spec, new_agents, new_groups))
+
+    async def deregister(self, *, agents: Collection[int] = (), groups: Collection[int] = ()) -> None:
+        """Leave these robots and groups."""
+        self.agents.difference_update(agents)
+        self.groups.difference_update(groups)
+        await self._owner.tell(lambda own_id: frames.deregistration(own_id, self.spec, agents, groups))
+
+    async def close(self) -> None:
+        """Leave all robots and groups; the node is gone. Two messages, agents then groups, as the C# program."""
+        agents, groups = sorted(self.agents), sorted(self.groups)
+        self._owner.forget(self)
+        await self.deregister(agents=agents)
+        await self.deregister(groups=groups)
+
+    def receive(self, message: Incoming) -> Mailbox[Incoming] | None:
+        """Take a message for this node; a mailbox where the reader shall put it, None if that is done."""
+        log.warning("a message came for %s, which takes none", self.spec.tos_name)
+        return None
+
+    def end(self) -> None:
+        """The headset is closed."""
+
+
+class Subscription(Node):
+    """A robot topic. Iterate over it for `Incoming` messages, or give a callback to `Headset.subscribe`.
+
+    Holds the last ``buffer_size`` messages for a slow taker (the first ones with ``drop_new``); `dropped` counts
+    the others.
+    """
+
+    def __init__(self, owner: Owner, spec: NodeSpec, callback: Callable[[Incoming], object] | None = None) -> None:
+        super().__init__(owner, spec)
+        self._callback = callback
+        self._mailbox: Mailbox[Incoming] = Mailbox(spec.buffer_size, drop_new=spec.drop_new)
+
+    @property
+    def dropped(self) -> int:
+        """How many messages were dropped here because nobody took them."""
+        return self._mailbox.dropped
+
+    def __aiter__(self) -> Subscription:
+        return self
+
+    async def __anext__(self) -> Incoming:
+        return await self._mailbox.__anext__()
+
+    def receive(self, message: Incoming) -> Mailbox[Incoming] | None:
+        if self._callback is None:
+            return self._mailbox
+        try:
+            self._callback(message)
+        except Exception:  # a faulty callback costs its message, never the connection
+            log.exception("the callback of %s failed", self.spec.tos_name)
+        return None
+
+    def end(self) -> None:
+        self._mailbox.close()
+
+
+class Publisher(Node):
+    """A robot topic that this headset publishes to."""
+
+    async def publish(self, cdr: bytes, *, agents: Collection[int] = (), groups: Collection[int] = ()) -> None:
+        """Send one message to these robots and groups, by default to all where it is registered.
+
+        Raises Unreachable without a connection, TooManyDestinations above 10 agents or groups.
+        """
+        if not agents and not groups:
+            agents, groups = sorted(self.agents), sorted(self.groups)
+        if not agents and not groups:
+            raise UsageError(f"{self.spec.tos_name} is registered with no robot and no group")
+        await self._owner.send_frame(frames.node_data(self._owner.id, self.spec, cdr, agents, groups))
+
+
+class ServiceClient(Node):
+    """A service that runs on robots and that this headset calls."""
+
+    def __init__(self, owner: Owner, spec: NodeSpec) -> None:
+        super().__init__(owner, spec)
+        self._next_request = 0  # 0 is a real request id
+        self._open: dict[tuple[int, int], asyncio.Future[bytes]] = {}
+
+    async def call(self, agent: int, request: bytes, timeout_s: float) -> bytes:
+        """Raises CallTimeout, or Unreachable when the connection ends first."""
+        request_id = self._next_request
+        self._next_request = (request_id + 1) % REQUEST_IDS
+        frame = frames.node_data(self._owner.id, self.spec, request, (agent,), request_id=request_id)
+        answer = asyncio.get_running_loop().create_future()
+        self._open[agent, request_id] = answer
+        try:
+            await self._owner.send_frame(frame)
+            return await asyncio.wait_for(answer, timeout_s)
+        except asyncio.TimeoutError as error:
+            raise CallTimeout(f"service {self.spec.tos_name} of robot {agent}", timeout_s) from error
+        finally:
+            del self._open[agent, request_id]
+
+    def fail(self, error: Unreachable) -> None:
+        """The connection that the answers would come over is gone."""
+        fail_all(self._open.values(), error)
+
+    def receive(self, message: Incoming) -> None:
+        answer = self._open.get((message.sender_id or 0, message.metadata.request_id))
+        if answer is None or answer.done():
+            log.info("an answer of %s came too late", self.spec.tos_name)
+        else:
+            answer.set_result(message.data)
+
+
+class Service(Node):
+    """A service that runs on this headset for ROS nodes on robots."""
+
+    def __init__(self, owner: Owner, spec: NodeSpec, handler: ServiceHandler) -> None:
+        super().__init__(owner, spec)
+        self.dropped = 0
+        self._handler = handler
+        self._open: set[asyncio.Task[None]] = set()
+
+    def receive(self, message: Incoming) -> None:
+        if len(self._open) >= MAX_OPEN_REQUESTS:
+            self.dropped += 1
+            log.warning("%s: %d requests open, one more dropped", self.spec.tos_name, len(self._open))
+            return
+        request = ServiceRequest(message.sender_id or 0, message.metadata.request_id, message.data)
+        task = asyncio.get_running_loop().create_task(self._answer(request))
+        self._open.add(task)
+        task.add_done_callback(self._open.discard)
+
+    async def _answer(self, request: ServiceRequest) -> None:
+        try:
+            answer = self._handler(request)
+            response = await answer if inspect.isawaitable(answer) else answer
+        except Exception:  # the wire has no word for a failed service: the caller times out
+            log.exception("the handler of %s failed", self.spec.tos_name)
+            return
+        with contextlib.suppress(Unreachable):
+            await self._owner.send_frame(
+                frames.node_data(self._owner.id, self.spec, response, (request.robot,), request_id=request.request_id)
+            )
+
+    def end(self) -> None:
+        for task in self._open:
+            task.cancel()
+
+
+def fail_all(answers: Collection[asyncio.Future[bytes]], error: Unreachable) -> None:
+    """Let everybody who waits for an answer fail with this error."""
+    for answer in answers:
+        if not answer.done():
+            answer.set_exception(error)

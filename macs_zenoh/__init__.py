@@ -1,0 +1,21 @@
+"""macs-zenoh: a Zenoh mesh on which ROS 2 robots and XR headsets reach each other by id, by group or all at once."""
+
+from .agent import Agent, Call, Message, join
+from .config import MeshSettings
+from .directory import AgentInfo
+from .errors import MacsError, Refused, Unreachable
+from .messages import Metadata, NodeType
+
+__all__ = [
+    "Agent",
+    "AgentInfo",
+    "Call",
+    "MacsError",
+    "MeshSettings",
+    "Message",
+    "Metadata",
+    "NodeType",
+    "Refused",
+    "Unreachable",
+    "join",
+]

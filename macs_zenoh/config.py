@@ -1,0 +1,304 @@
+"""The configuration, typed: what a settings file may say, its defaults, and the ranges that hold.
+
+A settings file is TOML with up to three sections, one per struct below::
+
+    [mesh]                                   # MeshSettings: every program on the mesh
+    connect = ["tcp/192.168.1.10:7447"]
+
+    [gateway]                                # GatewaySettings: `macs gateway`
+    port = 7000
+
+    [robot]                                  # RobotSettings: `macs agent`
+    id = 7
+
+It is loaded once, in ``main``, and passed down. A misspelled name or a value out of range is a
+`ConfigError` whose path names file and field. The ranges hold however a struct is made, because the
+values end up in Zenoh, and Zenoh does not forgive (a transmit queue above 16 panics at the first link).
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from macs_zenoh.errors import ConfigError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # type: ignore[import-not-found, unused-ignore]
+
+Mode = Literal["client", "peer", "router"]
+
+AgentId = Annotated[int, Meta(ge=1, le=0xFFFF)]
+GroupId = Annotated[int, Meta(ge=0, le=0xFF)]
+"""0 means: in no group."""
+Port = Annotated[int, Meta(ge=0, le=0xFFFF)]
+"""0 means: any free one."""
+Millis = Annotated[int, Meta(ge=0, le=3_600_000)]
+Seconds = Annotated[float, Meta(gt=0, le=86_400)]
+Bytes = Annotated[int, Meta(ge=39, le=0xFFFF_FFFF)]
+"""At least one header, at most what the header's u32 can declare."""
+
+LOCAL_ROUTER = "tcp/127.0.0.1:7447"
+EVERY_INTERFACE = "tcp/[::]:7447"
+
+
+class ZenohEntry(NamedTuple):
+    """One line of Zenoh's own configuration.
+
+    ``chosen`` tells a value that somebody asked for from our default: a default gives way to what a Zenoh
+    configuration file (``config_file``) says about the same path.
+    """
+
+    path: str
+    json5: str
+    chosen: bool
+
+
+class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A section of the settings file. Checks every range when it is made, from a file or in Python."""
+
+    section: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        for field in msgspec.structs.fields(self):
+            try:
+                msgspec.convert(getattr(self, field.name), field.type)
+            except msgspec.ValidationError as error:
+                raise self._wrong(field.name, _plain(str(error))[1]) from None
+        self._check()
+
+    def _check(self) -> None:
+        """Rules that concern more than one field, or that a type cannot say."""
+
+    def _wrong(self, field: str, problem: str) -> ConfigError:
+        return ConfigError(f"{self.section}.{field}", problem)
+
+    def _chosen(self, field: str) -> bool:
+        """Whether the field differs from its default."""
+        return bool(getattr(self, field) != getattr(type(self)(), field))
+
+
+class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a program joins the mesh. The comments name Zenoh's own paths and say why we differ from its defaults."""
+
+    section: ClassVar[str] = "mesh"
+
+    mode: Mode = "client"
+    """Agents and gateways are clients: two peers on one router do not reach each other (Zenoh 1.10)."""
+    connect: list[str] = []
+    """Router endpoints, tried in order; several give fail-over. Empty: the local router, for a client."""
+    listen: list[str] = []
+    """Where to accept sessions. Empty: port 7447 on every interface for a router, nowhere for others."""
+    config_file: str | None = None
+    """Zenoh's own JSON5 file (``-c``). What it says wins over our defaults, not over fields that are set."""
+    overrides: list[str] = []
+    """``path:JSON5`` (``--cfg``), applied last, so they win over everything."""
+    namespace: str | None = None
+    """Zenoh's ``namespace``, put before every key: several meshes on one router."""
+
+    lease_ms: Annotated[int, Meta(ge=500, le=600_000)] = 2000
+    """How long a stopped host stays on the mesh after its last sign of life (Zenoh: 10 s)."""
+    retry_min_ms: Annotated[int, Meta(ge=1, le=60_000)] = 50
+    """First pause before another attempt to reach a router (Zenoh: 1 s, which is long for a teleoperator)."""
+    retry_max_ms: Annotated[int, Meta(ge=1, le=60_000)] = 200
+    """Longest such pause; each is twice the one before."""
+    block_limit_ms: Annotated[int, Meta(ge=1, le=60_000)] = 500
+    """How long a blocking put may wait for a stuck link before that link is closed (Zenoh: 5 s for everyone)."""
+    drop_wait_ms: Millis = 1
+    """How long a droppable message waits for room before it is dropped."""
+    fragment_wait_ms: Millis = 50
+    """The same for a message of several fragments, for all of them together: without it, big messages vanish."""
+    tx_queue_batches: Annotated[int, Meta(ge=1, le=16)] = 2
+    """Batches queued per priority and link. Above 16 Zenoh panics at the first link."""
+    shared_memory: bool = False
+    """Implicit shared memory bypasses size limits and can drop silently, so it is off (Zenoh: on)."""
+    multicast: bool = False
+    """Find routers by multicast scouting. Off: a mesh is what its endpoints say (Zenoh: on)."""
+
+    id_slots: Annotated[int, Meta(ge=1, le=255)] = 10
+    """Destination id slots in the frame header. The same on the whole mesh; 10 is what existing programs use."""
+    group_slots: Annotated[int, Meta(ge=1, le=255)] = 10
+    """Destination group slots in the frame header, likewise."""
+
+    def _check(self) -> None:
+        for field in ("connect", "listen"):
+            for endpoint in getattr(self, field):
+                self._check_endpoint(field, endpoint)
+        for override in self.overrides:
+            if not re.match(r"[^:\s]+:.", override):
+                raise self._wrong("overrides", f"{override!r} is not PATH:JSON5, as in mode:'\"peer\"'")
+        if self.retry_min_ms > self.retry_max_ms:
+            raise self._wrong("retry_min_ms", f"{self.retry_min_ms} is above retry_max_ms, {self.retry_max_ms}")
+        if self.namespace is not None and not re.fullmatch(r"[^/*$?#\s]+(/[^/*$?#\s]+)*", self.namespace):
+            raise self._wrong("namespace", f"{self.namespace!r} is not a plain key, as in site1 or site1/hall2")
+
+    def _check_endpoint(self, field: str, endpoint: str) -> None:
+        if re.fullmatch(r"[a-z][a-z0-9_.-]*/\S+", endpoint):
+            return
+        hint = (
+            f", write tcp/{endpoint}" if re.fullmatch(r"[\w.\[\]:-]+:\d+", endpoint) else ", as in tcp/10.0.0.1:7447"
+        )
+        raise self._wrong(field, f"{endpoint!r} is not a Zenoh endpoint{hint}")
+
+    @property
+    def routers(self) -> list[str]:
+        """Endpoints to connect to: those given, else the local router for a client that names none."""
+        if self.connect or self.mode != "client" or self.config_file or self.multicast:
+            return self.connect
+        return [LOCAL_ROUTER]
+
+    def zenoh(self) -> list[ZenohEntry]:
+        """These settings as Zenoh's configuration, without `config_file` and `overrides`, in the order to apply."""
+        return [
+            ZenohEntry(path, json.dumps(value), any(self._chosen(field) for field in fields))
+            for path, value, fields in self._zenoh_table()
+        ]
+
+    def _zenoh_table(self) -> list[tuple[str, Any, tuple[str, ...]]]:
+        """Rows of (Zenoh's path, value, the fields here that decide it)."""
+        listen = self.listen or ([EVERY_INTERFACE] if self.mode == "router" else [])
+        retry = {"period_init_ms": self.retry_min_ms, "period_max_ms": self.retry_max_ms, "period_increase_factor": 2}
+        queues = "transport/link/tx/queue"
+        priorities = (
+            "real_time",
+            "interactive_high",
+            "interactive_low",
+            "data_high",
+            "data",
+            "data_low",
+            "background",
+        )
+        return [
+            ("mode", self.mode, ("mode",)),
+            ("connect/endpoints", self.routers, ("connect",)),
+            # A client without these gives up on its first router instead of waiting for it.
+            ("connect/timeout_ms", -1, ()),
+            ("connect/exit_on_failure", False, ()),
+            ("connect/retry", retry, ("retry_min_ms", "retry_max_ms")),
+            ("listen/endpoints", listen, ("listen",)),
+            ("scouting/multicast/enabled", self.multicast, ("multicast",)),
+            ("transport/shared_memory/enabled", self.shared_memory, ("shared_memory",)),
+            ("transport/link/tx/lease", self.lease_ms, ("lease_ms",)),
+            (f"{queues}/congestion_control/drop/wait_before_drop", self.drop_wait_ms * 1000, ("drop_wait_ms",)),
+            (
+                f"{queues}/congestion_control/drop/max_wait_before_drop_fragments",
+                self.fragment_wait_ms * 1000,
+                ("fragment_wait_ms",),
+            ),
+            (f"{queues}/congestion_control/block/wait_before_close", self.block_limit_ms * 1000, ("block_limit_ms",)),
+            *((f"{queues}/size/{name}", self.tx_queue_batches, ("tx_queue_batches",)) for name in priorities),
+            *([("namespace", self.namespace, ("namespace",))] if self.namespace else []),
+        ]
+
+
+class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The TCP gateway: where headsets connect, and what one of them may cost."""
+
+    section: ClassVar[str] = "gateway"
+
+    host: str = "127.0.0.1"
+    """Address to listen on. The protocol has no authentication, so the network is opened on purpose: 0.0.0.0."""
+    port: Port = 7000
+    max_connections: Annotated[int, Meta(ge=1, le=65_535)] = 512
+    max_frame_bytes: Bytes = 32 * 1024 * 1024
+    """A larger declared frame closes its connection before a byte of it is stored."""
+    handshake_s: Seconds = 10.0
+    """A connection that has not configured itself by then is closed."""
+    silence_s: Seconds = 10.0
+    """A connection silent for so long is dead: agents send a heartbeat after 5 s without other output."""
+    outbox_bytes: Annotated[int, Meta(ge=64 * 1024, le=4 * 1024**3)] = 8 * 1024 * 1024
+    """Waiting for one connection, at most. One message may always wait, however large."""
+    stall_s: Seconds = 30.0
+    """A connection that takes nothing for so long while something waits is closed."""
+    block: GroupId | None = None
+    """The block of 256 agent ids this gateway gives out, 0 being 1..255; unset: lease the first free one."""
+
+
+class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The robot agent beside a ROS 2 graph."""
+
+    section: ClassVar[str] = "robot"
+
+    id: AgentId | None = None
+    """Unset: lease a free one. Headsets address robots by number, so a robot in use has a fixed one."""
+    group: GroupId = 0
+    call_timeout_s: Seconds = 5.0
+    """How long a service call waits for its answer, on either side."""
+    max_nodes: Annotated[int, Meta(ge=1, le=10_000)] = 256
+    """Interface nodes that headsets may have registered here at one time."""
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole settings file."""
+
+    mesh: MeshSettings = MeshSettings()
+    gateway: GatewaySettings = GatewaySettings()
+    robot: RobotSettings = RobotSettings()
+
+
+def load(path: str | os.PathLike[str]) -> Settings:
+    """Read a settings file (TOML).
+
+    Raises `ConfigError`: it cannot be read, is not TOML, has an unknown name or a value out of range.
+    """
+    source = str(path)
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(source, error.strerror or str(error)) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(source, f"not UTF-8 at byte {error.start}") from error
+    return parse(text, source)
+
+
+def parse(text: str, source: str = "settings") -> Settings:
+    """Turn the text of a settings file into settings; ``source`` names it in errors."""
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(source, f"not TOML: {error}") from error
+    try:
+        return msgspec.convert(document, Settings)
+    except msgspec.ValidationError as error:
+        where, problem = _plain(str(error))
+        raise ConfigError(f"{source}: {where}" if where else source, problem + _hint(where, problem)) from None
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error.path}", error.problem) from None
+
+
+_S = TypeVar("_S", bound=msgspec.Struct)
+
+
+def changed(settings: _S, **changes: Any) -> _S:
+    """The same settings with some fields replaced; a change to None leaves the field (an option not given).
+
+    Raises `ConfigError` naming section and field.
+    """
+    return msgspec.structs.replace(settings, **{name: value for name, value in changes.items() if value is not None})
+
+
+def _plain(text: str) -> tuple[str, str]:
+    """Split msgspec's ``Expected `int` <= 9 - at `$.mesh.port``` into a dotted path and a sentence."""
+    problem, _, where = text.partition(" - at `$")
+    problem = problem.replace("Object contains unknown field", "unknown name").replace("array", "list")
+    return where.rstrip("`").lstrip("."), problem[:1].lower() + problem[1:]
+
+
+def _hint(where: str, problem: str) -> str:
+    """``, did you mean `port`?`` after an unknown name that is nearly a known one."""
+    unknown = re.fullmatch(r"unknown name `(.+)`", problem)
+    owner: Any = {"mesh": MeshSettings, "gateway": GatewaySettings, "robot": RobotSettings}.get(where, Settings)
+    if unknown is None:
+        return ""
+    near = difflib.get_close_matches(unknown[1], [field.name for field in msgspec.structs.fields(owner)], n=1)
+    return f", did you mean `{near[0]}`?" if near else ""

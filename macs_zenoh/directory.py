@@ -1,0 +1,129 @@
+"""Who is online, as told by presence tokens. Pure: tokens and link changes in, joins and leaves out.
+
+A watcher that loses its own router is told that everybody left. So while the link is down, and for ``grace_s`` after
+it came back, a token that ends is only remembered; its agent leaves when the grace is over and it has not returned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from .keyexpr import PRESENCE, type_name
+
+
+class AgentInfo(NamedTuple):
+    """One agent as the mesh sees it. ``type`` is the number; ``group`` 0 means none; ``zid`` is the Zenoh
+    session that declared it (the agent's own, or its gateway's)."""
+
+    type: int
+    id: int
+    group: int
+    zid: str
+
+    @property
+    def type_name(self) -> str:
+        """``ros``, ``unity`` or the number."""
+        return type_name(self.type)
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """What identifies the agent: (type, id)."""
+        return (self.type, self.id)
+
+
+class Change(NamedTuple):
+    """An agent came (or changed its group) or left."""
+
+    agent: AgentInfo
+    online: bool
+
+
+class Directory:
+    """Everybody online. Two sessions may claim one (type, id) for a moment; the newest claim counts."""
+
+    def __init__(self, grace_s: float = 2.0) -> None:
+        self.grace_s = grace_s
+        self._claims: dict[tuple[int, int], dict[str, AgentInfo]] = {}
+        self._doubtful: set[AgentInfo] = set()
+        self._linked = True
+        self._settled_at = 0.0
+
+    def __len__(self) -> int:
+        return len(self._claims)
+
+    def __iter__(self) -> Iterator[AgentInfo]:
+        """All agents, by type and id."""
+        return (self._current(key) for key in sorted(self._claims))
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._claims
+
+    def get(self, agent_type: int, agent_id: int) -> AgentInfo | None:
+        """The agent, or None when it is not online."""
+        key = (agent_type, agent_id)
+        return self._current(key) if key in self._claims else None
+
+    def ids(self, agent_type: int) -> list[int]:
+        """Ids of all agents of a type, ascending."""
+        return sorted(agent_id for kind, agent_id in self._claims if kind == agent_type)
+
+    def members(self, group: int, agent_type: int) -> list[int]:
+        """Ids of a type's agents that are in a group, ascending."""
+        return [agent.id for agent in self if agent.type == agent_type and agent.group == group]
+
+    def claimants(self, agent_type: int, agent_id: int) -> list[AgentInfo]:
+        """Everybody who holds a token for this (type, id): more than one is a conflict."""
+        return list(self._claims.get((agent_type, agent_id), {}).values())
+
+    def token(self, key: str, alive: bool, now: float) -> list[Change]:
+        """A presence token appeared or ended. Keys that are no presence keys are ignored."""
+        fields = PRESENCE.parse(key)
+        if fields is None:
+            return []
+        agent = AgentInfo(int(fields["type"]), int(fields["id"]), int(fields["group"]), str(fields["zid"]))
+        if alive:
+            return self._claim(agent)
+        if not self._linked or now < self._settled_at:
+            self._doubtful.add(agent)
+            return []
+        return self._release(agent)
+
+    def link(self, up: bool, now: float) -> None:
+        """Our own connection to the routers changed."""
+        self._linked = up
+        self._settled_at = now + self.grace_s
+
+    def next_deadline(self) -> float | None:
+        """When `tick` has something to do, None when it has not."""
+        return self._settled_at if self._doubtful and self._linked else None
+
+    def tick(self, now: float) -> list[Change]:
+        """Let agents leave that were in doubt and have not come back within the grace."""
+        if not self._linked or now < self._settled_at:
+            return []
+        doubtful, self._doubtful = self._doubtful, set()
+        return [change for agent in sorted(doubtful) for change in self._release(agent)]
+
+    def _current(self, key: tuple[int, int]) -> AgentInfo:
+        return next(reversed(self._claims[key].values()))
+
+    def _claim(self, agent: AgentInfo) -> list[Change]:
+        self._doubtful.discard(agent)
+        claims = self._claims.setdefault(agent.key, {})
+        before = self._current(agent.key) if claims else None
+        claims.pop(agent.zid, None)
+        claims[agent.zid] = agent
+        return [] if before == agent else [Change(agent, online=True)]
+
+    def _release(self, agent: AgentInfo) -> list[Change]:
+        claims = self._claims.get(agent.key, {})
+        if claims.get(agent.zid) != agent:
+            return []  # already replaced, e.g. by the same agent in another group
+        before = self._current(agent.key)
+        del claims[agent.zid]
+        if not claims:
+            del self._claims[agent.key]
+            return [Change(agent, online=False)]
+        current = self._current(agent.key)
+        return [] if current == before else [Change(current, online=True)]

@@ -1,0 +1,140 @@
+"""Every error of this project, in one tree whose branches say who is at fault.
+
+::
+
+    MacsError
+    ├── WireError                 the peer: what it sent cannot be used
+    │   ├── FrameTooLarge         (final for its connection: framing is lost)
+    │   ├── BadSizes
+    │   ├── BadJson
+    │   ├── BadField
+    │   ├── UnknownManager
+    │   └── NotAllowed
+    ├── UsageError                our caller
+    │   ├── TooManyDestinations
+    │   └── OutOfRange
+    ├── ConfigError               the configuration
+    ├── Refused                   the other end answered, and said no
+    └── Unreachable               the world
+        └── CallTimeout
+
+Numbers are attributes; the text is made from them.
+"""
+
+from __future__ import annotations
+
+
+class MacsError(Exception):
+    """Base of all errors raised by this project."""
+
+
+class WireError(MacsError):
+    """The peer sent something that cannot be used. Costs that frame, at most that connection."""
+
+
+class FrameTooLarge(WireError):
+    """A header declares more bytes than allowed, so the next frame cannot be found: final for the connection."""
+
+    def __init__(self, size: int, limit: int) -> None:
+        super().__init__(f"a frame of {size} bytes was declared, the limit is {limit}")
+        self.size = size
+        self.limit = limit
+
+
+class BadSizes(WireError):
+    """The sizes inside a frame or message do not add up."""
+
+    def __init__(self, what: str, declared: int, available: int) -> None:
+        super().__init__(f"{what}: {declared} bytes declared, {available} there")
+        self.what = what
+        self.declared = declared
+        self.available = available
+
+
+class BadJson(WireError):
+    """Bytes that should be a JSON object are not."""
+
+    def __init__(self, what: str, problem: str) -> None:
+        super().__init__(f"{what} is not valid JSON: {problem}")
+        self.what = what
+        self.problem = problem
+
+
+class BadField(WireError):
+    """A JSON field is missing or has the wrong type or range."""
+
+    def __init__(self, what: str, problem: str) -> None:
+        super().__init__(f"{what}: {problem}")
+        self.what = what
+        self.problem = problem
+
+
+class UnknownManager(WireError):
+    """Management data names a manager that nobody here has."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"unknown message manager {name[:64]!r}")
+        self.name = name
+
+
+class NotAllowed(WireError):
+    """A peer asked for something that its place on the mesh does not permit."""
+
+
+class UsageError(MacsError):
+    """Our caller passed something that cannot be done."""
+
+
+class TooManyDestinations(UsageError):
+    """More ids or groups than the header has slots."""
+
+    def __init__(self, kind: str, count: int, limit: int) -> None:
+        super().__init__(f"{count} destination {kind}, the header has {limit} slots")
+        self.kind = kind
+        self.count = count
+        self.limit = limit
+
+
+class OutOfRange(UsageError):
+    """A number outside the range its field can carry."""
+
+    def __init__(self, name: str, value: int, low: int, high: int) -> None:
+        super().__init__(f"{name} is {value}, allowed is {low}..{high}")
+        self.name = name
+        self.value = value
+        self.low = low
+        self.high = high
+
+
+class ConfigError(MacsError):
+    """The configuration is wrong. ``path`` names the file and field."""
+
+    def __init__(self, path: str, problem: str) -> None:
+        super().__init__(f"{path}: {problem}")
+        self.path = path
+        self.problem = problem
+
+
+class Refused(MacsError):
+    """A call was answered with a refusal. ``reason`` is for a person."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+class Unreachable(MacsError):
+    """A router or an agent cannot be reached."""
+
+    def __init__(self, target: str, why: str) -> None:
+        super().__init__(f"{target} cannot be reached: {why}")
+        self.target = target
+        self.why = why
+
+
+class CallTimeout(Unreachable):
+    """A call was not answered in time."""
+
+    def __init__(self, target: str, timeout_s: float) -> None:
+        super().__init__(target, f"no answer within {timeout_s:g} s")
+        self.timeout_s = timeout_s

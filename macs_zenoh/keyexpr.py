@@ -1,0 +1,191 @@
+"""Every key expression of the mesh, built and parsed in one place; nothing else spells a ``/``.
+
+``keyexpr_map.md`` explains the same table to people who write Zenoh programs or access rules; a test holds the two
+together. Agent types are names in keys (``ros``, ``unity``, otherwise the number), ids and groups decimal.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from urllib.parse import quote, unquote
+
+from .errors import UsageError
+from .messages import ROS, UNITY
+
+BLOCK_SIZE = 256
+"""Ids per block: the block of an id is its high byte."""
+
+_TYPE_NAMES = {ROS: "ros", UNITY: "unity"}
+_TYPE_NUMBERS = {name: number for number, name in _TYPE_NAMES.items()}
+
+FieldValue = int | str
+
+_NUMBERS = frozenset({"id", "from_id", "group", "block"})
+_TYPES = frozenset({"type", "from_type"})
+_SAFE = "".join(sorted({chr(c) for c in range(33, 127)} - set("/*$?#%"))) + " "
+
+
+def type_name(agent_type: int) -> str:
+    """How an agent type is written in keys: 1 → ``ros``, 2 → ``unity``, others as the number."""
+    return _TYPE_NAMES.get(agent_type) or str(agent_type)
+
+
+def type_number(name: str) -> int:
+    """The agent type behind a name: ``ros`` → 1, ``unity`` → 2, ``"7"`` → 7. Raises UsageError."""
+    number = _TYPE_NUMBERS.get(name)
+    if number is None:
+        if not name.isascii() or not name.isdigit() or not 1 <= int(name) <= 255:
+            raise UsageError(f"unknown agent type {name!r}: use 'ros', 'unity' or a number from 1 to 255")
+        number = int(name)
+    return number
+
+
+def block_of(agent_id: int) -> int:
+    """The block that an id belongs to."""
+    return agent_id // BLOCK_SIZE
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key space: a template whose ``{fields}`` are single chunks, and who puts what there."""
+
+    template: str
+    publisher: str
+    subscriber: str
+    payload: str
+    fields: tuple[str, ...] = field(init=False)
+    _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "fields", tuple(re.findall(r"\{(\w+)\}", self.template)))
+        pattern = re.sub(r"\{(\w+)\}", r"(?P<\1>[^/*$?#]+)", self.template)
+        object.__setattr__(self, "_pattern", re.compile(pattern))
+
+    def of(self, **values: FieldValue) -> str:
+        """The concrete key for these fields. Raises UsageError when one is missing, unknown or cannot be written."""
+        missing = set(self.fields) - values.keys()
+        if missing:
+            raise UsageError(f"key {self.template}: no value for {', '.join(sorted(missing))}")
+        return self._fill(values)
+
+    def every(self, **values: FieldValue) -> str:
+        """The key expression for all keys with these fields; fields not given match anything.
+
+        A tail in which nothing is given becomes ``**``, so ``UNICAST.every(type=1, block=0, id=7)`` is
+        ``macs/to/ros/0/7/**``.
+        """
+        given = [name in values for name in self.fields]
+        last = max((i for i, here in enumerate(given) if here), default=-1)
+        tail = self.fields[last + 1 :]
+        template = self.template
+        if tail:
+            template = template[: template.index("{" + tail[0] + "}")] + "**"
+        for name in self.fields[: last + 1]:
+            if name not in values:
+                template = template.replace("{" + name + "}", "*")
+        return self._fill(values, template)
+
+    def parse(self, key: str) -> dict[str, FieldValue] | None:
+        """The fields of a concrete key (types and ids as numbers), or None when the key is not of this space."""
+        match = self._pattern.fullmatch(key)
+        if match is None:
+            return None
+        try:
+            return {name: _read(name, text) for name, text in match.groupdict().items()}
+        except (UsageError, ValueError):
+            return None
+
+    def _fill(self, values: dict[str, FieldValue], template: str | None = None) -> str:
+        unknown = values.keys() - set(self.fields)
+        if unknown:
+            raise UsageError(f"key {self.template} has no field {', '.join(sorted(unknown))}")
+        return (template or self.template).format(**{name: _write(name, value) for name, value in values.items()})
+
+
+def _write(name: str, value: FieldValue) -> str:
+    if name in _TYPES:
+        return type_name(value) if isinstance(value, int) else type_name(type_number(value))
+    if name in _NUMBERS:
+        if not isinstance(value, int) or value < 0:
+            raise UsageError(f"{name} must be a number from 0, not {value!r}")
+        return str(value)
+    text = str(value)
+    if not text:
+        raise UsageError(f"{name} is empty")
+    return quote(text, safe=_SAFE)
+
+
+def _read(name: str, text: str) -> FieldValue:
+    if name in _TYPES:
+        return type_number(text)
+    if name in _NUMBERS:
+        if not text.isascii() or not text.isdigit():
+            raise ValueError(text)
+        return int(text)
+    return unquote(text)
+
+
+FRAME = "one frame"
+
+UNICAST = Key(
+    "macs/to/{type}/{block}/{id}/{from_type}/{from_id}",
+    publisher="the sender",
+    subscriber="an agent: its own `{type}/{block}/{id}`; a gateway: its block of headsets, each of its TCP robots",
+    payload=FRAME,
+)
+GROUP = Key(
+    "macs/group/{group}/{type}/{from_type}/{from_id}",
+    publisher="the sender",
+    subscriber="an agent in the group; a gateway once, however many of its agents are in the group",
+    payload=FRAME,
+)
+BROADCAST = Key(
+    "macs/all/{from_type}/{from_id}",
+    publisher="the sender",
+    subscriber="every agent and gateway",
+    payload=FRAME,
+)
+STREAM = Key(
+    "macs/from/{type}/{id}/{node}",
+    publisher="a robot, once per topic message",
+    subscriber="every gateway with a registrant on that node",
+    payload="one frame whose management data lists the registrants",
+)
+PRESENCE = Key(
+    "macs/live/{type}/{id}/{group}/{zid}",
+    publisher="an agent, or the gateway it is behind (liveliness token)",
+    subscriber="every agent and gateway",
+    payload="none",
+)
+LEASE = Key(
+    "macs/block/{block}/{zid}",
+    publisher="the gateway that hands out the ids of this block (liveliness token)",
+    subscriber="gateways and agents that choose an id",
+    payload="none",
+)
+CALL = Key(
+    "macs/call/{type}/{id}/{verb}/{from_type}/{from_id}",
+    publisher="the caller (query)",
+    subscriber="the agent that is called (queryable)",
+    payload="one frame; the reply is one message",
+)
+
+KEYS: dict[str, Key] = {
+    "unicast": UNICAST,
+    "group": GROUP,
+    "broadcast": BROADCAST,
+    "stream": STREAM,
+    "presence": PRESENCE,
+    "lease": LEASE,
+    "call": CALL,
+}
+"""Every key space by the name of its plane."""
+
+
+def parse(key: str) -> tuple[str, dict[str, FieldValue]] | None:
+    """Which plane a concrete key belongs to, and its fields; None for a key that is not ours."""
+    for plane, space in KEYS.items():
+        if (fields := space.parse(key)) is not None:
+            return plane, fields
+    return None

@@ -1,0 +1,283 @@
+"""Metadata and management data as typed values; JSON as the existing programs write it.
+
+Existing programs spell top-level keys in camelCase, UpperCamelCase or snake_case, in any order, with keys missing
+or unknown ones added. All of that is accepted; a value of the wrong type is not. What we write is compact camelCase,
+as headsets do.
+
+The wire calls the kinds of management data *managers* and names a class for each. Here each kind is a struct named
+for what it says, with the wire's name in ``manager``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from enum import IntEnum
+from functools import cache, lru_cache
+from typing import Annotated, Any, ClassVar, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+
+from .errors import BadField, BadJson, UnknownManager
+
+BROADCAST = 0
+"""Agent type of a header that goes to everybody."""
+ROS = 1
+"""Agent type of robots."""
+UNITY = 2
+"""Agent type of headsets."""
+
+AgentType = Annotated[int, Meta(ge=0, le=255)]
+AgentId = Annotated[int, Meta(ge=0, le=0xFFFF)]
+GroupId = Annotated[int, Meta(ge=0, le=255)]
+RequestId = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
+
+
+class NodeType(IntEnum):
+    """What an interface node is on the robot (the seed text names 3 and 4 from the headset's side)."""
+
+    SUBSCRIBER = 1
+    """A ROS subscription: a robot's topic goes to headsets."""
+    PUBLISHER = 2
+    """A ROS publisher: headsets' data goes to a robot's topic."""
+    CLIENT = 3
+    """A ROS service client: a headset calls a service that runs on the robot."""
+    SERVICE = 4
+    """A ROS service: a node on the robot calls a service that runs on a headset."""
+
+
+class Metadata(Struct, frozen=True, rename="camel"):
+    """The JSON in front of every message's data. A router leaves the sender null; request id 0 is a real id."""
+
+    sender_agent_type: AgentType | None = None
+    sender_agent_id: AgentId | None = None
+    request_id: RequestId = 0
+    message_manager: str = ""
+    node_type: Annotated[int, Meta(ge=0, le=255)] = 0
+    node_name: str = ""
+    data_exchange_type: str = ""
+
+    @staticmethod
+    def decode(data: bytes | bytearray | memoryview) -> Metadata:
+        """Read metadata JSON. Raises BadJson or BadField."""
+        try:
+            return _metadata_decoder.decode(data)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            # the plain spelling failed: the tolerant way finds another spelling or tells what is wrong
+            try:
+                return _convert("metadata", _json_object("metadata", bytes(data)), Metadata)
+            except BadJson:
+                raise BadJson("metadata", str(error)) from error
+
+    def encode(self) -> bytes:
+        """Write compact JSON with all seven keys."""
+        return msgspec.json.encode(self)
+
+
+_metadata_decoder = msgspec.json.Decoder(Metadata)
+
+
+class Functionality(Struct, frozen=True, rename="camel"):
+    """What a robot offers: topic or service name -> type, e.g. ``{"/chatter": "std_msgs/msg/String"}``."""
+
+    subscribers: dict[str, str] = {}
+    publishers: dict[str, str] = {}
+    services: dict[str, str] = {}
+
+
+class Management(Struct, frozen=True, rename="camel"):
+    """Base of everything that names a manager."""
+
+    manager: ClassVar[str] = ""
+
+
+class Welcome(Management, frozen=True):
+    """Router → each new connection, at once: your id. Metadata's request id is the number of the connection."""
+
+    manager: ClassVar[str] = "AgentConfigurer"
+    agent_id: AgentId
+
+
+class Configuration(Management, frozen=True):
+    """Agent → router: the answer to Welcome. ``request_id`` echoes it; robots add what they offer."""
+
+    manager: ClassVar[str] = "AgentclientConfigurer"
+    agent_type: AgentType
+    agent_id: AgentId
+    group_id: GroupId = 0
+    request_id: RequestId = 0
+    functionality: Functionality | None = None
+
+
+class Heartbeat(Management, frozen=True):
+    """Agent → router, after 5 s without other output."""
+
+    manager: ClassVar[str] = "HeartbeatHandler"
+
+
+class OnlineRequest(Management, frozen=True):
+    """Headset → router: who is online? The answer goes to the asking connection with its request id."""
+
+    manager: ClassVar[str] = "OnlineAgentsGetter"
+    agent_type: AgentType = UNITY
+    agent_id: AgentId = 0
+
+
+class OnlineReply(Struct, frozen=True, rename="camel"):
+    """Router → asker, in the data part."""
+
+    ros_agent_ids: list[AgentId] = []
+    unity_agent_ids: list[AgentId] = []
+
+
+class Registration(Management, frozen=True):
+    """Headset → router → robots: add or remove an interface node. The message inside says which."""
+
+    manager: ClassVar[str] = "RosAgentNodeRegistrationForwarder"
+    registrant_agent_id: AgentId
+    node_type: Annotated[int, Meta(ge=0, le=255)]
+    node_name: str
+    registrar_agent_ids: list[AgentId] = []
+    registrar_group_ids: list[GroupId] = []
+    tos_name: str = ""
+    data_exchange_type: str = ""
+
+
+class AddNode(Management, frozen=True):
+    """Headset → robot: create this interface node, or register me on it. ``tos_name`` is the topic or service."""
+
+    manager: ClassVar[str] = "InterfaceNodeAdder"
+    registrant_agent_type: AgentType
+    registrant_agent_id: AgentId
+    node_type: Annotated[int, Meta(ge=0, le=255)]
+    node_name: str
+    tos_name: str
+    data_exchange_type: str
+    buffer_size: Annotated[int, Meta(ge=0)] = 10
+    drop_new: bool = False
+    is_latched: bool = False
+
+
+class RemoveNode(Management, frozen=True):
+    """Headset → robot: take me off this interface node."""
+
+    manager: ClassVar[str] = "InterfaceNodeRemover"
+    registrant_agent_type: AgentType
+    registrant_agent_id: AgentId
+    node_type: Annotated[int, Meta(ge=0, le=255)]
+    node_name: str
+
+
+class StreamData(Management, frozen=True):
+    """Robot → router → headsets: topic data for these registrants: agent type as a string → ids, any number."""
+
+    manager: ClassVar[str] = "RosAgentSubscriberDataForwarder"
+    dest_agents: dict[str, list[AgentId]]
+
+
+class GoOffline(Management, frozen=True):
+    """Headset → router: I leave."""
+
+    manager: ClassVar[str] = "UnityAgentclientRemover"
+    agent_id: AgentId = 0
+
+
+class GoneAgent(Struct, frozen=True):
+    """One entry of AgentsGone; on the wire in snake_case."""
+
+    agent_type: AgentType
+    agent_id: AgentId
+
+
+class AgentsGone(Management, frozen=True):
+    """Router → all agents: these are no longer online. Lists robots too."""
+
+    manager: ClassVar[str] = "PrunedUnityAgentsInterfaceNodesCleaner"
+    agents: list[GoneAgent]
+
+
+class FunctionalityRequest(Management, frozen=True):
+    """Anyone → robot: report your topics and services."""
+
+    manager: ClassVar[str] = "FunctionalityGetter"
+
+
+MANAGERS: dict[str, type[Management]] = {kind.manager: kind for kind in Management.__subclasses__()}
+"""Every manager by its name on the wire. Nothing is ever imported or created because a message names it."""
+
+StructT = TypeVar("StructT", bound=Struct)
+
+
+def decode_management(data: bytes) -> Management:
+    """Read management data. Raises BadJson, BadField or UnknownManager."""
+    fields = _json_object("management data", data)
+    name = fields.pop("message_manager", None)
+    if not isinstance(name, str):
+        raise BadField("management data", "the key 'messageManager' is missing or not a string")
+    kind = MANAGERS.get(name)
+    if kind is None:
+        raise UnknownManager(name)
+    return _convert(name, fields, kind)
+
+
+def encode_management(value: Management) -> bytes:
+    """Write management data: the value's fields and its manager's name."""
+    return msgspec.json.encode({**_fields(value), "messageManager": value.manager})
+
+
+def decode_data(kind: type[StructT], data: bytes | bytearray | memoryview) -> StructT:
+    """Read the JSON in a message's data part as ``kind``. Raises BadJson or BadField."""
+    name = getattr(kind, "manager", "") or kind.__name__
+    return _convert(name, _json_object(name, bytes(data)), kind)
+
+
+def encode_data(value: Struct) -> bytes:
+    """Write a message's data part."""
+    return msgspec.json.encode(value)
+
+
+@lru_cache(maxsize=1024)
+def node_name(tos_name: str) -> str:
+    """The name of the interface node for a topic or service: ``/cmd_vel`` → ``nd__cmd_vel``. Names can collide."""
+    return "nd_" + tos_name.replace("/", "_").replace("~", "_")
+
+
+def _json_object(what: str, data: bytes) -> dict[str, Any]:
+    """The object in ``data`` with its top-level keys in snake_case. Raises BadJson."""
+    try:
+        value = msgspec.json.decode(data)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise BadJson(what, str(error)) from error
+    if not isinstance(value, dict):
+        raise BadJson(what, f"an object was expected, not {type(value).__name__}")
+    return {_snake(key): field for key, field in value.items()}
+
+
+def _convert(what: str, fields: dict[str, Any], kind: type[StructT]) -> StructT:
+    names = _wire_names(kind)
+    known = {names[key]: value for key, value in fields.items() if key in names}
+    if (nested := known.get("functionality")) and isinstance(nested, dict):
+        known["functionality"] = {_snake(key): value for key, value in nested.items()}
+    try:
+        return msgspec.convert(known, kind)
+    except msgspec.ValidationError as error:
+        raise BadField(what, str(error)) from error
+
+
+@cache
+def _wire_names(kind: type[Struct]) -> dict[str, str]:
+    return dict(zip(kind.__struct_fields__, kind.__struct_encode_fields__, strict=True))
+
+
+def _fields(value: Struct) -> dict[str, Any]:
+    fields: dict[str, Any] = msgspec.to_builtins(value)
+    return {key: field for key, field in fields.items() if field is not None}
+
+
+_HUMP: Callable[[str], str] = lambda key: re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", key)  # noqa: E731
+
+
+@lru_cache(maxsize=1024)
+def _snake(key: str) -> str:
+    return _HUMP(key).lower()

@@ -1,0 +1,41 @@
+"""Where a frame goes: header → keys on the way in, key and header → agents on the way out. Pure.
+
+One rule makes one copy per receiver: an agent named by id and by group gets the copy for its id and drops the one
+for its group. Nobody hears its own broadcast or group message; an id list that names the sender is honoured.
+"""
+
+from __future__ import annotations
+
+from .keyexpr import BROADCAST, GROUP, UNICAST, block_of
+from .messages import BROADCAST as EVERYBODY
+from .wire import Header
+
+
+def keys_of(header: Header, from_type: int, from_id: int) -> list[str]:
+    """The keys on which a frame with this header is put, for a frame without management data.
+
+    Empty when the header names nobody: the caller counts that.
+    """
+    if header.agent_type == EVERYBODY:
+        return [BROADCAST.of(from_type=from_type, from_id=from_id)]
+    unicast = [unicast_key(header.agent_type, agent_id, from_type, from_id) for agent_id in dict.fromkeys(header.ids)]
+    groups = [
+        GROUP.of(group=group, type=header.agent_type, from_type=from_type, from_id=from_id)
+        for group in dict.fromkeys(header.groups)
+    ]
+    return unicast + groups
+
+
+def unicast_key(agent_type: int, agent_id: int, from_type: int, from_id: int) -> str:
+    """The inbox key of one agent, for one sender."""
+    return UNICAST.of(type=agent_type, block=block_of(agent_id), id=agent_id, from_type=from_type, from_id=from_id)
+
+
+def inbox(agent_type: int, agent_id: int) -> str:
+    """What an agent subscribes to for frames sent to its id."""
+    return UNICAST.every(type=agent_type, block=block_of(agent_id), id=agent_id)
+
+
+def takes_group_copy(header: Header, agent_id: int, sender: tuple[int, int], agent_type: int) -> bool:
+    """Whether a member of the group keeps this copy: not when its id is named as well, nor its own message."""
+    return agent_id not in header.ids and (agent_type, agent_id) != sender

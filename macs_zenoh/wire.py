@@ -1,0 +1,369 @@
+"""The MACS wire: header, frame and message, bytes to values and back. No I/O, no clock, no JSON.
+
+A *frame* travels from an agent into the mesh and is the payload of every sample::
+
+    offset  size  field
+    0       1     agent type: 0 broadcast, 1 ROS robots, 2 Unity headsets
+    1       20    10 x u16 destination ids, 0 = empty slot
+    21      10    10 x u8 destination groups, 0 = empty slot
+    31      4     u32 M, size of the management data
+    35      4     u32 T, size of the message
+    39      M     management data, JSON
+    39+M    T     the message
+
+A *message* travels from the router to an agent: ``u32 S, S bytes metadata JSON, u32 D, D bytes data``,
+with T = 8 + S + D. All integers are unsigned, little-endian, unaligned.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from .errors import BadSizes, FrameTooLarge, OutOfRange, TooManyDestinations
+
+MAX_FRAME_BYTES = 32 << 20
+"""Default limit of a whole frame; camera frames of 20 MiB pass."""
+
+MESSAGE_OVERHEAD = 8
+"""Bytes of a message that are neither metadata nor data."""
+
+EMPTY_MESSAGE = bytes(MESSAGE_OVERHEAD)
+"""What configuration replies and heartbeats carry: no metadata, no data."""
+
+_U32 = struct.Struct("<I")
+_SIZES = struct.Struct("<II")
+_U32_MAX = 0xFFFFFFFF
+
+Buffer = bytes | bytearray | memoryview
+
+
+class Header(NamedTuple):
+    """A decoded routing header. Empty slots are left out; order and duplicates are kept."""
+
+    agent_type: int
+    ids: tuple[int, ...]
+    groups: tuple[int, ...]
+    management_bytes: int
+    message_bytes: int
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How many destination slots the header has. One mesh uses one layout; 10 and 10 make the 39 bytes of MACS."""
+
+    id_slots: int = 10
+    group_slots: int = 10
+    destination_bytes: int = field(init=False, repr=False, compare=False)
+    header_bytes: int = field(init=False, repr=False, compare=False)
+    _struct: struct.Struct = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.id_slots <= 255:
+            raise OutOfRange("id_slots", self.id_slots, 1, 255)
+        if not 1 <= self.group_slots <= 255:
+            raise OutOfRange("group_slots", self.group_slots, 1, 255)
+        packed = struct.Struct(f"<B{self.id_slots}H{self.group_slots}BII")
+        object.__setattr__(self, "_struct", packed)
+        object.__setattr__(self, "header_bytes", packed.size)
+        object.__setattr__(self, "destination_bytes", packed.size - _SIZES.size)
+
+    def pack(
+        self,
+        agent_type: int,
+        ids: tuple[int, ...] | list[int] = (),
+        groups: tuple[int, ...] | list[int] = (),
+        management_bytes: int = 0,
+        message_bytes: int = 0,
+    ) -> bytes:
+        """Encode a header of ``header_bytes`` bytes.
+
+        Raises TooManyDestinations when there are more ids or groups than slots, OutOfRange when a number
+        does not fit its field.
+        """
+        self._check(agent_type, ids, groups)
+        for name, size in (("management_bytes", management_bytes), ("message_bytes", message_bytes)):
+            if not 0 <= size <= _U32_MAX:
+                raise OutOfRange(name, size, 0, _U32_MAX)
+        id_padding = (0,) * (self.id_slots - len(ids))
+        group_padding = (0,) * (self.group_slots - len(groups))
+        return self._struct.pack(
+            agent_type, *ids, *id_padding, *groups, *group_padding, management_bytes, message_bytes
+        )
+
+    def unpack(self, buffer: Buffer, at: int = 0) -> Header:
+        """Decode the header that starts at offset ``at``. Raises BadSizes when the buffer ends before it does."""
+        if len(buffer) - at < self.header_bytes:
+            raise BadSizes("header", self.header_bytes, max(0, len(buffer) - at))
+        fields = self._struct.unpack_from(buffer, at)
+        groups_at = 1 + self.id_slots
+        return Header(
+            fields[0],
+            tuple(i for i in fields[1:groups_at] if i),
+            tuple(g for g in fields[groups_at:-2] if g),
+            fields[-2],
+            fields[-1],
+        )
+
+    def _check(self, agent_type: int, ids: tuple[int, ...] | list[int], groups: tuple[int, ...] | list[int]) -> None:
+        if not 0 <= agent_type <= 255:
+            raise OutOfRange("agent_type", agent_type, 0, 255)
+        if len(ids) > self.id_slots:
+            raise TooManyDestinations("ids", len(ids), self.id_slots)
+        if len(groups) > self.group_slots:
+            raise TooManyDestinations("groups", len(groups), self.group_slots)
+        for agent_id in ids:
+            if not 0 <= agent_id <= 0xFFFF:
+                raise OutOfRange("agent id", agent_id, 0, 0xFFFF)
+        for group in groups:
+            if not 0 <= group <= 255:
+                raise OutOfRange("group", group, 0, 255)
+
+
+MACS = Layout()
+"""The layout of every existing MACS program: 39 bytes."""
+
+
+class Frame:
+    """One whole frame, decoded only as far as asked.
+
+    ``data`` is the frame's bytes as they came; nothing here copies them except `management`, `metadata` and
+    `destination`, which are short.
+    """
+
+    __slots__ = ("_message_at", "data", "layout")
+
+    def __init__(self, data: bytes | bytearray, layout: Layout = MACS) -> None:
+        self.data = data
+        self.layout = layout
+        self._message_at = layout.header_bytes + _U32.unpack_from(data, layout.destination_bytes)[0]
+
+    @property
+    def header(self) -> Header:
+        """The decoded header."""
+        return self.layout.unpack(self.data)
+
+    @property
+    def destination(self) -> bytes:
+        """The header without its sizes: equal for frames that go the same way, so it can key a table."""
+        return bytes(self.data[: self.layout.destination_bytes])
+
+    @property
+    def has_management(self) -> bool:
+        """Whether the frame carries management data (then ids and groups in its header are ignored)."""
+        return bool(self._message_at > self.layout.header_bytes)
+
+    @property
+    def management(self) -> bytes:
+        """The management data, possibly empty."""
+        return bytes(self.data[self.layout.header_bytes : self._message_at])
+
+    @property
+    def message(self) -> memoryview:
+        """The message part: what a TCP agent receives."""
+        return memoryview(self.data)[self._message_at :]
+
+    @property
+    def metadata(self) -> bytes:
+        """The metadata JSON of the message. Valid after `check`."""
+        at = self._message_at
+        return bytes(self.data[at + 4 : at + 4 + _U32.unpack_from(self.data, at)[0]])
+
+    @property
+    def body(self) -> memoryview:
+        """The data part of the message. Valid after `check`."""
+        at = self._message_at
+        metadata_bytes = _U32.unpack_from(self.data, at)[0]
+        return memoryview(self.data)[at + MESSAGE_OVERHEAD + metadata_bytes :]
+
+    def check(self) -> None:
+        """Raise BadSizes unless the sizes inside the message add up. A frame that fails must never be forwarded."""
+        _check_message(self.data, self._message_at)
+
+
+def parse_frame(data: bytes | bytearray, layout: Layout = MACS) -> Frame:
+    """Take ``data`` as exactly one frame, check all of its sizes and return it. Raises BadSizes."""
+    if len(data) < layout.header_bytes:
+        raise BadSizes("header", layout.header_bytes, len(data))
+    management_bytes, message_bytes = _SIZES.unpack_from(data, layout.destination_bytes)
+    declared = layout.header_bytes + management_bytes + message_bytes
+    if declared != len(data):
+        raise BadSizes("frame", declared, len(data))
+    frame = Frame(data, layout)
+    frame.check()
+    return frame
+
+
+def encode_frame(
+    agent_type: int = 0,
+    ids: tuple[int, ...] | list[int] = (),
+    groups: tuple[int, ...] | list[int] = (),
+    *,
+    management: bytes = b"",
+    message: Buffer = EMPTY_MESSAGE,
+    layout: Layout = MACS,
+) -> bytes:
+    """Build a whole frame. Raises TooManyDestinations or OutOfRange."""
+    header = layout.pack(agent_type, ids, groups, len(management), len(message))
+    return b"".join((header, management, message))
+
+
+def encode_message(metadata: bytes, data: Buffer = b"") -> bytes:
+    """Build a message from its metadata JSON and its data."""
+    return b"".join((_U32.pack(len(metadata)), metadata, _U32.pack(len(data)), data))
+
+
+def split_message(message: Buffer) -> tuple[bytes, memoryview]:
+    """Take a message apart into metadata JSON and data (a view into ``message``). Raises BadSizes."""
+    _check_message(message, 0)
+    metadata_bytes = _U32.unpack_from(message, 0)[0]
+    view = memoryview(message)
+    return bytes(view[4 : 4 + metadata_bytes]), view[MESSAGE_OVERHEAD + metadata_bytes :]
+
+
+def _check_message(buffer: Buffer, at: int) -> None:
+    available = len(buffer) - at - MESSAGE_OVERHEAD
+    if available < 0:
+        raise BadSizes("message", MESSAGE_OVERHEAD, available + MESSAGE_OVERHEAD)
+    metadata_bytes = _U32.unpack_from(buffer, at)[0]
+    if metadata_bytes > available:
+        raise BadSizes("metadata", metadata_bytes, available)
+    data_bytes = _U32.unpack_from(buffer, at + 4 + metadata_bytes)[0]
+    if metadata_bytes + data_bytes != available:
+        raise BadSizes("data", data_bytes, available - metadata_bytes)
+
+
+class FrameDecoder:
+    """Cuts a byte stream, in whatever pieces it comes, into whole frames.
+
+    Two ways in: `feed` takes bytes; `space` and `advance` let a socket receive straight into the decoder, so a big
+    frame is copied nowhere. Declared sizes are judged before anything is reserved for them, and memory grows with
+    the bytes that really came, never with the bytes that were promised.
+
+    A frame above the limit finishes the decoder, because the next one cannot be found: the frames before it are
+    still returned, `error` is set, and whatever follows is ignored.
+    """
+
+    SMALL_BYTES = 64 << 10
+
+    def __init__(
+        self,
+        max_frame_bytes: int = MAX_FRAME_BYTES,
+        layout: Layout = MACS,
+        scratch: bytearray | None = None,
+    ) -> None:
+        """``scratch`` is where `space` receives small frames; decoders that are never filled at the same
+        time (connections of one event loop) may share one."""
+        self.max_frame_bytes = max_frame_bytes
+        self.layout = layout
+        self.error: FrameTooLarge | None = None
+        self._scratch = memoryview(scratch if scratch is not None else bytearray(self.SMALL_BYTES))
+        self._partial = bytearray()  # a frame that has begun; its length is what is reserved, not what has come
+        self._filled = 0
+        self._wanted = 0  # size of the whole partial frame; 0 while its header is incomplete
+
+    def feed(self, data: bytes | bytearray | memoryview) -> list[Frame]:
+        """Take the next bytes of the stream and return the frames that are now whole."""
+        frames: list[Frame] = []
+        view = memoryview(data)
+        while len(view) and not self.error:
+            space = self.space()
+            size = min(len(space), len(view))
+            space[:size] = view[:size]
+            del space  # an exported view would keep the partial frame from growing
+            frames += self.advance(size)
+            view = view[size:]
+        return frames
+
+    def space(self) -> memoryview:
+        """Where the next bytes of the stream belong. Never empty; give it back before calling `advance`."""
+        if not self._wanted:
+            return self._scratch
+        if self._filled == len(self._partial):
+            self._partial.extend(bytes(min(self._wanted, 2 * self._filled) - self._filled))
+        return memoryview(self._partial)[self._filled :]
+
+    def advance(self, size: int) -> list[Frame]:
+        """``size`` bytes were written to the start of `space`: return the frames that are now whole."""
+        if self.error:
+            return []
+        if self._wanted:
+            self._filled += size
+            return [self._finish()] if self._filled == self._wanted else []
+        received = self._scratch[:size]
+        if not self._partial:
+            return self._cut(bytes(received))
+        begun = bytes(self._partial) + received
+        self._partial = bytearray()
+        return self._cut(begun)
+
+    def _cut(self, data: bytes) -> list[Frame]:
+        """Cut whole frames off ``data`` and keep the rest as the beginning of the next one."""
+        layout = self.layout
+        header_bytes = layout.header_bytes
+        sizes_at = layout.destination_bytes
+        frames: list[Frame] = []
+        start = 0
+        end = len(data)
+        while end - start >= header_bytes:
+            management_bytes, message_bytes = _SIZES.unpack_from(data, start + sizes_at)
+            size = header_bytes + management_bytes + message_bytes
+            if size > self.max_frame_bytes:
+                self.error = FrameTooLarge(size, self.max_frame_bytes)
+                return frames
+            if size > end - start:
+                self._begin(data[start:], size)
+                return frames
+            frames.append(Frame(data[start : start + size], layout))
+            start += size
+        self._partial = bytearray(data[start:])
+        return frames
+
+    def _begin(self, data: bytes, wanted: int) -> None:
+        self._partial = bytearray(min(wanted, max(2 * len(data), self.SMALL_BYTES)))
+        self._partial[: len(data)] = data
+        self._filled = len(data)
+        self._wanted = wanted
+
+    def _finish(self) -> Frame:
+        frame = Frame(self._partial, self.layout)
+        self._partial = bytearray()
+        self._filled = self._wanted = 0
+        return frame
+
+
+class MessageDecoder:
+    """Cuts the stream that a TCP agent receives into whole messages (they have no header and no outer size)."""
+
+    def __init__(self, max_message_bytes: int = MAX_FRAME_BYTES) -> None:
+        self.max_message_bytes = max_message_bytes
+        self._buffer = bytearray()
+
+    def feed(self, data: Buffer) -> list[bytes]:
+        """Take the next bytes and return the messages that are now whole. Raises FrameTooLarge."""
+        self._buffer += data
+        messages = []
+        start = 0
+        while (size := self._message_size(start)) is not None and len(self._buffer) - start >= size:
+            messages.append(bytes(memoryview(self._buffer)[start : start + size]))
+            start += size
+        del self._buffer[:start]
+        return messages
+
+    def _message_size(self, at: int) -> int | None:
+        """Size of the message at ``at``, None while that is not known yet."""
+        available = len(self._buffer) - at
+        if available < 4:
+            return None
+        metadata_bytes: int = _U32.unpack_from(self._buffer, at)[0]
+        self._judge(MESSAGE_OVERHEAD + metadata_bytes)
+        if available < MESSAGE_OVERHEAD + metadata_bytes:
+            return None
+        data_bytes: int = _U32.unpack_from(self._buffer, at + 4 + metadata_bytes)[0]
+        self._judge(MESSAGE_OVERHEAD + metadata_bytes + data_bytes)
+        return MESSAGE_OVERHEAD + metadata_bytes + data_bytes
+
+    def _judge(self, size: int) -> None:
+        if size > self.max_message_bytes:
+            raise FrameTooLarge(size, self.max_message_bytes)

@@ -1,0 +1,35 @@
+"""What holds for a whole test run."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+NEED_ROS_TESTS = "MACS_NEED_ROS_TESTS"
+"""Set by ``make test`` and CI: a run in which no ROS test passed is a failed run."""
+
+
+class _RosTests:
+    """Counts the tests under tests/ros that ran and passed."""
+
+    def __init__(self) -> None:
+        self.passed = 0
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.when == "call" and report.passed and Path(report.nodeid.partition("::")[0]).parts[:2] == ("tests", "ros"):
+            self.passed += 1
+
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        if not self.passed and session.exitstatus == pytest.ExitCode.OK:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        verdict = f"ROS tests passed: {self.passed}"
+        terminalreporter.write_line(verdict if self.passed else f"{verdict}: this run proves too little, so it failed")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if os.environ.get(NEED_ROS_TESTS):
+        config.pluginmanager.register(_RosTests())

@@ -1,0 +1,144 @@
+"""The settings: ranges, errors that name file and field, and what reaches Zenoh."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from macs_zenoh import config
+from macs_zenoh.config import GatewaySettings, MeshSettings, RobotSettings, Settings
+from macs_zenoh.errors import ConfigError
+
+SHIPPED = sorted((Path(__file__).parents[2] / "config").glob("*.toml"))
+
+
+def test_an_empty_file_is_all_defaults() -> None:
+    """A settings file may be empty."""
+    assert config.parse("") == Settings()
+
+
+def test_a_file_sets_its_fields(tmp_path: Path) -> None:
+    """Each section of a file reaches its struct, and other fields keep their defaults."""
+    file = tmp_path / "macs.toml"
+    file.write_text(
+        '[mesh]\nconnect = ["tcp/10.0.0.1:7447"]\nlease_ms = 3000\n'
+        "[gateway]\nport = 7001\n"
+        "[robot]\nid = 7\ngroup = 3\n"
+    )
+    settings = config.load(file)
+    assert settings.mesh == MeshSettings(connect=["tcp/10.0.0.1:7447"], lease_ms=3000)
+    assert settings.gateway == GatewaySettings(port=7001)
+    assert settings.robot == RobotSettings(id=7, group=3)
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "problem"),
+    [
+        ("[gateway]\nprot = 1", "f.toml: gateway", "did you mean `port`?"),
+        ("[gatway]\nport = 1", "f.toml", "did you mean `gateway`?"),
+        ("[robot]\nwheels = 4", "f.toml: robot", "unknown name `wheels`"),
+        ("[gateway]\nport = 70000", "f.toml: gateway.port", "expected `int` <= 65535"),
+        ("[gateway]\nport = '7000'", "f.toml: gateway.port", "expected `int`, got `str`"),
+        ("[robot]\nid = 0", "f.toml: robot.id", ">= 1"),
+        ("[robot]\ngroup = 256", "f.toml: robot.group", "<= 255"),
+        ("[mesh]\nconnect = ['tcp/a:1', 5]", "f.toml: mesh.connect[1]", "expected `str`"),
+        ("[mesh]\nconnect = ['10.0.0.1:7447']", "f.toml: mesh.connect", "write tcp/10.0.0.1:7447"),
+        ("[mesh]\nlisten = ['everywhere']", "f.toml: mesh.listen", "as in tcp/"),
+        ("[mesh]\ntx_queue_batches = 17", "f.toml: mesh.tx_queue_batches", "<= 16"),
+        ("[mesh]\nretry_min_ms = 500", "f.toml: mesh.retry_min_ms", "above retry_max_ms, 200"),
+        ("[mesh]\noverrides = ['mode']", "f.toml: mesh.overrides", "not PATH:JSON5"),
+        ("[mesh]\nnamespace = 'a/**'", "f.toml: mesh.namespace", "not a plain key"),
+        ("[mesh]\nmode = 'broker'", "f.toml: mesh.mode", "broker"),
+        ("[mesh", "f.toml", "not TOML"),
+    ],
+)
+def test_an_error_names_file_and_field(text: str, path: str, problem: str) -> None:
+    """Whatever is wrong in a file, the error says where and what."""
+    with pytest.raises(ConfigError) as caught:
+        config.parse(text, "f.toml")
+    assert caught.value.path == path
+    assert problem in caught.value.problem
+
+
+def test_a_missing_file_is_a_config_error(tmp_path: Path) -> None:
+    """A file that cannot be read is named, with the reason."""
+    with pytest.raises(ConfigError, match=r"none\.toml: No such file"):
+        config.load(tmp_path / "none.toml")
+
+
+def test_a_file_that_is_not_text_is_a_config_error(tmp_path: Path) -> None:
+    """Bytes that are not UTF-8 are refused with their place."""
+    (tmp_path / "x.toml").write_bytes(b"[mesh]\n\xff")
+    with pytest.raises(ConfigError, match="not UTF-8 at byte 7"):
+        config.load(tmp_path / "x.toml")
+
+
+@pytest.mark.parametrize(
+    ("make", "path"),
+    [
+        (lambda: MeshSettings(tx_queue_batches=17), "mesh.tx_queue_batches"),
+        (lambda: MeshSettings(connect="tcp/127.0.0.1:7447"), "mesh.connect"),  # type: ignore[arg-type]
+        (lambda: config.changed(GatewaySettings(), port=-1), "gateway.port"),
+    ],
+)
+def test_ranges_hold_in_python_too(make: Any, path: str) -> None:
+    """A struct made in Python is checked like one from a file."""
+    with pytest.raises(ConfigError) as caught:
+        make()
+    assert caught.value.path == path
+
+
+def test_an_option_that_was_not_given_changes_nothing() -> None:
+    """`changed` leaves fields whose new value is None."""
+    settings = RobotSettings(id=7)
+    assert config.changed(settings, id=None, group=3) == RobotSettings(id=7, group=3)
+
+
+def test_zenoh_accepts_every_entry() -> None:
+    """Each path we write exists in Zenoh's configuration and keeps the value."""
+    every = MeshSettings(namespace="site1", tx_queue_batches=16, connect=["tcp/127.0.0.1:1"])
+    theirs = zenoh.Config()
+    for entry in every.zenoh():
+        theirs.insert_json5(entry.path, entry.json5)
+    for entry in every.zenoh():
+        got = json.loads(theirs.get_json(entry.path))
+        want = json.loads(entry.json5)
+        if isinstance(want, dict):  # Zenoh adds the members that were not given
+            got = {name: got[name] for name in want}
+        assert got == want, entry.path
+
+
+def test_only_what_was_asked_for_is_chosen() -> None:
+    """A default gives way to a Zenoh file, a field that was set does not."""
+    chosen = {entry.path for entry in MeshSettings(lease_ms=5000, mode="peer").zenoh() if entry.chosen}
+    assert chosen == {"mode", "transport/link/tx/lease"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "routers"),
+    [
+        (MeshSettings(), ["tcp/127.0.0.1:7447"]),
+        (MeshSettings(connect=["tcp/a:1"]), ["tcp/a:1"]),
+        (MeshSettings(mode="router"), []),
+        (MeshSettings(mode="peer"), []),
+        (MeshSettings(config_file="z.json5"), []),
+    ],
+)
+def test_a_client_without_endpoints_uses_the_local_router(settings: MeshSettings, routers: list[str]) -> None:
+    """Only a client that names no router, and no Zenoh file, falls back to the one on this host."""
+    assert settings.routers == routers
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+def test_shipped_files_load(path: Path) -> None:
+    """Every file in config/ is valid, also with all its comments taken for settings."""
+    config.load(path)
+    uncommented = "\n".join(
+        line.removeprefix("#") if line.startswith("#") and " = " in line else line
+        for line in path.read_text().splitlines()
+    )
+    config.parse(uncommented, path.name)

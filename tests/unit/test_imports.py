@@ -1,0 +1,87 @@
+"""Imports point one way: tests -> bridge -> macs_zenoh -> msgspec and eclipse-zenoh."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+CORE = sorted((ROOT / "macs_zenoh").rglob("*.py"))
+BRIDGE = sorted((ROOT / "bridge").rglob("*.py"))
+
+WITH_ZENOH = {"mesh.py"}
+WITH_ASYNCIO = {"mesh.py", "agent.py"}
+NEEDED_FROM_OUTSIDE = {"msgspec", "zenoh", "tomli"}
+INPUT_OUTPUT = {"socket", "socketserver", "selectors", "ssl", "subprocess", "multiprocessing", "rclpy", "bridge", "tests"}
+
+
+def imported(path: Path) -> Iterator[tuple[str, bool]]:
+    """The modules that a file imports, absolute, each with whether it is imported when the file is."""
+    package = path.relative_to(ROOT).with_suffix("").parts[:-1]
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    inside = {id(node) for scope in ast.walk(tree) if isinstance(scope, ast.FunctionDef | ast.AsyncFunctionDef)
+              for node in ast.walk(scope)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            names = [module, *(f"{module}.{alias.name}" for alias in node.names)]
+        else:
+            continue
+        for name in names:
+            yield name, id(node) not in inside
+
+
+def roots(path: Path) -> set[str]:
+    """The top-level packages that a file imports anywhere."""
+    return {name.partition(".")[0] for name, _ in imported(path)}
+
+
+def test_there_is_something_to_walk() -> None:
+    """The walk below covers real files."""
+    assert {path.name for path in CORE} >= {"wire.py", "keyexpr.py", "mesh.py", "agent.py", *WITH_ZENOH}
+    assert BRIDGE
+
+
+@pytest.mark.parametrize("path", CORE, ids=lambda path: path.name)
+def test_the_core_imports_no_input_or_output(path: Path) -> None:
+    """In macs_zenoh: no bridge, no ROS, no sockets; asyncio and zenoh only where they are said to be."""
+    used = roots(path)
+    assert not used & INPUT_OUTPUT
+    assert "zenoh" not in used or path.name in WITH_ZENOH
+    assert "asyncio" not in used or path.name in WITH_ASYNCIO
+
+
+@pytest.mark.parametrize("path", CORE, ids=lambda path: path.name)
+def test_the_core_needs_only_what_it_declares(path: Path) -> None:
+    """Everything macs_zenoh imports is the standard library, itself or a declared dependency."""
+    assert roots(path) <= sys.stdlib_module_names | NEEDED_FROM_OUTSIDE | {"macs_zenoh"}
+
+
+@pytest.mark.parametrize("path", [p for p in CORE if p.name not in WITH_ASYNCIO | {"__init__.py"}], ids=lambda p: p.name)
+def test_pure_modules_do_not_reach_back(path: Path) -> None:
+    """A pure module never imports the mesh or the agent API."""
+    assert not {name for name, _ in imported(path)} & {"macs_zenoh.mesh", "macs_zenoh.agent"}
+
+
+@pytest.mark.parametrize("path", BRIDGE, ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_bridge_does_not_import_tests_or_zenoh(path: Path) -> None:
+    """The bridge reaches Zenoh through macs_zenoh only, ROS only in the robot's packages, and never tests."""
+    used = roots(path)
+    assert not used & {"tests", "zenoh"}
+    if path.parent.name not in {"ros", "awareness"}:
+        assert "rclpy" not in used
+
+
+@pytest.mark.parametrize("path", [p for p in BRIDGE if p.parent.name == "cli"], ids=lambda path: path.name)
+def test_help_is_instant(path: Path) -> None:
+    """A CLI module imports what is heavy inside its functions, not when it is loaded."""
+    heavy = ("macs_zenoh.mesh", "macs_zenoh.agent", "macs_zenoh.join", "bridge.ros", "bridge.gateway", "bridge.headset")
+    at_once = {name for name, when_loaded in imported(path) if when_loaded}
+    assert not {name for name in at_once if name.startswith(heavy) or name.partition(".")[0] in {"zenoh", "rosbags"}}
