@@ -15,8 +15,10 @@ import logging
 import time
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import NamedTuple
+
+from msgspec import structs
 
 from . import blocks, keyexpr
 from .config import MeshSettings, changed
@@ -135,8 +137,7 @@ class Agent:
 
     def _stamp(self, metadata: Metadata) -> Metadata:
         """The metadata with its true sender."""
-        fields = {name: getattr(metadata, name) for name in metadata.__struct_fields__}
-        return Metadata(**{**fields, "sender_agent_type": self.type_number, "sender_agent_id": self.id})
+        return structs.replace(metadata, sender_agent_type=self.type_number, sender_agent_id=self.id)
 
     def _note_unknown(self, agent_type: int, agent_id: int) -> None:
         if (agent_type, agent_id) in self.directory:
@@ -303,9 +304,14 @@ class Agent:
 
     async def _wait_for_stale(self, agent_id: int) -> None:
         """Give the token of an earlier life of this agent the time of a lease to end."""
-        deadline = time.monotonic() + self.mesh.settings.lease_ms / 1000 + 1.0
-        while (self.type_number, agent_id) in self.directory and time.monotonic() < deadline:
-            await asyncio.sleep(0.05)
+        gone = asyncio.Event()
+        stale = (self.type_number, agent_id)
+        self.on_presence(lambda agent, online: gone.set() if agent.key == stale and not online else None)
+        if stale in self.directory:
+            log.info("%s/%d is still online; waiting for it to go", self.type, agent_id)
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(gone.wait(), self.mesh.settings.lease_ms / 1000 + 1.0)
+        self._on_presence.clear()
 
     async def _lease_id(self) -> None:
         tried: set[int] = set()

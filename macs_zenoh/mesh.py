@@ -41,6 +41,8 @@ class Traffic(Enum):
     STREAM = (zenoh.Priority.DATA, zenoh.CongestionControl.DROP, False)
     """Topic data: dropped when a link is full."""
 
+    __hash__ = object.__hash__  # Enum's own is a Python call, and each put needs it
+
 
 class Sample(NamedTuple):
     """What a subscription receives."""

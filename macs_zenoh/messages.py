@@ -237,6 +237,14 @@ def encode_data(value: Struct) -> bytes:
     return msgspec.json.encode(value)
 
 
+def correct_sender(metadata: bytes, agent_type: int, agent_id: int) -> bytes:
+    """The same metadata JSON with its true sender; unknown keys are kept. Raises BadJson."""
+    fields = _json_object("metadata", metadata)
+    names = _wire_names(Metadata)
+    spelled = {names.get(key, key): value for key, value in fields.items()}
+    return msgspec.json.encode({**spelled, "senderAgentType": agent_type, "senderAgentId": agent_id})
+
+
 @lru_cache(maxsize=1024)
 def node_name(tos_name: str) -> str:
     """The name of the interface node for a topic or service: ``/cmd_vel`` → ``nd__cmd_vel``. Names can collide."""

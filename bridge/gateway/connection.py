@@ -1,0 +1,203 @@
+"""One socket: bytes between a TCP agent and its `Peer`, and the queue of an agent that reads too slowly."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import time
+from collections import Counter
+from typing import Protocol
+
+from macs_zenoh.peer import Event, Left, Peer, Rejected, State
+from macs_zenoh.queues import Chunk, Outbox
+
+log = logging.getLogger("macs.gateway")
+
+WRITE_BUFFER_BYTES = 256 << 10
+"""What the transport may hold before messages wait in the outbox, where a call can still overtake topic data."""
+
+
+class Owner(Protocol):
+    """What a connection needs of its gateway."""
+
+    def opened(self, connection: Connection) -> Peer | None:
+        """A socket connected: its protocol, or None to refuse it."""
+
+    def handle(self, connection: Connection, event: Event) -> None:
+        """The agent did something."""
+
+    def closed(self, connection: Connection) -> None:
+        """The socket is gone."""
+
+    def stream_depth(self, connection: Connection, node: str) -> tuple[int, bool]:
+        """How many messages of a node may wait, and whether new ones are dropped rather than old ones."""
+
+
+class Connection(asyncio.BufferedProtocol):
+    """A TCP agent's socket. Everything it means is decided in `Peer` and by its gateway."""
+
+    def __init__(self, owner: Owner, *, outbox_bytes: int, stall_s: float) -> None:
+        self.owner = owner
+        self.peer: Peer
+        self.address = "?"
+        self.drops: Counter[str] = Counter()
+        self._outbox = Outbox(outbox_bytes)
+        self._stall_s = stall_s
+        self._transport: asyncio.Transport
+        self._ready: list[Chunk] = []
+        self._paused_at: float | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._complained: set[str] = set()
+        self._refused = False
+
+    @property
+    def agent_id(self) -> int:
+        """The id that this gateway gave to the connection."""
+        return self.peer.agent_id
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """(agent type, agent id)."""
+        return (self.peer.agent_type, self.peer.agent_id)
+
+    def __str__(self) -> str:
+        kind = {0: "agent", 1: "robot", 2: "headset"}.get(self.peer.agent_type, f"type {self.peer.agent_type}")
+        return f"{kind} {self.peer.agent_id} at {self.address}"
+
+    # -- asyncio -------------------------------------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        _tune(transport.get_extra_info("socket"))
+        peer_name = transport.get_extra_info("peername")
+        self.address = f"{peer_name[0]}:{peer_name[1]}" if peer_name else "?"
+        peer = self.owner.opened(self)
+        if peer is None:
+            self._refused = True
+            transport.abort()
+            return
+        self.peer = peer
+        transport.set_write_buffer_limits(high=WRITE_BUFFER_BYTES)
+        transport.write(peer.welcome())
+        self._schedule()
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        return self.peer.space()
+
+    def buffer_updated(self, nbytes: int) -> None:
+        self._events(self.peer.advance(nbytes, time.monotonic()))
+
+    def pause_writing(self) -> None:
+        self._paused_at = time.monotonic()
+        self._schedule()
+
+    def resume_writing(self) -> None:
+        self._paused_at = None
+        while self._outbox and self._paused_at is None:  # writing may pause us again
+            self._write(self._outbox.take(WRITE_BUFFER_BYTES))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._refused:
+            return
+        self.peer.lost()
+        self.owner.closed(self)
+
+    # -- in ------------------------------------------------------------------------------------------------------
+
+    def _events(self, events: list[Event]) -> None:
+        for event in events:
+            if isinstance(event, Rejected):
+                self.complain(type(event.error).__name__, str(event.error))
+            elif isinstance(event, Left):
+                self.close(event.reason)
+            else:
+                self.owner.handle(self, event)
+
+    # -- out -----------------------------------------------------------------------------------------------------
+
+    def send_call(self, message: Chunk) -> None:
+        """Send in order; kept while the agent does not read, disconnected when too much waits."""
+        if self._paused_at is None:
+            self._ready.append(message)
+        elif not self._outbox.put_call(message):
+            self.close(f"it does not read: {self._outbox.bytes} bytes are waiting")
+
+    def send_stream(self, node: str, message: Chunk) -> None:
+        """Send topic data of a node; the registration's buffer size bounds what waits."""
+        if self._paused_at is None:
+            self._ready.append(message)
+            return
+        depth, drop_new = self.owner.stream_depth(self, node)
+        self._outbox.put_stream(node, message, depth=depth, drop_new=drop_new)
+
+    @property
+    def waits(self) -> bool:
+        """Whether messages are gathered for the next `flush`."""
+        return bool(self._ready)
+
+    def flush(self) -> None:
+        """Write what was sent since the last flush, in one go."""
+        if self._ready:
+            ready, self._ready = self._ready, []
+            self._write(ready)
+
+    def _write(self, chunks: list[Chunk]) -> None:
+        if chunks and not self._transport.is_closing():
+            self._transport.writelines(chunks)
+
+    # -- life ----------------------------------------------------------------------------------------------------
+
+    def complain(self, name: str, problem: str) -> None:
+        """Count something that was dropped; the first of a kind is logged."""
+        self.drops[name] += 1
+        if name not in self._complained:
+            self._complained.add(name)
+            log.warning("%s: %s (logged once, counted as %s)", self, problem, name)
+
+    def close(self, reason: str) -> None:
+        """Send what is gathered, then FIN."""
+        if self._transport.is_closing():
+            return
+        self.peer.lost()
+        level = logging.INFO if reason == "went offline" else logging.WARNING
+        log.log(level, "%s leaves: %s", self, reason)
+        self.flush()
+        if self._paused_at is None:
+            self._transport.close()
+        else:
+            self._transport.abort()  # it does not read: closing politely would wait for ever
+
+    def all_drops(self) -> Counter[str]:
+        """Everything that was dropped for this agent, by name."""
+        return self.drops + self.peer.drops + self._outbox.drops
+
+    def _schedule(self) -> None:
+        """Look again when time may have run out; sooner is never needed."""
+        if self._timer is not None:
+            self._timer.cancel()
+        due = self.peer.next_deadline()
+        if self._paused_at is not None:
+            due = min(due, self._paused_at + self._stall_s)
+        delay_s = max(0.0, due - time.monotonic()) + 0.001
+        self._timer = asyncio.get_running_loop().call_later(delay_s, self._tick)
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        self._events(self.peer.tick(now))
+        if self._paused_at is not None and now >= self._paused_at + self._stall_s:
+            self.close(f"it has not read for {self._stall_s:g} s")
+        if self.peer.state is not State.GONE:
+            self._schedule()
+
+
+def _tune(sock: socket.socket) -> None:
+    """No delay for small messages; dead hosts are noticed within about 20 s even where heartbeats are off."""
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 3), ("TCP_KEEPCNT", 3)):
+        if hasattr(socket, name):
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

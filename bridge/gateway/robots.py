@@ -1,0 +1,137 @@
+"""What a gateway asks of robots for its headsets: interface nodes added and removed, by calls that are answered.
+
+Each call is one task per robot and node; a newer one for the same node replaces it. A robot that does not answer is
+asked again while it is online; a refusal is final until the headset asks again or the robot comes back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from macs_zenoh.directory import Change, Directory
+from macs_zenoh.errors import Refused, Unreachable
+from macs_zenoh.keyexpr import CALL
+from macs_zenoh.mesh import Mesh
+from macs_zenoh.messages import ROS, AddNode, Metadata, NodeType, RemoveNode, encode_data
+from macs_zenoh.registrations import AgentKey, Registrations, Robots, Task
+from macs_zenoh.wire import Layout, encode_frame, encode_message
+
+log = logging.getLogger("macs.gateway")
+
+CALL_TIMEOUT_S = 2.0
+RETRY_S = 0.5
+
+TaskKey = tuple[int, AgentKey, int, str]
+
+
+class RobotCalls:
+    """Registrations of this gateway's headsets, and the calls that make them true on the robots."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        directory: Directory,
+        layout: Layout,
+        *,
+        on_streams: Callable[[set[tuple[int, str]]], None],
+    ) -> None:
+        self._mesh = mesh
+        self._directory = directory
+        self._layout = layout
+        self._on_streams = on_streams
+        self._registrations = Registrations()
+        self._running: dict[TaskKey, asyncio.Task[None]] = {}
+
+    def close(self) -> None:
+        """End all calls."""
+        for running in self._running.values():
+            running.cancel()
+
+    def register(self, node: AddNode | RemoveNode, robot_ids: list[int], groups: list[int]) -> None:
+        """A headset registers on, or leaves, a node of these robots."""
+        robots = self._robots()
+        if isinstance(node, AddNode):
+            tasks = self._registrations.add(node, robot_ids, groups, robots)
+        else:
+            tasks = self._registrations.remove(node, robot_ids, groups, robots)
+        self._streams_changed()
+        for task in tasks:
+            self._start(task)
+
+    def leave(self, agent: AgentKey) -> None:
+        """A headset is gone. Robots drop it when its presence ends; here it is only forgotten."""
+        self._registrations.leave(agent)
+        self._streams_changed()
+
+    def find(self, agent: AgentKey, node_type: int, node_name: str) -> AddNode | None:
+        """What an agent registered on a node."""
+        return self._registrations.find(agent, node_type, node_name)
+
+    def presence(self, change: Change) -> None:
+        """A robot that comes, comes back or changes its group is told everything that is registered for it."""
+        agent, online = change
+        if agent.type != ROS:
+            return
+        if online:
+            for task in self._registrations.of_robot(agent.id, agent.group):
+                self._start(task)
+        self._streams_changed()
+
+    def repeat_all(self) -> None:
+        """Our own link was lost: robots may have seen our headsets leave, so tell them everything again."""
+        for robot_id, group in self._robots().items():
+            for task in self._registrations.of_robot(robot_id, group):
+                self._start(task)
+
+    def _robots(self) -> Robots:
+        return {agent.id: agent.group for agent in self._directory if agent.type == ROS}
+
+    def _streams_changed(self) -> None:
+        self._on_streams(self._registrations.streams(NodeType.SUBSCRIBER, self._robots()))
+
+    def _start(self, task: Task) -> None:
+        node = task.node
+        key = (task.robot_id, (node.registrant_agent_type, node.registrant_agent_id), node.node_type, node.node_name)
+        if (before := self._running.pop(key, None)) is not None:
+            before.cancel()
+        running = asyncio.get_running_loop().create_task(self._run(task))
+        self._running[key] = running
+        running.add_done_callback(lambda done: self._running.pop(key) if self._running.get(key) is done else None)
+
+    async def _run(self, task: Task) -> None:
+        node = task.node
+        what = f"headset {node.registrant_agent_id}: {_describe(node)} on robot {task.robot_id}"
+        while True:
+            try:
+                await self._ask(task)
+                log.info("%s: done", what)
+                return
+            except Refused as refusal:
+                log.warning("%s was refused: %s", what, refusal.reason)
+                return
+            except Unreachable as error:
+                log.debug("%s: %s", what, error)
+            await asyncio.sleep(RETRY_S)
+            if isinstance(node, RemoveNode):
+                if task.robot_id not in self._robots():
+                    return
+            elif not self._registrations.holds(task, self._robots()):
+                return
+
+    async def _ask(self, task: Task) -> None:
+        node = task.node
+        sender = (node.registrant_agent_type, node.registrant_agent_id)
+        verb = "add_node" if isinstance(node, AddNode) else "remove_node"
+        key = CALL.of(type=ROS, id=task.robot_id, verb=verb, from_type=sender[0], from_id=sender[1])
+        metadata = Metadata(*sender, message_manager=node.manager)
+        message = encode_message(metadata.encode(), encode_data(node))
+        frame = encode_frame(ROS, (task.robot_id,), message=message, layout=self._layout)
+        await self._mesh.query(key, frame, timeout_s=CALL_TIMEOUT_S)
+
+
+def _describe(node: AddNode | RemoveNode) -> str:
+    kind = NodeType(node.node_type).name.lower() if node.node_type in list(NodeType) else f"node type {node.node_type}"
+    verb = "add" if isinstance(node, AddNode) else "remove"
+    return f"{verb} {kind} {getattr(node, 'tos_name', '') or node.node_name}"

@@ -1,0 +1,350 @@
+"""One TCP agent, as a gateway sees it: bytes in, events and bytes out, time passed in. No socket, no clock.
+
+::
+
+    GREETED ── configuration ──> ONLINE ── go-offline, silence, fatal error ──> GONE
+       └────────────── handshake limit, fatal error ─────────────────────────────┘
+
+The connection's own id is the truth. What the agent's JSON says about its sender is corrected where it differs:
+existing headsets send id 0 from nodes made before the handshake and old ids from nodes kept across a reconnect.
+Frames that come before the configuration are held until it is there, because headsets do send registrations first.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from enum import Enum
+from typing import NamedTuple
+
+from msgspec import structs
+
+from .errors import BadField, NotAllowed, WireError
+from .messages import (
+    ROS,
+    AddNode,
+    Configuration,
+    Functionality,
+    GoOffline,
+    Heartbeat,
+    Management,
+    Metadata,
+    OnlineRequest,
+    Registration,
+    RemoveNode,
+    StreamData,
+    Welcome,
+    correct_sender,
+    decode_data,
+    decode_management,
+    encode_data,
+)
+from .wire import MACS, MAX_FRAME_BYTES, Frame, FrameDecoder, Layout, encode_frame, encode_message
+
+
+class State(Enum):
+    """Where an agent stands."""
+
+    GREETED = "greeted"
+    ONLINE = "online"
+    GONE = "gone"
+
+
+class Limits(NamedTuple):
+    """What one TCP agent may cost, and how long it may be silent."""
+
+    max_frame_bytes: int = MAX_FRAME_BYTES
+    handshake_s: float = 10.0
+    silence_s: float = 10.0
+    held_frames: int = 256
+    held_bytes: int = 1 << 20
+
+
+DEFAULT_LIMITS = Limits()
+
+
+class Joined(NamedTuple):
+    """The agent told its type and group, for the first time or differently than before."""
+
+    agent_type: int
+    group: int
+    functionality: Functionality | None
+
+
+class Sent(NamedTuple):
+    """A frame for other agents. Its sizes add up and its sender is true."""
+
+    frame: Frame
+    metadata: Metadata
+
+
+class Streamed(NamedTuple):
+    """Topic data of a robot, for the registrants in ``targets``: agent type → ids."""
+
+    frame: Frame
+    metadata: Metadata
+    targets: dict[int, list[int]]
+
+
+class Registering(NamedTuple):
+    """The agent registers on, or leaves, an interface node of these robots and groups of robots."""
+
+    node: AddNode | RemoveNode
+    robot_ids: list[int]
+    groups: list[int]
+
+
+class AskedOnline(NamedTuple):
+    """The agent asks who is online; the answer carries this request id."""
+
+    request_id: int
+
+
+class Rejected(NamedTuple):
+    """A frame was not accepted. The connection goes on unless a `Left` follows."""
+
+    error: WireError
+
+
+class Left(NamedTuple):
+    """The agent is gone; ``reason`` is for the log. Close the connection."""
+
+    reason: str
+
+
+Event = Joined | Sent | Streamed | Registering | AskedOnline | Rejected | Left
+
+
+class Peer:
+    """The protocol of one TCP agent.
+
+    ``drops`` counts, by name, what was not passed on; ``corrected`` counts frames whose sender had to be put right.
+    """
+
+    METADATA_CACHE = 512
+
+    def __init__(
+        self,
+        agent_id: int,
+        connection_number: int,
+        now: float,
+        *,
+        limits: Limits = DEFAULT_LIMITS,
+        layout: Layout = MACS,
+        scratch: bytearray | None = None,
+    ) -> None:
+        self.agent_id = agent_id
+        self.connection_number = connection_number
+        self.agent_type = 0
+        self.group = 0
+        self.state = State.GREETED
+        self.drops: Counter[str] = Counter()
+        self.corrected = 0
+        self._limits = limits
+        self._layout = layout
+        self._decoder = FrameDecoder(limits.max_frame_bytes, layout, scratch)
+        self._held: deque[Frame] = deque()
+        self._held_bytes = 0
+        self._connected_at = now
+        self._heard_at = now
+        # headsets repeat the same metadata for every message of a topic: decode and correct each one once
+        self._metadata: dict[bytes, tuple[Metadata, bytes | None]] = {}
+
+    def __repr__(self) -> str:
+        return f"agent {self.agent_id} ({self.state.value})"
+
+    # -- out -----------------------------------------------------------------------------------------------------
+
+    def welcome(self) -> bytes:
+        """The first message on every connection; agents give up when anything else comes before it."""
+        metadata = Metadata(request_id=self.connection_number, message_manager=Welcome.manager)
+        return encode_message(metadata.encode(), encode_data(Welcome(agent_id=self.agent_id)))
+
+    # -- in ------------------------------------------------------------------------------------------------------
+
+    def space(self) -> memoryview:
+        """Where the next received bytes belong; then call `advance`."""
+        return self._decoder.space()
+
+    def advance(self, size: int, now: float) -> list[Event]:
+        """``size`` bytes were received into `space`."""
+        if self.state is State.GONE:
+            return []
+        self._heard_at = now
+        events: list[Event] = []
+        for frame in self._decoder.advance(size):
+            try:
+                frame.check()
+                self._frame(frame, events)
+            except WireError as error:
+                self.drops[type(error).__name__] += 1
+                events.append(Rejected(error))
+            if self._gone():
+                return events
+        if self._decoder.error is not None:
+            self.drops["FrameTooLarge"] += 1
+            events += [Rejected(self._decoder.error), self._leave("its next frame cannot be found")]
+        return events
+
+    def receive(self, data: bytes, now: float) -> list[Event]:
+        """The same for bytes that are already somewhere."""
+        events: list[Event] = []
+        view = memoryview(data)
+        while len(view):
+            space = self.space()
+            size = min(len(space), len(view))
+            space[:size] = view[:size]
+            del space
+            events += self.advance(size, now)
+            view = view[size:]
+        return events
+
+    def next_deadline(self) -> float:
+        """When `tick` is due at the latest."""
+        if self.state is State.GREETED:
+            return self._connected_at + self._limits.handshake_s
+        return self._heard_at + self._limits.silence_s
+
+    def tick(self, now: float) -> list[Event]:
+        """Judge the time that has passed."""
+        if self.state is State.GONE or now < self.next_deadline():
+            return []
+        if self.state is State.GREETED:
+            return [self._leave(f"no configuration within {self._limits.handshake_s:g} s")]
+        return [self._leave(f"silent for {self._limits.silence_s:g} s")]
+
+    def lost(self) -> None:
+        """The connection has ended."""
+        self.state = State.GONE
+
+    # -- frames --------------------------------------------------------------------------------------------------
+
+    def _frame(self, frame: Frame, events: list[Event]) -> None:
+        if frame.has_management:
+            management = decode_management(frame.management)
+            if isinstance(management, Configuration):
+                self._configure(management, events)
+                return
+            if isinstance(management, Heartbeat):
+                return
+            if isinstance(management, GoOffline):
+                self._go_offline(management, events)
+                return
+            if self.state is State.ONLINE:
+                events.append(self._manage(management, frame))
+                return
+        elif self.state is State.ONLINE:
+            events.append(self._sent(frame))
+            return
+        self._hold(frame)
+
+    def _hold(self, frame: Frame) -> None:
+        if len(self._held) >= self._limits.held_frames or self._held_bytes + len(frame.data) > self._limits.held_bytes:
+            self.drops["before_configuration"] += 1
+            return
+        self._held.append(frame)
+        self._held_bytes += len(frame.data)
+
+    def _configure(self, configuration: Configuration, events: list[Event]) -> None:
+        """The first configuration counts, whatever id and request it names; a later one may change the group."""
+        kind, group = configuration.agent_type, configuration.group_id
+        if kind == 0:
+            raise BadField("configuration", "agent type 0 is no agent")
+        if self.state is State.ONLINE:
+            if kind != self.agent_type:
+                raise NotAllowed(f"a configured agent of type {self.agent_type} cannot become type {kind}")
+            if group == self.group:
+                return
+        self.state = State.ONLINE
+        self.agent_type, self.group = kind, group
+        self._metadata.clear()
+        events.append(Joined(kind, group, configuration.functionality))
+        while self._held:
+            frame = self._held.popleft()
+            self._held_bytes -= len(frame.data)
+            try:
+                self._frame(frame, events)
+            except WireError as error:
+                self.drops[type(error).__name__] += 1
+                events.append(Rejected(error))
+
+    def _go_offline(self, message: GoOffline, events: list[Event]) -> None:
+        if message.agent_id not in (0, self.agent_id):
+            raise NotAllowed(f"agent {self.agent_id} cannot send agent {message.agent_id} offline")
+        events.append(self._leave("went offline"))
+
+    def _manage(self, management: Management, frame: Frame) -> Event:
+        if isinstance(management, OnlineRequest):
+            return AskedOnline(self._decode(frame).request_id)
+        if isinstance(management, Registration):
+            return self._registration(management, frame)
+        if isinstance(management, StreamData):
+            return self._stream(management, frame)
+        raise NotAllowed(f"{management.manager} is not for an agent to send")
+
+    def _registration(self, registration: Registration, frame: Frame) -> Registering:
+        manager = self._decode(frame).message_manager
+        node: AddNode | RemoveNode
+        if manager == AddNode.manager:
+            node = decode_data(AddNode, frame.body)
+        elif manager == RemoveNode.manager:
+            node = decode_data(RemoveNode, frame.body)
+        else:
+            raise BadField("registration", f"its message is neither {AddNode.manager} nor {RemoveNode.manager}")
+        if (node.registrant_agent_type, node.registrant_agent_id) != (self.agent_type, self.agent_id):
+            self.corrected += 1
+            node = structs.replace(node, registrant_agent_type=self.agent_type, registrant_agent_id=self.agent_id)
+        return Registering(node, registration.registrar_agent_ids, registration.registrar_group_ids)
+
+    def _stream(self, stream: StreamData, frame: Frame) -> Streamed:
+        if self.agent_type != ROS:
+            raise NotAllowed("only a robot sends topic data")
+        targets = {int(kind): ids for kind, ids in stream.dest_agents.items() if kind.isascii() and kind.isdigit()}
+        sent = self._sent(frame)
+        return Streamed(sent.frame, sent.metadata, targets)
+
+    def _sent(self, frame: Frame) -> Sent:
+        raw = frame.metadata
+        known = self._metadata.get(raw)
+        if known is None:
+            known = self._judge(raw)
+        metadata, corrected = known
+        if corrected is not None:
+            self.corrected += 1
+            frame = self._with_metadata(frame, corrected)
+        return Sent(frame, metadata)
+
+    def _judge(self, raw: bytes) -> tuple[Metadata, bytes | None]:
+        if not raw:
+            raise BadField("metadata", "a message for other agents needs metadata")
+        metadata = Metadata.decode(raw)
+        corrected = None
+        if (metadata.sender_agent_type, metadata.sender_agent_id) != (self.agent_type, self.agent_id):
+            corrected = correct_sender(raw, self.agent_type, self.agent_id)
+            metadata = Metadata.decode(corrected)
+        if len(self._metadata) >= self.METADATA_CACHE:
+            self._metadata.clear()
+        self._metadata[raw] = (metadata, corrected)
+        return metadata, corrected
+
+    def _with_metadata(self, frame: Frame, metadata: bytes) -> Frame:
+        header = frame.header
+        data = encode_frame(
+            header.agent_type,
+            header.ids,
+            header.groups,
+            management=frame.management,
+            message=encode_message(metadata, frame.body),
+            layout=self._layout,
+        )
+        return Frame(data, self._layout)
+
+    def _decode(self, frame: Frame) -> Metadata:
+        raw = frame.metadata
+        return Metadata.decode(raw) if raw else Metadata()
+
+    def _leave(self, reason: str) -> Left:
+        self.state = State.GONE
+        return Left(reason)
+
+    def _gone(self) -> bool:
+        return self.state is State.GONE

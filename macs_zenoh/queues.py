@@ -1,0 +1,95 @@
+"""What waits for one slow TCP agent: bounded, calls before topic data, every drop named. Pure."""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict, deque
+
+Chunk = bytes | memoryview
+
+
+class Outbox:
+    """Messages that wait until their agent reads again.
+
+    Calls, management and messages between agents are kept in order and go first. Topic data is kept per node: the
+    last ``depth`` messages, or the first with ``drop_new``, nodes taking turns. ``limit_bytes`` bounds all of it:
+    topic data gives way to anything, calls to nothing. One message may always wait, however large.
+
+    ``drops`` counts ``node_full_oldest``, ``node_full_newest`` and ``outbox_full``.
+    """
+
+    def __init__(self, limit_bytes: int) -> None:
+        self.limit_bytes = limit_bytes
+        self.bytes = 0
+        self.drops: Counter[str] = Counter()
+        self._calls: deque[Chunk] = deque()
+        self._streams: OrderedDict[str, deque[Chunk]] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._calls) + sum(map(len, self._streams.values()))
+
+    def __bool__(self) -> bool:
+        return bool(self._calls or self._streams)
+
+    def put_call(self, message: Chunk) -> bool:
+        """Keep a message in order. False when the limit is reached even without any topic data: the agent has
+        to be disconnected, because what comes next would be missed silently."""
+        self._make_room(len(message))
+        if self._over(len(message)):
+            self.drops["outbox_full"] += 1
+            return False
+        self._calls.append(message)
+        self.bytes += len(message)
+        return True
+
+    def put_stream(self, node: str, message: Chunk, *, depth: int, drop_new: bool) -> None:
+        """Keep topic data of one node, as its registration says."""
+        waiting = self._streams.get(node)
+        if waiting is not None and len(waiting) >= max(1, depth):
+            if drop_new:
+                self.drops["node_full_newest"] += 1
+                return
+            self._drop_oldest(node, "node_full_oldest")
+        if drop_new and self._over(len(message)):
+            self.drops["outbox_full"] += 1
+            return
+        self._make_room(len(message))
+        if self._over(len(message)):
+            self.drops["outbox_full"] += 1
+            return
+        self._streams.setdefault(node, deque()).append(message)
+        self.bytes += len(message)
+
+    def take(self, limit_bytes: int) -> list[Chunk]:
+        """The next messages to send, in order, up to about ``limit_bytes`` (at least one, if any)."""
+        taken: list[Chunk] = []
+        size = 0
+        while self and size < limit_bytes:
+            chunk = self._calls.popleft() if self._calls else self._next_stream()
+            taken.append(chunk)
+            size += len(chunk)
+        self.bytes -= size
+        return taken
+
+    def _next_stream(self) -> Chunk:
+        node, waiting = next(iter(self._streams.items()))
+        chunk = waiting.popleft()
+        del self._streams[node]
+        if waiting:
+            self._streams[node] = waiting  # to the back: nodes take turns
+        return chunk
+
+    def _over(self, size: int) -> bool:
+        return self.bytes > 0 and self.bytes + size > self.limit_bytes
+
+    def _make_room(self, size: int) -> None:
+        """Let the node with the most bytes give up its oldest message until the new one fits."""
+        while self._streams and self._over(size):
+            heaviest = max(self._streams, key=lambda node: sum(map(len, self._streams[node])))
+            self._drop_oldest(heaviest, "outbox_full")
+
+    def _drop_oldest(self, node: str, name: str) -> None:
+        waiting = self._streams[node]
+        self.bytes -= len(waiting.popleft())
+        if not waiting:
+            del self._streams[node]
+        self.drops[name] += 1
