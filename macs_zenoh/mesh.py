@@ -18,7 +18,7 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Awaitable, Callable, Iterable
 from enum import Enum
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import zenoh
@@ -44,12 +44,8 @@ class Traffic(Enum):
     __hash__ = object.__hash__  # Enum's own is a Python call, and each put needs it
 
 
-class Sample(NamedTuple):
-    """What a subscription receives."""
-
-    key: str
-    payload: bytes
-
+Sample = tuple[str, bytes]
+"""What a subscription receives: key and payload."""
 
 OnBatch = Callable[[list[Sample]], None]
 Handler = Callable[[str, bytes], Awaitable[bytes]]
@@ -121,10 +117,14 @@ class Mesh:
         self._session = session
         self._loop = asyncio.get_running_loop()
         self._loop_thread = threading.get_ident()
-        self._publishers: OrderedDict[tuple[str, Traffic], zenoh.Publisher] = OrderedDict()
+        self._publishers: dict[Traffic, OrderedDict[str, zenoh.Publisher]] = {kind: OrderedDict() for kind in Traffic}
         self._publishers_lock = threading.Lock()
-        self._sender = _Sender(backlog_bytes)
+        self._on_room: list[Callable[[], None]] = []
+        self._sender = _Sender(backlog_bytes, lambda: self._from_thread(self._room))
         self._routers: set[str] = set()
+        self._needs_router = settings.mode == "client"
+        self.linked = not self._needs_router
+        """Whether a router is connected now; always true for a router."""
         self._on_link: list[Callable[[bool], None]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._links = session.info.declare_transport_events_listener(self._transport_changed, history=True)
@@ -172,11 +172,6 @@ class Mesh:
     # -- links ---------------------------------------------------------------------------------------------------
 
     @property
-    def linked(self) -> bool:
-        """Whether a router (for a router: anybody) is connected now."""
-        return bool(self._routers) or self.settings.mode != "client"
-
-    @property
     def routers(self) -> list[str]:
         """Zenoh ids of the routers connected now."""
         return sorted(self._routers)
@@ -194,6 +189,7 @@ class Mesh:
     def _set_router(self, zid: str, up: bool) -> None:
         before = self.linked
         (self._routers.add if up else self._routers.discard)(zid)
+        self.linked = bool(self._routers) or not self._needs_router
         # losing one router of several shakes what we know about others just as losing the only one does
         if not up or not before:
             for callback in self._on_link:
@@ -214,11 +210,24 @@ class Mesh:
         """
         if not self.linked:
             self.drops["no_route"] += 1
-        publisher = self._publisher(key, traffic)
+        publisher = self._publishers[traffic].get(key) or self._declare(key, traffic)
         if traffic is not Traffic.CALL or (self._sender.idle and len(payload) <= self.LARGE_BYTES):
             _put(publisher, payload)
         elif not self._sender.put(publisher, payload):
             self.drops["backlog"] += 1
+
+    @property
+    def backlogged(self) -> bool:
+        """Whether so much waits to be sent that callers should slow down; `on_room` tells when it is over."""
+        return self._sender.backlogged
+
+    def on_room(self, callback: Callable[[], None]) -> None:
+        """Call ``callback`` whenever a backlog has gone."""
+        self._on_room.append(callback)
+
+    def _room(self) -> None:
+        for callback in self._on_room:
+            callback()
 
     def subscribe(self, key: str, on_batch: OnBatch) -> Subscription:
         """Receive samples in batches, in order per sender."""
@@ -234,40 +243,42 @@ class Mesh:
             if batch:
                 on_batch(batch)
 
-        def receive(sample: zenoh.Sample) -> None:
-            on_loop = threading.get_ident() == self._loop_thread
-            if not on_loop and not inbox.has_room():
-                self.drops["loop_behind"] += 1
-                return
-            inbox.queue.append(Sample(str(sample.key_expr), sample.payload.to_bytes()))
+        def receive_own(sample: zenoh.Sample) -> None:
+            inbox.queue.append((str(sample.key_expr), sample.payload.to_bytes()))
             if not inbox.waiting:
                 inbox.waiting = True
-                if on_loop:
+                if threading.get_ident() == self._loop_thread:
                     self._loop.call_soon(deliver)
                 else:
                     self._from_thread(deliver)
 
+        def receive(sample: zenoh.Sample) -> None:
+            if len(inbox.queue) >= inbox.LIMIT and not inbox.has_room():
+                self.drops["loop_behind"] += 1
+                return
+            inbox.queue.append((str(sample.key_expr), sample.payload.to_bytes()))
+            if not inbox.waiting:
+                inbox.waiting = True
+                self._from_thread(deliver)
+
         declare = self._session.declare_subscriber
         callback = zenoh.handlers.Callback
         return Subscription(
-            declare(key, callback(receive, indirect=False), allowed_origin=zenoh.Locality.SESSION_LOCAL),
+            declare(key, callback(receive_own, indirect=False), allowed_origin=zenoh.Locality.SESSION_LOCAL),
             declare(key, callback(receive, indirect=True), allowed_origin=zenoh.Locality.REMOTE),
         )
 
-    def _publisher(self, key: str, traffic: Traffic) -> zenoh.Publisher:
-        """The publisher for a key. A declared one sends nothing over the link while nobody there listens."""
-        name = (key, traffic)
-        publisher = self._publishers.get(name)
-        if publisher is not None:
-            return publisher
+    def _declare(self, key: str, traffic: Traffic) -> zenoh.Publisher:
+        """A publisher for a key: unlike a bare put, it sends nothing over the link while nobody there listens."""
         priority, congestion, express = traffic.value
+        publishers = self._publishers[traffic]
         with self._publishers_lock:
             publisher = self._session.declare_publisher(
                 key, priority=priority, congestion_control=congestion, express=express
             )
-            self._publishers[name] = publisher
-            if len(self._publishers) > self.PUBLISHERS:
-                self._publishers.popitem(last=False)  # undeclared when the last put with it is done
+            publishers[key] = publisher
+            if len(publishers) > self.PUBLISHERS:
+                publishers.popitem(last=False)  # undeclared when the last put with it is done
         return publisher
 
     # -- calls ---------------------------------------------------------------------------------------------------
@@ -386,8 +397,10 @@ class Mesh:
 class _Sender:
     """A thread that puts what may take long, in order. It starts with the first such payload."""
 
-    def __init__(self, limit_bytes: int) -> None:
+    def __init__(self, limit_bytes: int, on_room: Callable[[], None]) -> None:
+        self.backlogged = False
         self._limit_bytes = limit_bytes
+        self._on_room = on_room
         self._bytes = 0
         self._queue: deque[tuple[zenoh.Publisher, Payload]] = deque()
         self._wake = threading.Condition()
@@ -405,6 +418,7 @@ class _Sender:
             if self._closing or (self._bytes and self._bytes + len(payload) > self._limit_bytes):
                 return False
             self._bytes += len(payload)
+            self.backlogged = self._bytes > self._limit_bytes // 4
             self._queue.append((publisher, payload))
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="macs-sender", daemon=True)
@@ -431,6 +445,11 @@ class _Sender:
             _put(publisher, payload)
             with self._wake:
                 self._bytes -= len(payload)
+                relieved = self.backlogged and self._bytes < self._limit_bytes // 8
+                if relieved:
+                    self.backlogged = False
+            if relieved:
+                self._on_room()
 
 
 def _put(publisher: zenoh.Publisher, payload: Payload) -> None:

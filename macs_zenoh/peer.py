@@ -38,7 +38,7 @@ from .messages import (
     decode_management,
     encode_data,
 )
-from .wire import MACS, MAX_FRAME_BYTES, Frame, FrameDecoder, Layout, encode_frame, encode_message
+from .wire import MACS, MAX_FRAME_BYTES, Frame, FrameDecoder, Layout, encode_frame, encode_message, parse_frame
 
 
 class State(Enum):
@@ -70,11 +70,14 @@ class Joined(NamedTuple):
     functionality: Functionality | None
 
 
-class Sent(NamedTuple):
+class Sent:
     """A frame for other agents. Its sizes add up and its sender is true."""
 
-    frame: Frame
-    metadata: Metadata
+    __slots__ = ("frame", "metadata")
+
+    def __init__(self, frame: Frame, metadata: Metadata) -> None:
+        self.frame = frame
+        self.metadata = metadata
 
 
 class Streamed(NamedTuple):
@@ -174,6 +177,9 @@ class Peer:
         for frame in self._decoder.advance(size):
             try:
                 frame.check()
+                if self.state is State.ONLINE and not frame.has_management:
+                    events.append(self._sent(frame))
+                    continue
                 self._frame(frame, events)
             except WireError as error:
                 self.drops[type(error).__name__] += 1
@@ -336,7 +342,7 @@ class Peer:
             message=encode_message(metadata, frame.body),
             layout=self._layout,
         )
-        return Frame(data, self._layout)
+        return parse_frame(data, self._layout)
 
     def _decode(self, frame: Frame) -> Metadata:
         raw = frame.metadata

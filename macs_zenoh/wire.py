@@ -32,6 +32,9 @@ MESSAGE_OVERHEAD = 8
 EMPTY_MESSAGE = bytes(MESSAGE_OVERHEAD)
 """What configuration replies and heartbeats carry: no metadata, no data."""
 
+COPY_BYTES = 4096
+"""Below this, copying a part of a frame costs less than making a view of it."""
+
 _U32 = struct.Struct("<I")
 _SIZES = struct.Struct("<II")
 _U32_MAX = 0xFFFFFFFF
@@ -129,15 +132,17 @@ class Frame:
     """One whole frame, decoded only as far as asked.
 
     ``data`` is the frame's bytes as they came; nothing here copies them except `management`, `metadata` and
-    `destination`, which are short.
+    `destination`, which are short. What concerns the message is valid after `check`.
     """
 
-    __slots__ = ("_message_at", "data", "layout")
+    __slots__ = ("_body_at", "_message_at", "data", "layout")
 
-    def __init__(self, data: bytes | bytearray, layout: Layout = MACS) -> None:
+    def __init__(self, data: bytes | bytearray, layout: Layout, message_at: int) -> None:
+        """``message_at`` is where the message starts: header and management data end there."""
         self.data = data
         self.layout = layout
-        self._message_at = layout.header_bytes + _U32.unpack_from(data, layout.destination_bytes)[0]
+        self._message_at = message_at
+        self._body_at = 0
 
     @property
     def header(self) -> Header:
@@ -152,7 +157,7 @@ class Frame:
     @property
     def has_management(self) -> bool:
         """Whether the frame carries management data (then ids and groups in its header are ignored)."""
-        return bool(self._message_at > self.layout.header_bytes)
+        return self._message_at != self.layout.header_bytes
 
     @property
     def management(self) -> bytes:
@@ -160,26 +165,26 @@ class Frame:
         return bytes(self.data[self.layout.header_bytes : self._message_at])
 
     @property
-    def message(self) -> memoryview:
-        """The message part: what a TCP agent receives."""
-        return memoryview(self.data)[self._message_at :]
+    def message(self) -> bytes | memoryview:
+        """The message part: what a TCP agent receives. A copy when that is cheaper than a view."""
+        data = self.data
+        if len(data) <= COPY_BYTES and type(data) is bytes:
+            return data[self._message_at :]
+        return memoryview(data)[self._message_at :]
 
     @property
     def metadata(self) -> bytes:
-        """The metadata JSON of the message. Valid after `check`."""
-        at = self._message_at
-        return bytes(self.data[at + 4 : at + 4 + _U32.unpack_from(self.data, at)[0]])
+        """The metadata JSON of the message."""
+        return bytes(self.data[self._message_at + 4 : self._body_at - 4])
 
     @property
     def body(self) -> memoryview:
-        """The data part of the message. Valid after `check`."""
-        at = self._message_at
-        metadata_bytes = _U32.unpack_from(self.data, at)[0]
-        return memoryview(self.data)[at + MESSAGE_OVERHEAD + metadata_bytes :]
+        """The data part of the message."""
+        return memoryview(self.data)[self._body_at :]
 
     def check(self) -> None:
         """Raise BadSizes unless the sizes inside the message add up. A frame that fails must never be forwarded."""
-        _check_message(self.data, self._message_at)
+        self._body_at = _body_at(self.data, self._message_at)
 
 
 def parse_frame(data: bytes | bytearray, layout: Layout = MACS) -> Frame:
@@ -190,7 +195,7 @@ def parse_frame(data: bytes | bytearray, layout: Layout = MACS) -> Frame:
     declared = layout.header_bytes + management_bytes + message_bytes
     if declared != len(data):
         raise BadSizes("frame", declared, len(data))
-    frame = Frame(data, layout)
+    frame = Frame(data, layout, layout.header_bytes + management_bytes)
     frame.check()
     return frame
 
@@ -216,22 +221,28 @@ def encode_message(metadata: bytes, data: Buffer = b"") -> bytes:
 
 def split_message(message: Buffer) -> tuple[bytes, memoryview]:
     """Take a message apart into metadata JSON and data (a view into ``message``). Raises BadSizes."""
-    _check_message(message, 0)
-    metadata_bytes = _U32.unpack_from(message, 0)[0]
+    at = _body_at(message, 0)
     view = memoryview(message)
-    return bytes(view[4 : 4 + metadata_bytes]), view[MESSAGE_OVERHEAD + metadata_bytes :]
+    return bytes(view[4 : at - 4]), view[at:]
 
 
-def _check_message(buffer: Buffer, at: int) -> None:
-    available = len(buffer) - at - MESSAGE_OVERHEAD
+def _body_at(buffer: Buffer, at: int) -> int:
+    """Where the data of the message that starts at ``at`` and fills the rest of the buffer starts. Raises BadSizes."""
+    size = len(buffer)
+    try:
+        metadata_bytes = _U32.unpack_from(buffer, at)[0]
+        body_at: int = at + MESSAGE_OVERHEAD + metadata_bytes
+        if body_at + _U32.unpack_from(buffer, body_at - 4)[0] == size:
+            return body_at
+    except struct.error:
+        pass
+    available = size - at - MESSAGE_OVERHEAD
     if available < 0:
         raise BadSizes("message", MESSAGE_OVERHEAD, available + MESSAGE_OVERHEAD)
-    metadata_bytes = _U32.unpack_from(buffer, at)[0]
     if metadata_bytes > available:
         raise BadSizes("metadata", metadata_bytes, available)
-    data_bytes = _U32.unpack_from(buffer, at + 4 + metadata_bytes)[0]
-    if metadata_bytes + data_bytes != available:
-        raise BadSizes("data", data_bytes, available - metadata_bytes)
+    data_bytes = _U32.unpack_from(buffer, body_at - 4)[0]
+    raise BadSizes("data", data_bytes, available - metadata_bytes)
 
 
 class FrameDecoder:
@@ -261,6 +272,7 @@ class FrameDecoder:
         self._scratch = memoryview(scratch if scratch is not None else bytearray(self.SMALL_BYTES))
         self._partial = bytearray()  # a frame that has begun; its length is what is reserved, not what has come
         self._filled = 0
+        self._message_at = 0
         self._wanted = 0  # size of the whole partial frame; 0 while its header is incomplete
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[Frame]:
@@ -277,12 +289,15 @@ class FrameDecoder:
         return frames
 
     def space(self) -> memoryview:
-        """Where the next bytes of the stream belong. Never empty; give it back before calling `advance`."""
+        """Where the next bytes of the stream belong. Never empty; give it back before calling `advance`.
+
+        Never large either: an event loop may fill it many times before anything else gets its turn.
+        """
         if not self._wanted:
             return self._scratch
         if self._filled == len(self._partial):
             self._partial.extend(bytes(min(self._wanted, 2 * self._filled) - self._filled))
-        return memoryview(self._partial)[self._filled :]
+        return memoryview(self._partial)[self._filled : self._filled + self.SMALL_BYTES]
 
     def advance(self, size: int) -> list[Frame]:
         """``size`` bytes were written to the start of `space`: return the frames that are now whole."""
@@ -314,8 +329,9 @@ class FrameDecoder:
                 return frames
             if size > end - start:
                 self._begin(data[start:], size)
+                self._message_at = header_bytes + management_bytes
                 return frames
-            frames.append(Frame(data[start : start + size], layout))
+            frames.append(Frame(data[start : start + size], layout, header_bytes + management_bytes))
             start += size
         self._partial = bytearray(data[start:])
         return frames
@@ -327,7 +343,7 @@ class FrameDecoder:
         self._wanted = wanted
 
     def _finish(self) -> Frame:
-        frame = Frame(self._partial, self.layout)
+        frame = Frame(self._partial, self.layout, self._message_at)
         self._partial = bytearray()
         self._filled = self._wanted = 0
         return frame

@@ -7,10 +7,12 @@ import logging
 import socket
 import time
 from collections import Counter
-from typing import Protocol
+from typing import Protocol, cast
 
-from macs_zenoh.peer import Event, Left, Peer, Rejected, State
+from macs_zenoh.peer import Event, Left, Peer, Rejected, Sent, State
 from macs_zenoh.queues import Chunk, Outbox
+
+from .brake import Brake
 
 log = logging.getLogger("macs.gateway")
 
@@ -24,8 +26,14 @@ class Owner(Protocol):
     def opened(self, connection: Connection) -> Peer | None:
         """A socket connected: its protocol, or None to refuse it."""
 
+    def forward(self, connection: Connection, sent: Sent) -> None:
+        """The agent sent a frame to others."""
+
     def handle(self, connection: Connection, event: Event) -> None:
-        """The agent did something."""
+        """The agent did something else."""
+
+    def dirty(self, connection: Connection) -> None:
+        """The connection has messages to flush."""
 
     def closed(self, connection: Connection) -> None:
         """The socket is gone."""
@@ -50,6 +58,10 @@ class Connection(asyncio.BufferedProtocol):
         self._timer: asyncio.TimerHandle | None = None
         self._complained: set[str] = set()
         self._refused = False
+        self._pauses = 0
+        self.congested = False
+        """Whether so much waits for this agent that its senders should slow down."""
+        self.brake = Brake()
 
     @property
     def agent_id(self) -> int:
@@ -68,7 +80,7 @@ class Connection(asyncio.BufferedProtocol):
     # -- asyncio -------------------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
+        transport = cast(asyncio.Transport, transport)  # uvloop's is one without saying so
         self._transport = transport
         _tune(transport.get_extra_info("socket"))
         peer_name = transport.get_extra_info("peername")
@@ -97,6 +109,9 @@ class Connection(asyncio.BufferedProtocol):
         self._paused_at = None
         while self._outbox and self._paused_at is None:  # writing may pause us again
             self._write(self._outbox.take(WRITE_BUFFER_BYTES))
+        if self.congested and not self._outbox:
+            self.congested = False
+            self.brake.release()
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._timer is not None:
@@ -104,13 +119,16 @@ class Connection(asyncio.BufferedProtocol):
         if self._refused:
             return
         self.peer.lost()
+        self.brake.release()
         self.owner.closed(self)
 
     # -- in ------------------------------------------------------------------------------------------------------
 
     def _events(self, events: list[Event]) -> None:
         for event in events:
-            if isinstance(event, Rejected):
+            if type(event) is Sent:
+                self.owner.forward(self, event)
+            elif isinstance(event, Rejected):
                 self.complain(type(event.error).__name__, str(event.error))
             elif isinstance(event, Left):
                 self.close(event.reason)
@@ -122,22 +140,23 @@ class Connection(asyncio.BufferedProtocol):
     def send_call(self, message: Chunk) -> None:
         """Send in order; kept while the agent does not read, disconnected when too much waits."""
         if self._paused_at is None:
+            if not self._ready:
+                self.owner.dirty(self)
             self._ready.append(message)
         elif not self._outbox.put_call(message):
             self.close(f"it does not read: {self._outbox.bytes} bytes are waiting")
+        else:
+            self.congested = self._outbox.bytes > self._outbox.limit_bytes // 4
 
     def send_stream(self, node: str, message: Chunk) -> None:
         """Send topic data of a node; the registration's buffer size bounds what waits."""
         if self._paused_at is None:
+            if not self._ready:
+                self.owner.dirty(self)
             self._ready.append(message)
             return
         depth, drop_new = self.owner.stream_depth(self, node)
         self._outbox.put_stream(node, message, depth=depth, drop_new=drop_new)
-
-    @property
-    def waits(self) -> bool:
-        """Whether messages are gathered for the next `flush`."""
-        return bool(self._ready)
 
     def flush(self) -> None:
         """Write what was sent since the last flush, in one go."""
@@ -148,6 +167,18 @@ class Connection(asyncio.BufferedProtocol):
     def _write(self, chunks: list[Chunk]) -> None:
         if chunks and not self._transport.is_closing():
             self._transport.writelines(chunks)
+
+    def pause(self) -> None:
+        """Stop reading from the agent until as many `resume` as `pause` were called."""
+        self._pauses += 1
+        if self._pauses == 1 and not self._transport.is_closing():
+            self._transport.pause_reading()
+
+    def resume(self) -> None:
+        """Read again."""
+        self._pauses -= 1
+        if self._pauses == 0 and not self._transport.is_closing():
+            self._transport.resume_reading()
 
     # -- life ----------------------------------------------------------------------------------------------------
 

@@ -39,12 +39,15 @@ from macs_zenoh.messages import (
 )
 from macs_zenoh.peer import AskedOnline, Event, Joined, Limits, Peer, Registering, Sent, Streamed
 from macs_zenoh.routing import inbox, keys_of, takes_group_copy
-from macs_zenoh.wire import Frame, Header, Layout, encode_message, parse_frame
+from macs_zenoh.wire import Frame, FrameDecoder, Header, Layout, encode_message, parse_frame
 
+from .brake import Brake
 from .connection import Connection
 from .robots import RobotCalls
 
 log = logging.getLogger("macs.gateway")
+
+PUBLISHER = int(NodeType.PUBLISHER)
 
 SETTLE_S = 0.3
 """How long a claimed block waits for somebody else's claim on it to show up."""
@@ -71,7 +74,7 @@ class Gateway:
         self.drops: Counter[str] = Counter()
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
         self._limits = Limits(settings.max_frame_bytes, settings.handshake_s, settings.silence_s)
-        self._scratch = bytearray(256 << 10)  # sockets of one loop receive one after the other
+        self._scratch = bytearray(FrameDecoder.SMALL_BYTES)  # sockets of one loop receive one after the other
         self._connections: dict[int, Connection] = {}
         self._numbers = 0
         self._tokens: dict[Connection, Token] = {}
@@ -82,9 +85,11 @@ class Gateway:
         self._targets: dict[str, Connection | None] = {}
         self._metadata: dict[bytes, Metadata] = {}
         self._stream_targets: dict[bytes, dict[str, list[int]]] = {}
-        self._dirty: set[Connection] = set()
+        self._dirty: list[Connection] = []
         self._sweep: asyncio.TimerHandle | None = None
         self._server: asyncio.Server | None = None
+        self._brake = Brake()
+        mesh.on_room(self._brake.release)
         self._robots = RobotCalls(mesh, self.directory, self._layout, on_streams=self._subscribe_streams)
 
     # -- life ----------------------------------------------------------------------------------------------------
@@ -194,7 +199,6 @@ class Gateway:
         """Forget a connection; its presence ends at once."""
         self._connections.pop(connection.agent_id, None)
         self._routes.pop(connection, None)
-        self._dirty.discard(connection)
         self.drops += connection.all_drops()
         token = self._tokens.pop(connection, None)
         if token is not None:
@@ -212,9 +216,7 @@ class Gateway:
 
     def handle(self, connection: Connection, event: Event) -> None:
         """One thing a TCP agent did."""
-        if isinstance(event, Sent):
-            self._forward(connection, event)
-        elif isinstance(event, Streamed):
+        if isinstance(event, Streamed):
             self._forward_stream(connection, event)
         elif isinstance(event, Joined):
             self._joined(connection, event)
@@ -223,8 +225,9 @@ class Gateway:
         elif isinstance(event, AskedOnline):
             self._answer_online(connection, event.request_id)
 
-    def _forward(self, connection: Connection, event: Sent) -> None:
-        frame = event.frame
+    def forward(self, connection: Connection, sent: Sent) -> None:
+        """Put a frame on the keys of its destinations."""
+        frame = sent.frame
         destination = frame.destination
         routes = self._routes[connection]
         route = routes.get(destination)
@@ -240,9 +243,11 @@ class Gateway:
         for agent_id in route.header.ids:
             if (kind, agent_id) not in self.directory and kind != EVERYBODY:
                 connection.complain("unknown_agent", f"a message goes to {type_name(kind)}/{agent_id}, not online")
-        traffic = Traffic.COMMAND if event.metadata.node_type == NodeType.PUBLISHER else Traffic.CALL
+        traffic = Traffic.COMMAND if sent.metadata.node_type == PUBLISHER else Traffic.CALL
         for key in route.keys:
             self.mesh.put(key, frame.data, traffic)
+        if self.mesh.backlogged:
+            self._brake.hold(connection)
 
     def _forward_stream(self, connection: Connection, event: Streamed) -> None:
         key = STREAM.of(type=ROS, id=connection.agent_id, node=event.metadata.node_name or "_")
@@ -279,8 +284,17 @@ class Gateway:
                 if connection is None:
                     continue
             if (frame := self._frame(key, payload)) is not None:
-                self._deliver(connection, frame)
+                connection.send_call(frame.message)
+                if connection.congested:
+                    self._hold_sender(key, connection)
         self._flush()
+
+    def _hold_sender(self, key: str, receiver: Connection) -> None:
+        """Slow down a sender on this gateway. Those elsewhere are slowed by nobody: the outbox's limit decides."""
+        fields = UNICAST.parse(key)
+        sender = self._connections.get(int(fields["from_id"])) if fields else None
+        if fields and sender is not None and sender.key == (fields["from_type"], fields["from_id"]):
+            receiver.brake.hold(sender)
 
     def _find_target(self, key: str) -> Connection | None:
         fields = UNICAST.parse(key)
@@ -306,7 +320,7 @@ class Gateway:
             header = frame.header
             for connection in self._members(int(fields["type"]), int(fields["group"])):
                 if takes_group_copy(header, connection.agent_id, sender, connection.peer.agent_type):
-                    self._deliver(connection, frame)
+                    connection.send_call(frame.message)
         self._flush()
 
     def _broadcast(self, batch: list[Sample]) -> None:
@@ -318,7 +332,7 @@ class Gateway:
             sender = (fields["from_type"], fields["from_id"])
             for connection in self._tokens:
                 if connection.key != sender:
-                    self._deliver(connection, frame)
+                    connection.send_call(frame.message)
         self._flush()
 
     def _stream(self, batch: list[Sample]) -> None:
@@ -336,7 +350,6 @@ class Gateway:
                         and (str(connection.peer.agent_type) == agent_type)
                     ):
                         connection.send_stream(node, frame.message)
-                        self._dirty.add(connection)
         self._flush()
 
     def _registrants(self, frame: Frame) -> dict[str, list[int]]:
@@ -375,16 +388,16 @@ class Gateway:
         if self.drops["bad_frame"] == 1:
             log.warning("a frame on %s cannot be used: %s (logged once, counted as bad_frame)", key, error)
 
-    def _deliver(self, connection: Connection, frame: Frame) -> None:
-        connection.send_call(frame.message)
-        self._dirty.add(connection)
+    def dirty(self, connection: Connection) -> None:
+        """Remember a connection for the next flush."""
+        self._dirty.append(connection)
 
     def _call(self, connection: Connection, message: bytes) -> None:
         connection.send_call(message)
-        connection.flush()
+        self._flush()
 
     def _flush(self) -> None:
-        dirty, self._dirty = self._dirty, set()
+        dirty, self._dirty = self._dirty, []
         for connection in dirty:
             connection.flush()
 
