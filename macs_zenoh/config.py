@@ -232,8 +232,6 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     id: AgentId | None = None
     """Unset: lease a free one. Headsets address robots by number, so a robot in use has a fixed one."""
     group: GroupId = 0
-    call_timeout_s: Seconds = 5.0
-    """How long a service call waits for its answer, on either side."""
     max_nodes: Annotated[int, Meta(ge=1, le=10_000)] = 256
     """Interface nodes that headsets may have registered here at one time."""
 

@@ -90,7 +90,9 @@ class Directory:
         return self._release(agent)
 
     def link(self, up: bool, now: float) -> None:
-        """Our own connection to the routers changed."""
+        """Our own connection to the routers was lost, or is back."""
+        if up and self._linked:
+            return
         self._linked = up
         self._settled_at = now + self.grace_s
 

@@ -129,7 +129,7 @@ class Connection(asyncio.BufferedProtocol):
             if type(event) is Sent:
                 self.owner.forward(self, event)
             elif isinstance(event, Rejected):
-                self.complain(type(event.error).__name__, str(event.error))
+                self._warn_once(type(event.error).__name__, str(event.error))  # the peer has counted it
             elif isinstance(event, Left):
                 self.close(event.reason)
             else:
@@ -185,6 +185,9 @@ class Connection(asyncio.BufferedProtocol):
     def complain(self, name: str, problem: str) -> None:
         """Count something that was dropped; the first of a kind is logged."""
         self.drops[name] += 1
+        self._warn_once(name, problem)
+
+    def _warn_once(self, name: str, problem: str) -> None:
         if name not in self._complained:
             self._complained.add(name)
             log.warning("%s: %s (logged once, counted as %s)", self, problem, name)

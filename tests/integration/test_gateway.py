@@ -1,0 +1,301 @@
+"""The gateway over real sockets: what agents get from it, and what they cannot do to it or to each other."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+import pytest
+
+import macs_zenoh
+from bridge.gateway import Gateway
+from macs_zenoh.errors import ConfigError
+from macs_zenoh.messages import (
+    AddNode,
+    AgentsGone,
+    Configuration,
+    Metadata,
+    NodeType,
+    StreamData,
+    Welcome,
+    decode_data,
+    encode_management,
+)
+from macs_zenoh.wire import MessageDecoder, encode_frame, encode_message, split_message
+from tests.integration.conftest import Connect, StartGateway, until
+
+METADATA = Metadata(message_manager="Greeting").encode()
+
+
+class Socket:
+    """A TCP agent by hand, for what the well-behaved headset does not do."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader, self.writer = reader, writer
+        self._decoder = MessageDecoder()
+        self._messages: list[bytes] = []
+        self.id = 0
+
+    async def message(self) -> tuple[Metadata, bytes]:
+        """The next message; ConnectionError at the end of the stream."""
+        while not self._messages:
+            data = await asyncio.wait_for(self.reader.read(65536), 5)
+            if not data:
+                raise ConnectionError
+            self._messages += self._decoder.feed(data)
+        metadata, body = split_message(self._messages.pop(0))
+        return Metadata.decode(metadata), bytes(body)
+
+    async def greet(self) -> None:
+        """Take the first message, which gives the id."""
+        metadata, body = await self.message()
+        assert metadata.message_manager == Welcome.manager
+        self.id = decode_data(Welcome, body).agent_id
+
+    def configure(self, *, agent_type: int = 2, group: int = 0) -> None:
+        """Send the configuration reply."""
+        configuration = Configuration(agent_type=agent_type, agent_id=self.id, group_id=group, request_id=1)
+        self.writer.write(encode_frame(management=encode_management(configuration)))
+
+    async def online(self) -> tuple[list[int], list[int]]:
+        """Ask who is online: an answer also shows that everything before was dealt with."""
+        management = b'{"messageManager":"OnlineAgentsGetter"}'
+        self.writer.write(encode_frame(management=management, message=encode_message(Metadata(request_id=7).encode())))
+        while True:
+            metadata, body = await self.message()
+            if metadata.request_id == 7 and not metadata.message_manager:
+                answer = json.loads(body)
+                return answer["rosAgentIds"], answer["unityAgentIds"]
+
+
+@asynccontextmanager
+async def socket(gateway: Gateway) -> AsyncIterator[Socket]:
+    """A connection that has been greeted."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port)
+    agent = Socket(reader, writer)
+    try:
+        await agent.greet()
+        yield agent
+    finally:
+        writer.close()
+
+
+BAD_FRAMES = {
+    "management data that is no JSON": encode_frame(management=b"not json"),
+    "management data that is no object": encode_frame(management=b"[1]"),
+    "no manager": encode_frame(management=b'{"hello":1}'),
+    "unknown manager": encode_frame(management=b'{"messageManager":"os.system"}'),
+    "wrong type of a field": encode_frame(
+        management=b'{"messageManager":"RosAgentNodeRegistrationForwarder","nodeType":"x"}'
+    ),
+    "kicking another agent": encode_frame(management=b'{"messageManager":"UnityAgentclientRemover","agentId":77}'),
+    "a message of no bytes": encode_frame(2, (1,), message=b""),
+    "metadata of no bytes": encode_frame(2, (1,), message=encode_message(b"", b"data")),
+    "metadata that is no JSON": encode_frame(2, (1,), message=encode_message(b"\xff\x00", b"data")),
+    "inner sizes that lie": encode_frame(2, (1,), message=struct.pack("<I", 5) + b"{}" + bytes(20)),
+    "a headset sending topic data": encode_frame(
+        management=b'{"messageManager":"RosAgentSubscriberDataForwarder","destAgents":{"2":[1]}}',
+        message=encode_message(METADATA, b"x"),
+    ),
+    "nobody to send to": encode_frame(2, message=encode_message(METADATA, b"x")),
+    "nested beyond reason": encode_frame(management=b'{"a":' + b"[" * 20000),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FRAMES)
+async def test_a_bad_frame_costs_that_frame(name: str, start_gateway: StartGateway, connect: Connect) -> None:
+    """After a bad frame the connection goes on, it is counted, and a neighbour has seen nothing of it."""
+    gateway = await start_gateway()
+    neighbour = await connect(gateway)
+    async with socket(gateway) as agent:
+        agent.configure()
+        agent.writer.write(BAD_FRAMES[name])
+        good = encode_frame(2, (neighbour.id,), message=encode_message(METADATA, b"good"))
+        agent.writer.write(good)
+        message = await neighbour.receive(5)
+        assert bytes(message.data) == b"good"
+        assert (await agent.online())[1] == [neighbour.id, agent.id]
+        connection = gateway._connections[agent.id]
+        assert sum(connection.all_drops().values()) >= 1
+    assert neighbour.connected
+
+
+async def test_a_frame_too_large_costs_that_connection(start_gateway: StartGateway, connect: Connect) -> None:
+    """A header that declares 4 GiB closes its connection with FIN at once, and no other."""
+    gateway = await start_gateway()
+    neighbour = await connect(gateway)
+    async with socket(gateway) as agent:
+        agent.configure()
+        agent.writer.write(encode_frame(management=b'{"messageManager":"HeartbeatHandler"}'))
+        agent.writer.write(struct.pack("<B30xII", 2, 0, 0xFFFFFFFF))
+        with pytest.raises(ConnectionError):
+            await agent.message()
+    await until(lambda: gateway.drops["FrameTooLarge"] == 1)
+    assert (await neighbour.online()).unity_agent_ids == [neighbour.id]
+
+
+async def test_frames_before_the_configuration_are_kept(start_gateway: StartGateway, connect: Connect) -> None:
+    """What a headset sends before its configuration reply is done after it, with its true sender."""
+    gateway = await start_gateway()
+    neighbour = await connect(gateway)
+    async with socket(gateway) as agent:
+        lie = Metadata(sender_agent_type=2, sender_agent_id=0, message_manager="Greeting").encode()
+        agent.writer.write(encode_frame(2, (neighbour.id,), message=encode_message(lie, b"early")))
+        agent.configure()
+        message = await neighbour.receive(5)
+        assert (bytes(message.data), message.metadata.sender_agent_id) == (b"early", agent.id)
+
+
+async def test_nothing_comes_before_the_first_message(start_gateway: StartGateway, connect: Connect) -> None:
+    """A connection that has not answered its configuration gets no broadcast, and is not online."""
+    gateway = await start_gateway()
+    talker = await connect(gateway)
+    async with socket(gateway) as silent, socket(gateway) as listener:
+        listener.configure()
+        await listener.online()
+        await talker.send(b"to all", to=0, manager="Greeting")
+        metadata, body = await listener.message()
+        assert (metadata.message_manager, body) == ("Greeting", b"to all")
+        assert (await listener.online())[1] == sorted([talker.id, listener.id])
+        silent.configure()
+        await silent.online()  # the next message it sees is the answer to its own question
+
+
+async def test_silence_ends_a_connection(start_gateway: StartGateway, connect: Connect) -> None:
+    """Who does not answer the handshake, or is silent afterwards, is disconnected; the others are told at once."""
+    gateway = await start_gateway(handshake_s=0.3, silence_s=0.5)
+    async with socket(gateway) as mute, socket(gateway) as silent, socket(gateway) as watcher:
+        silent.configure()
+        watcher.configure()
+        with pytest.raises(ConnectionError):
+            await mute.message()
+        heartbeat = encode_frame(management=b'{"messageManager":"HeartbeatHandler"}')
+        beating = asyncio.create_task(_repeat(watcher.writer, heartbeat))
+        metadata, body = await watcher.message()
+        beating.cancel()
+        assert metadata.message_manager == AgentsGone.manager
+        assert json.loads(body) == {"agents": [{"agent_type": 2, "agent_id": silent.id}]}
+
+
+async def _repeat(writer: asyncio.StreamWriter, data: bytes) -> None:
+    while True:
+        writer.write(data)
+        await asyncio.sleep(0.1)
+
+
+async def test_ids_are_used_again(start_gateway: StartGateway, connect: Connect) -> None:
+    """Ids go from 1 up, and the id of an agent that left is the next to be given."""
+    gateway = await start_gateway()
+    first, second = await connect(gateway), await connect(gateway)
+    assert [first.id, second.id] == [1, 2]
+    await first.close()
+    while (await second.online()).unity_agent_ids != [2]:
+        await asyncio.sleep(0.01)
+    assert (await connect(gateway)).id == 1
+
+
+async def test_a_block_has_one_gateway(start_gateway: StartGateway) -> None:
+    """A second gateway on a leased block is refused with a clear error; without a wish it takes the next one."""
+    assert (await start_gateway(block=3)).block == 3
+    with pytest.raises(ConfigError, match="block 3 is another gateway's"):
+        await start_gateway(block=3)
+    assert (await start_gateway()).block == 0
+
+
+async def test_two_gateways_at_once_take_two_blocks(start_gateway: StartGateway) -> None:
+    """Gateways that start in the same moment do not share a block."""
+    gateways = await asyncio.gather(*(start_gateway() for _ in range(4)))
+    assert sorted(gateway.block for gateway in gateways) == [0, 1, 2, 3]
+
+
+async def test_an_existing_robot_program_is_reached(start_gateway: StartGateway, connect: Connect) -> None:
+    """A robot over TCP gets registrations and commands of headsets on another gateway, and its topic data arrives."""
+    gateway, other = await start_gateway(), await start_gateway()
+    headset = await connect(other)
+    async with socket(gateway) as robot:
+        robot.configure(agent_type=1)
+        while robot.id not in (await headset.online()).ros_agent_ids:
+            await asyncio.sleep(0.01)
+        subscription = await headset.subscribe("/chatter", "std_msgs/String", agents=[robot.id])
+        metadata, body = await robot.message()
+        node = decode_data(AddNode, body)
+        assert metadata.message_manager == AddNode.manager
+        assert (node.registrant_agent_id, node.tos_name) == (headset.id, "/chatter")
+        data = Metadata(1, robot.id, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__chatter", "std_msgs/String")
+        management = encode_management(StreamData({"2": [headset.id]}))
+        frame = encode_frame(1, management=management, message=encode_message(data.encode(), b"topic data"))
+        robot.writer.write(frame)
+        message = await asyncio.wait_for(subscription.__anext__(), 5)
+        assert bytes(message.data) == b"topic data"
+
+
+async def test_registrations_reach_robots_that_come_later(
+    router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """A robot that joins a registered group, or comes back, is told what headsets want of it."""
+    gateway = await start_gateway()
+    headset = await connect(gateway)
+    await headset.subscribe("/pose", "geometry_msgs/Pose", groups=[5])
+    await headset.subscribe("/scan", "sensor_msgs/LaserScan", agents=[9])
+    for _ in range(2):
+        wanted: asyncio.Queue[AddNode] = asyncio.Queue()
+
+        async def add(call: macs_zenoh.Call, wanted: asyncio.Queue[AddNode] = wanted) -> bytes:
+            wanted.put_nowait(decode_data(AddNode, call.data))
+            return b""
+
+        async with macs_zenoh.join("ros", id=9, group=5, connect=[router]) as robot:
+            robot.serve("add_node", add)
+            topics = {(await asyncio.wait_for(wanted.get(), 5)).tos_name for _ in range(2)}
+            assert topics == {"/pose", "/scan"}
+
+
+async def test_a_stalled_headset_is_let_go(router: str, start_gateway: StartGateway, connect: Connect) -> None:
+    """A headset that stops reading is disconnected after its time; its neighbour gets everything in order."""
+    gateway = await start_gateway(stall_s=0.5, outbox_bytes=1 << 20)
+    neighbour, stalled = await connect(gateway), await connect(gateway)
+    stalled.pause()
+    async with macs_zenoh.join("ros", id=1, connect=[router]) as robot:
+        metadata = Metadata(1, 1, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__image", "sensor_msgs/Image")
+        management = encode_management(StreamData({"2": [neighbour.id, stalled.id]}))
+        image = encode_frame(1, management=management, message=encode_message(metadata.encode(), bytes(200_000)))
+
+        async def add(call: macs_zenoh.Call) -> bytes:
+            return b""
+
+        robot.serve("add_node", add)
+        images = await neighbour.subscribe("/image", "sensor_msgs/Image", agents=[1])
+        await stalled.subscribe("/image", "sensor_msgs/Image", agents=[1])
+        left = asyncio.Event()
+        robot.on_presence(lambda agent, online: left.set() if agent.id == stalled.id and not online else None)
+        received = 0
+        while not left.is_set():
+            robot.publish_stream("nd__image", image)
+            with suppress(asyncio.TimeoutError):  # until the registration is there, nobody listens
+                message = await asyncio.wait_for(images.__anext__(), 0.1)
+                assert len(message.data) == 200_000
+                received += 1
+        assert received > 10
+        assert gateway.drops["node_full_oldest"] or gateway.drops["outbox_full"]
+
+
+async def test_encoding_of_the_first_message(start_gateway: StartGateway) -> None:
+    """The welcome carries the connection's number as request id, and the id in its data, as agents expect."""
+    gateway = await start_gateway()
+    reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port)
+    messages = MessageDecoder().feed(await asyncio.wait_for(reader.read(4096), 5))
+    metadata, body = split_message(messages[0])
+    assert json.loads(metadata) == {
+        "senderAgentType": None,
+        "senderAgentId": None,
+        "requestId": 1,
+        "messageManager": "AgentConfigurer",
+        "nodeType": 0,
+        "nodeName": "",
+        "dataExchangeType": "",
+    }
+    assert json.loads(bytes(body)) == {"agentId": 1}
+    writer.close()
