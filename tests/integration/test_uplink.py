@@ -1,0 +1,92 @@
+"""A robot's uplink carries one copy of a topic message, however many headsets receive it: bytes on the link."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+import macs_zenoh
+from macs_zenoh.messages import Metadata, NodeType, StreamData, encode_management
+from macs_zenoh.wire import encode_frame, encode_message
+from tests.integration.conftest import Connect, StartGateway
+
+IMAGE_BYTES = 100_000
+
+
+class Link:
+    """A TCP link to the router that counts what goes up."""
+
+    def __init__(self) -> None:
+        self.endpoint = ""
+        self.up_bytes = 0
+
+
+@asynccontextmanager
+async def counted(router: str) -> AsyncIterator[Link]:
+    """A counting relay in front of the router."""
+    link = Link()
+    host, _, port = router.removeprefix("tcp/").rpartition(":")
+    tasks: set[asyncio.Task[None]] = set()
+
+    async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, up: bool) -> None:
+        with suppress(ConnectionError):
+            while data := await reader.read(65536):
+                link.up_bytes += len(data) if up else 0
+                writer.write(data)
+                await writer.drain()
+        writer.close()
+
+    async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        router_reader, router_writer = await asyncio.open_connection(host, int(port))
+        tasks.add(asyncio.create_task(pump(reader, router_writer, up=True)))
+        tasks.add(asyncio.create_task(pump(router_reader, writer, up=False)))
+
+    server = await asyncio.start_server(accept, "127.0.0.1", 0)
+    link.endpoint = f"tcp/127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    try:
+        yield link
+    finally:
+        server.close()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def test_one_copy_for_any_number_of_headsets(router: str, start_gateway: StartGateway, connect: Connect) -> None:
+    """For 1 and for 20 headsets on two gateways, a message costs the robot's uplink its size once."""
+    gateways = [await start_gateway(), await start_gateway()]
+    async with counted(router) as link, macs_zenoh.join("ros", id=1, connect=[link.endpoint]) as robot:
+
+        async def add(call: macs_zenoh.Call) -> bytes:
+            return b""
+
+        robot.serve("add_node", add)
+        headsets = [await connect(gateways[number % 2]) for number in range(20)]
+        images = [await h.subscribe("/image", "sensor_msgs/Image", agents=[1]) for h in headsets]
+        metadata = Metadata(1, 1, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__image", "sensor_msgs/Image")
+        message = encode_message(metadata.encode(), bytes(IMAGE_BYTES))
+
+        def image(count: int) -> bytes:
+            targets = StreamData({"2": [headset.id for headset in headsets[:count]]})
+            return encode_frame(1, management=encode_management(targets), message=message)
+
+        async def deliver(count: int) -> None:
+            """Publish until every one of ``count`` headsets has a message: registrations take their way."""
+            arriving = [asyncio.ensure_future(stream.__anext__()) for stream in images[:count]]
+            while not all(arrival.done() for arrival in arriving):
+                robot.publish_stream("nd__image", image(count))
+                await asyncio.wait(arriving, timeout=0.2)
+
+        await asyncio.wait_for(deliver(20), 20)
+        cost = {}
+        for count in (1, 20):
+            before = link.up_bytes
+            for _ in range(10):
+                robot.publish_stream("nd__image", image(count))
+                for stream in images[:count]:
+                    received = await asyncio.wait_for(stream.__anext__(), 5)
+                    assert len(received.data) == IMAGE_BYTES
+            cost[count] = (link.up_bytes - before) / 10
+        for count, per_message in cost.items():
+            assert IMAGE_BYTES < per_message < 1.05 * IMAGE_BYTES, f"{count} headsets: {per_message} bytes a message"
