@@ -1,0 +1,69 @@
+"""Messages that come before the node they are for. Pure: the time is passed in."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+from macs_zenoh.agent import Message
+
+
+class NodeKey(NamedTuple):
+    """What identifies an interface node, on the robot and in every message."""
+
+    node_type: int
+    node_name: str
+
+
+class EarlyMessage(NamedTuple):
+    """A message that came before its node."""
+
+    deadline: float
+    message: Message
+
+
+class EarlyMessages:
+    """Messages that wait for their node's registration, few and not for long. Pure: the time is passed in."""
+
+    HOLD_S = 1.0
+    PER_NODE = 16
+    NODES = 64
+    BYTES = 8 << 20
+
+    def __init__(self) -> None:
+        self._waiting: dict[NodeKey, deque[EarlyMessage]] = {}
+        self._bytes = 0
+
+    def hold(self, key: NodeKey, message: Message, now: float) -> bool:
+        """Keep a message. True when one was lost for want of room: the node's oldest, or else this one."""
+        waiting = self._waiting.get(key)
+        if (waiting is None and len(self._waiting) >= self.NODES) or self._bytes + len(message.data) > self.BYTES:
+            return True
+        waiting = self._waiting.setdefault(key, deque())
+        waiting.append(EarlyMessage(now + self.HOLD_S, message))
+        self._bytes += len(message.data)
+        if len(waiting) > self.PER_NODE:
+            self._bytes -= len(waiting.popleft().message.data)
+            return True
+        return False
+
+    def take(self, key: NodeKey) -> list[Message]:
+        """The messages that wait for a node, oldest first."""
+        taken = [early.message for early in self._waiting.pop(key, ())]
+        self._bytes -= sum(len(message.data) for message in taken)
+        return taken
+
+    def expire(self, now: float) -> dict[NodeKey, int]:
+        """Give up those that waited too long: how many per node."""
+        expired: dict[NodeKey, int] = {}
+        for key, waiting in list(self._waiting.items()):
+            while waiting and waiting[0].deadline <= now:
+                self._bytes -= len(waiting.popleft().message.data)
+                expired[key] = expired.get(key, 0) + 1
+            if not waiting:
+                del self._waiting[key]
+        return expired
+
+    def next_deadline(self) -> float | None:
+        """When `expire` has something to do; None while nothing waits."""
+        return min((waiting[0].deadline for waiting in self._waiting.values()), default=None)

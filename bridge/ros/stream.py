@@ -1,0 +1,62 @@
+"""Topic data as bytes: CDR into frames, and what can be said of CDR without decoding it. Pure."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+
+from macs_zenoh.messages import ROS, Metadata, StreamData, encode_management
+from macs_zenoh.wire import MACS, Layout, encode_frame, encode_message
+
+_U32 = struct.Struct("<I")
+
+
+class StreamFraming:
+    """Puts topic data into frames: one concatenation per message, as only two sizes ever change.
+
+    ``registrants`` are (agent type, agent id). Made anew when the registrants change. Called in the ROS thread only.
+    """
+
+    def __init__(self, metadata: Metadata, registrants: Iterable[tuple[int, int]], layout: Layout = MACS) -> None:
+        receivers: dict[str, list[int]] = {}
+        for agent_type, agent_id in sorted(registrants):
+            receivers.setdefault(str(agent_type), []).append(agent_id)
+        frame = encode_frame(
+            ROS,
+            management=encode_management(StreamData(receivers)),
+            message=encode_message(metadata.encode()),
+            layout=layout,
+        )
+        self._empty = frame
+        self._message_size_at = layout.header_bytes - 4
+        self._empty_message_bytes = _U32.unpack_from(frame, self._message_size_at)[0]
+        self._prefix = frame
+        self._cdr_bytes = 0
+
+    def __call__(self, cdr: bytes) -> bytes:
+        if len(cdr) != self._cdr_bytes:
+            self._resize(len(cdr))
+        return self._prefix + cdr
+
+    def _resize(self, cdr_bytes: int) -> None:
+        prefix = bytearray(self._empty)
+        _U32.pack_into(prefix, self._message_size_at, self._empty_message_bytes + cdr_bytes)
+        _U32.pack_into(prefix, len(prefix) - 4, cdr_bytes)
+        self._prefix = bytes(prefix)
+        self._cdr_bytes = cdr_bytes
+
+
+ENCAPSULATIONS = frozenset((b"\x00\x00", b"\x00\x01"))
+"""Plain CDR, big and little endian: what ROS 2 writes and reads (DDS-XTypes 1.3, table 59)."""
+
+
+def cdr_problem(data: bytes, least_bytes: int = 4) -> str | None:
+    """Why these bytes cannot be CDR of a type that needs ``least_bytes``; None when they may be."""
+    if not data:
+        return "it is empty"
+    if len(data) < 4 or data[:2] not in ENCAPSULATIONS:
+        # a headset built without its ROS2 define sends ROS 1 serialization: the same without the 4 bytes in front
+        return "it does not begin with a CDR header (00 01 00 00), is the sender built for ROS 2?"
+    if len(data) < least_bytes:
+        return f"it is cut off, at least {least_bytes} bytes are needed"
+    return None

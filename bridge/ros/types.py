@@ -1,0 +1,128 @@
+"""From a ``dataExchangeType`` to the class of an installed ROS interface; nothing else is ever imported.
+
+A name from the network is looked up in the ament index, where every interface package registers what it has
+(resource type ``rosidl_interfaces``). Only then is that package's ``msg``, ``srv`` or ``action`` module imported.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rosidl_parser import definition as idl  # type: ignore[import-untyped, import-not-found, unused-ignore]
+
+from macs_zenoh.errors import Refused
+
+_NAME = re.compile(
+    r"(?P<package>(?!\w*__)[a-z][a-z0-9_]{0,127}(?<!_))/(?:(?P<kind>msg|srv|action)/)?(?P<name>[A-Z][A-Za-z0-9]{0,127})"
+)
+_INDEX = Path("share", "ament_index", "resource_index", "rosidl_interfaces")
+
+_PRIMITIVE_BYTES = {
+    **dict.fromkeys(("boolean", "octet", "char", "uint8", "int8"), 1),
+    **dict.fromkeys(("uint16", "int16", "wchar"), 2),
+    **dict.fromkeys(("uint32", "int32", "float"), 4),
+    **dict.fromkeys(("uint64", "int64", "double"), 8),
+    "long double": 16,
+}
+
+
+class InterfaceName(NamedTuple):
+    """An interface by name: ``geometry_msgs``, ``msg``, ``Twist``."""
+
+    package: str
+    kind: str
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.package}/{self.kind}/{self.name}"
+
+    @property
+    def short(self) -> str:
+        """As headsets write it: ``geometry_msgs/Twist``."""
+        return f"{self.package}/{self.name}"
+
+    @classmethod
+    def parse(cls, text: str, kind: str) -> InterfaceName:
+        """Read ``pkg/Name`` or ``pkg/msg/Name``, where ``kind`` is expected. Raises Refused."""
+        match = _NAME.fullmatch(text)
+        if match is None:
+            raise Refused(f"{text[:80]!r} is not the name of a ROS type, as in geometry_msgs/Twist")
+        if match["kind"] not in (None, kind):
+            raise Refused(f"{text} is a {match['kind']} type, a {kind} type was expected")
+        return cls(match["package"], kind, match["name"])
+
+
+def resolve(text: str, kind: str = "msg") -> type[Any]:
+    """The class of an installed interface. ``kind`` is ``msg``, ``srv`` or ``action``.
+
+    Raises Refused: no valid name, of another kind, or not installed.
+    """
+    name = InterfaceName.parse(text, kind)
+    found = _resolved.get(name)
+    if found is None:
+        found = _resolved[name] = _load(name)
+    return found
+
+
+_resolved: dict[InterfaceName, type[Any]] = {}
+"""Only types that exist get in here, so it cannot grow by what others ask for."""
+
+
+def _load(name: InterfaceName) -> type[Any]:
+    interfaces = _registered(name.package)
+    if interfaces is None:
+        raise Refused(f"type {name} is not installed on this robot: there is no ROS interface package {name.package}")
+    if not {f"{name.kind}/{name.name}.{ending}" for ending in ("idl", name.kind)} & interfaces:
+        raise Refused(f"type {name} is not installed on this robot: {name.package} is, but has no such type")
+    try:
+        found = getattr(importlib.import_module(f"{name.package}.{name.kind}"), name.name)
+    except (ImportError, AttributeError) as error:
+        raise Refused(f"type {name} is registered on this robot, but cannot be imported: {error}") from error
+    if not isinstance(found, type):
+        raise Refused(f"type {name} is registered on this robot, but its class is something else")
+    return found
+
+
+def _registered(package: str) -> frozenset[str] | None:
+    """What an interface package registered, as ``msg/Twist.idl``; None when it is not an interface package."""
+    for prefix in _prefixes():
+        try:
+            return frozenset((prefix / _INDEX / package).read_text(encoding="utf-8").split())
+        except OSError:
+            continue
+    return None
+
+
+def _prefixes() -> list[Path]:
+    """Where ROS packages are installed: what was sourced, and this Python's own prefix for ROS from PyPI."""
+    sourced = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
+    return [*sourced, Path(sys.prefix)]
+
+
+def least_cdr_bytes(message: type[Any]) -> int:
+    """The fewest bytes that any CDR of this type can have, with its 4 byte encapsulation header.
+
+    Padding is not counted, and text and sequences count as empty, so no valid message is shorter, whoever wrote it.
+    For a type of fixed size (a Twist) it is nearly exact: a truncated command is caught without decoding.
+    """
+    return 4 + _least_bytes_of(message)
+
+
+def _least_bytes_of(message: type[Any]) -> int:
+    return sum(_least_bytes(slot) for slot in getattr(message, "SLOT_TYPES", ()))
+
+
+def _least_bytes(slot: Any) -> int:
+    if isinstance(slot, idl.BasicType):
+        return _PRIMITIVE_BYTES.get(slot.typename, 1)
+    if isinstance(slot, idl.NamespacedType):
+        package, kind = slot.namespaces
+        return _least_bytes_of(getattr(importlib.import_module(f"{package}.{kind}"), slot.name))
+    if isinstance(slot, idl.Array):
+        return int(slot.size) * _least_bytes(slot.value_type)
+    return 4  # a string or a sequence: its length, 0

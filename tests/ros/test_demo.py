@@ -1,0 +1,135 @@
+"""The demo robot, as arithmetic and as a process."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import signal
+import struct
+import sys
+import zlib
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+from geometry_msgs.msg import PoseStamped, Twist
+from rclpy.qos import qos_profile_sensor_data
+from ros_peer import Peer, get
+from sensor_msgs.msg import CompressedImage
+from std_srvs.srv import SetBool
+
+from bridge.ros import graph
+from bridge.ros.demo import Camera, Unicycle
+
+
+def test_a_unicycle_drives_a_circle() -> None:
+    """At 1 m/s and 1 rad/s it is back where it began after 2 pi seconds."""
+    robot = Unicycle()
+    robot.move(0.0)
+    for step in range(1000):
+        robot.command(1.0, 1.0, step * 2 * math.pi / 1000)
+        robot.move((step + 1) * 2 * math.pi / 1000)
+    assert (robot.x, robot.y, robot.heading) == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+
+
+def test_a_unicycle_stops_when_commands_stop() -> None:
+    """Half a second after the last command it stands."""
+    robot = Unicycle()
+    robot.move(10.0)
+    robot.command(1.0, 0.0, 10.0)
+    for now in (10.25, 10.5, 10.75, 11.0, 60.0):
+        robot.move(now)
+    assert not robot.moving
+    assert robot.x == pytest.approx(0.75)
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+def test_a_command_that_is_no_number_is_a_stop(number: float) -> None:
+    """Nonsense does not put the robot nowhere."""
+    robot = Unicycle()
+    robot.command(number, 0.0, 0.0)
+    robot.move(0.1)
+    assert (robot.moving, robot.x) == (False, 0.0)
+
+
+@pytest.mark.parametrize("lights", [True, False])
+def test_the_picture_is_a_png(lights: bool) -> None:
+    """Every chunk has its checksum, and the pixels are as many as the header says."""
+    robot = Unicycle()
+    robot.x, robot.y, robot.heading = 3.3, -7.7, 2.0
+    chunks = dict(_chunks(Camera().png(robot, lights=lights)))
+    width, height = struct.unpack(">II", chunks[b"IHDR"][:8])
+    rows = zlib.decompress(chunks[b"IDAT"])
+    assert list(chunks) == [b"IHDR", b"PLTE", b"IDAT", b"IEND"]
+    assert len(rows) == height * (1 + width)
+    assert set(rows) == {0, 1, 2, 3}
+    assert chunks[b"PLTE"] == (Camera.LIT if lights else Camera.DAY)
+
+
+def _chunks(png: bytes) -> list[tuple[bytes, bytes]]:
+    assert png.startswith(b"\x89PNG\r\n\x1a\n")
+    found, at = [], 8
+    while at < len(png):
+        size, kind = struct.unpack_from(">I4s", png, at)
+        data = png[at + 8 : at + 8 + size]
+        assert struct.unpack_from(">I", png, at + 8 + size)[0] == zlib.crc32(kind + data)
+        found.append((kind, data))
+        at += 12 + size
+    return found
+
+
+@pytest.fixture
+async def demo(domain: int) -> AsyncIterator[asyncio.subprocess.Process]:
+    """The demo robot in its own process."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "bridge.ros.demo", env={**os.environ, "ROS_DOMAIN_ID": str(domain)}
+    )
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.wait()
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+async def test_the_demo_robot_shows_drives_and_ends(
+    demo: asyncio.subprocess.Process, peer: Peer, end: signal.Signals
+) -> None:
+    """It publishes pictures and poses, moves when driven, switches its lights, and ends cleanly on a signal."""
+    poses = await peer.subscription(PoseStamped, "/pose")
+    pictures = await peer.subscription(CompressedImage, "/camera/image/compressed", qos_profile_sensor_data)
+    commands = await peer.publisher(Twist, "/cmd_vel", matched=1)
+    picture = await get(pictures)
+    assert picture.format == "png"
+    assert _chunks(bytes(picture.data))
+    twist = Twist()
+    twist.linear.x = 1.0
+    while (await get(poses)).pose.position.x < 0.05:
+        commands.publish(twist)
+    assert (await _call(peer, SetBool, "/set_lights", SetBool.Request(data=True))).message == "lights on"
+    offered = await peer.session.run(lambda: graph.offers(peer.session.node))
+    assert offered.subscribers == {"/cmd_vel": "geometry_msgs/msg/Twist"}
+    assert offered.publishers == {
+        "/camera/image/compressed": "sensor_msgs/msg/CompressedImage",
+        "/pose": "geometry_msgs/msg/PoseStamped",
+    }
+    assert offered.services == {"/set_lights": "std_srvs/srv/SetBool"}
+    demo.send_signal(end)
+    assert await asyncio.wait_for(demo.wait(), 5) == 0
+
+
+async def _call(peer: Peer, kind: type[Any], name: str, request: Any) -> Any:
+    node = peer.session.node
+    answered: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+    loop = asyncio.get_running_loop()
+
+    def ask() -> None:
+        client = node.create_client(kind, name)
+        assert client.wait_for_service(timeout_sec=5)
+        future = client.call_async(request)
+        future.add_done_callback(lambda done: loop.call_soon_threadsafe(answered.set_result, done.result()))
+
+    await peer.session.run(ask)
+    return await asyncio.wait_for(answered, 10)
