@@ -1,10 +1,5 @@
 """A headset in Python: what tests, tools and newcomers use in place of the hardware.
 
-`client` is the headset itself, `typed` reads and writes ROS messages without ROS, `script` is what
-``macs headset`` runs. Importing `client` needs neither ROS nor rosbags.
+`bridge.headset.client` is the headset itself, `bridge.headset.typed` reads and writes ROS messages without ROS,
+`bridge.headset.script` is what ``macs headset`` runs. Nothing is imported here: the command line only wants the verbs.
 """
-
-from .client import Headset, Link
-from .nodes import Incoming, Node, Publisher, Service, ServiceRequest, Subscription
-
-__all__ = ["Headset", "Incoming", "Link", "Node", "Publisher", "Service", "ServiceRequest", "Subscription"]

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import logging
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -158,6 +159,16 @@ class Headset:
     def connected(self) -> bool:
         """Whether there is a configured connection now."""
         return self._connection is not None
+
+    @property
+    def reconnecting(self) -> bool:
+        """Whether the connection is lost and a new one is being made."""
+        return self._connection is None and self._reconnect and not self._ended.is_set()
+
+    @property
+    def why_ended(self) -> str:
+        """Why the headset has ended for good; empty while it has not."""
+        return self._why
 
     @property
     def nodes(self) -> list[Node]:
@@ -321,7 +332,10 @@ class Headset:
             raise Unreachable(self.target, self._why) from None
 
     def pause(self) -> None:
-        """Stop reading the socket, as a headset that renders no frames; heartbeats go on."""
+        """Stop reading the socket, as a headset that renders no frames; heartbeats go on.
+
+        The read that is under way still ends, with at most one more message.
+        """
         self._reading.clear()
 
     def resume(self) -> None:
@@ -415,20 +429,23 @@ class Headset:
             await self._rejoin()
 
     async def _rejoin(self) -> None:
-        for attempt in range(1 << 30):
+        for attempt in itertools.count():
             try:
                 await self._join()
-                for node in self.nodes:
-                    if node.agents or node.groups:
-                        await self.send_frame(
-                            frames.registration(self.id, node.spec, sorted(node.agents), sorted(node.groups))
-                        )
+                await self._register_all()
             except Unreachable as error:
                 log.debug("%s", error)
+                self.drop_connection()
                 self._connection = None
             else:
                 return
             await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
+
+    async def _register_all(self) -> None:
+        for node in self.nodes:
+            if node.agents or node.groups:
+                agents, groups = sorted(node.agents), sorted(node.groups)
+                await self.send_frame(frames.registration(self.id, node.spec, agents, groups))
 
     async def _read_to_end(self) -> str:
         connection = self._connection
@@ -498,7 +515,7 @@ class Headset:
 
     async def tell(self, frame: Callable[[int], bytes]) -> None:
         """Send what a reconnection would repeat anyway: without a connection it waits for that."""
-        if self._connection is None and self._reconnect and not self._ended.is_set():
+        if self.reconnecting:
             return
         await self.send_frame(frame(self.id))
 

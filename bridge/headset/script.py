@@ -1,0 +1,503 @@
+"""What ``macs headset`` does: one headset performs verbs and reports in JSON lines.
+
+A verb is done in two steps. The first is quick and in order: register, so that the next line of a script can
+rely on it. The second is the *job* that remains: take messages, publish, wait for an answer. The command line runs
+that job to its end; a script may leave it in the background.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import base64
+import contextlib
+import logging
+import shlex
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coroutine, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from macs_zenoh.errors import CallTimeout, MacsError, Unreachable, UsageError, WireError
+from macs_zenoh.keyexpr import type_name
+
+from .client import Headset
+from .nodes import Incoming, Service, ServiceRequest, Subscription
+from .typed import Types, request_of, response_of
+from .verbs import MAX_BYTES, agent_type, json_object, script_parser
+
+log = logging.getLogger("macs.headset")
+
+_BACKGROUND = {"sub", "serve", "listen"}
+_LISTEN = "listen"
+_LAST_MESSAGES_S = 0.2
+"""How long `pub` stays after its last message: leaving at once takes the publisher off the robot before ROS has
+carried the message."""
+_RETRY_S = 0.1
+"""How often `pub` looks whether a lost connection is back."""
+
+
+Emit = Callable[[dict[str, Any]], None]
+"""Takes one result, an object for one line of JSON."""
+
+
+async def perform(args: argparse.Namespace, emit: Emit) -> int:
+    """Do what the command line says: connect, perform one verb or a script, go offline. Returns the exit code.
+
+    ``args`` is what `verbs` and ``macs headset`` parse. Cancelling is a way to stop: 0 for a verb that has no
+    end of its own, otherwise 130. Raises Unreachable, UsageError.
+    """
+    session = Session(emit, args.types)
+    if args.headset_verb != "run":
+        session.prepare(args)
+    host, port = args.target
+    try:
+        headset = await Headset.connect(host, port, group=args.group, reconnect=args.reconnect)
+        async with headset:
+            session.use(headset)
+            if args.headset_verb != "run":
+                return await (await session.start(args)).work
+            lines = stdin_lines() if args.file == "-" else file_lines(args.file)
+            return await Script(session, emit, keep_going=args.keep_going).run(lines)
+    except asyncio.CancelledError:
+        return 0 if session.endless else 130
+
+
+class Job(NamedTuple):
+    """What remains of a verb. ``endless``: nothing but a stop ends it."""
+
+    work: Coroutine[Any, Any, int]
+    endless: bool = False
+
+
+class Session:
+    """One headset and the verbs that it performs. ``emit`` takes each result, an object for one JSON line."""
+
+    def __init__(self, emit: Emit, definitions: Sequence[str] = ()) -> None:
+        self.endless = False
+        """Whether the verb that was started last goes on until somebody stops it."""
+        self._emit = emit
+        self._definitions = definitions
+        self._types: Types | None = None
+        self._headset: Headset | None = None
+        self._received: Counter[str] = Counter()
+        self._progress = asyncio.Event()
+
+    @property
+    def headset(self) -> Headset:
+        """The headset. Raises UsageError before there is one."""
+        if self._headset is None:
+            raise UsageError("not connected yet")
+        return self._headset
+
+    def use(self, headset: Headset) -> None:
+        """Perform with this headset."""
+        self._headset = headset
+
+    def prepare(self, args: argparse.Namespace) -> None:
+        """Find out before connecting what is wrong with a verb's types and values. Raises UsageError."""
+        verb = args.headset_verb
+        if verb == "sub" and not args.raw:
+            self.types.serialize(args.type, {})
+        elif verb == "pub":
+            self._message(args, 0)
+        elif verb == "call":
+            self.types.serialize(request_of(args.type), json_object(args.json))
+        elif verb == "serve":
+            self.types.serialize(response_of(args.type), json_object(args.json))
+        elif verb == "send":
+            _check_receivers(args)
+
+    async def start(self, args: argparse.Namespace) -> Job:
+        """Do the quick part of a verb and return the rest. Raises UsageError, Unreachable."""
+        self.prepare(args)
+        starts: dict[str, Callable[[argparse.Namespace], Awaitable[Job]]] = {
+            "online": self._online,
+            "sub": self._sub,
+            "pub": self._pub,
+            "call": self._call,
+            "serve": self._serve,
+            "send": self._send,
+            "listen": self._listen,
+        }
+        job = await starts[args.headset_verb](args)
+        self.endless = job.endless
+        return job
+
+    @property
+    def types(self) -> Types:
+        """The message definitions, loaded at first use. Raises MissingRosbags."""
+        if self._types is None:
+            self._types = Types(self._definitions)
+        return self._types
+
+    async def wait_for(self, what: str, count: int) -> None:
+        """Wait until ``what`` (a topic, a service or ``listen``) has had ``count`` messages since the beginning."""
+        while self._received[what] < count:
+            self._progress.clear()
+            await self._progress.wait()
+
+    # --- verbs ---
+
+    async def _online(self, _args: argparse.Namespace) -> Job:
+        async def work() -> int:
+            reply = await self.headset.online()
+            self._emit({"id": self.headset.id, "ros": reply.ros_agent_ids, "unity": reply.unity_agent_ids})
+            return 0
+
+        return Job(work())
+
+    async def _sub(self, args: argparse.Namespace) -> Job:
+        subscription = await self.headset.subscribe(
+            args.topic,
+            args.type,
+            agents=await self._robots(args),
+            groups=args.groups,
+            buffer_size=args.buffer,
+            drop_new=args.drop_new,
+        )
+        log.info("subscribed to %s of robots %s", args.topic, _where(subscription))
+        work = self._take(subscription, args.topic, args, lambda message: self._shown_topic(args, message))
+        return Job(work, endless=not (args.count or args.timeout))
+
+    async def _pub(self, args: argparse.Namespace) -> Job:
+        agents = await self._robots(args)
+        known = {node.spec.tos_name for node in self.headset.nodes}
+        publisher = await self.headset.advertise(
+            args.topic, args.type, agents=agents, groups=args.groups, latched=args.latched
+        )
+        count = args.count or (0 if args.rate else 1)
+        settle_s = 0.0 if args.topic in known else args.settle
+
+        async def work() -> int:
+            await asyncio.sleep(settle_s)
+            sent = 0
+            began = time.monotonic()
+            while not count or sent < count:
+                try:
+                    await publisher.publish(self._message(args, sent), agents=agents, groups=args.groups)
+                except Unreachable:
+                    if not self.headset.reconnecting:
+                        raise
+                    if not args.rate:
+                        await asyncio.sleep(_RETRY_S)
+                        continue
+                sent += 1
+                if args.rate and sent != count:
+                    await asyncio.sleep(began + sent / args.rate - time.monotonic())
+            await asyncio.sleep(_LAST_MESSAGES_S)
+            self._emit({"topic": args.topic, "published": sent})
+            return 0
+
+        return Job(work(), endless=not count)
+
+    async def _call(self, args: argparse.Namespace) -> Job:
+        request = self.types.serialize(request_of(args.type), json_object(args.json))
+        agent = args.agent or await self._only_robot()
+
+        async def work() -> int:
+            began = time.monotonic()
+            cdr = await self.headset.call(args.topic, args.type, agent, request, timeout_s=args.timeout)
+            took_ms = round((time.monotonic() - began) * 1000, 2)
+            response = self.types.deserialize(response_of(args.type), cdr, max_bytes=MAX_BYTES)
+            self._emit({"service": args.topic, "from": agent, "response": response, "ms": took_ms})
+            return 0
+
+        return Job(work())
+
+    async def _serve(self, args: argparse.Namespace) -> Job:
+        response = self.types.serialize(response_of(args.type), json_object(args.json))
+        requests: asyncio.Queue[ServiceRequest] = asyncio.Queue()
+
+        def answer(request: ServiceRequest) -> bytes:
+            requests.put_nowait(request)
+            return response
+
+        service = await self.headset.serve(
+            args.topic, args.type, answer, agents=await self._robots(args), groups=args.groups
+        )
+        log.info("serving %s for robots %s", args.topic, _where(service))
+        taken = _until_ended(self.headset, requests)
+        work = self._take(taken, args.topic, args, lambda request: self._shown_request(args, request))
+        return Job(work, endless=not (args.count or args.timeout))
+
+    async def _send(self, args: argparse.Namespace) -> Job:
+        async def work() -> int:
+            data = args.text.encode()
+            await self.headset.send(
+                data, to=agent_type(args.to), ids=args.ids, groups=args.groups, manager=args.manager
+            )
+            self._emit({"to": args.to, "ids": args.ids, "groups": args.groups, "bytes": len(data)})
+            return 0
+
+        return Job(work())
+
+    async def _listen(self, args: argparse.Namespace) -> Job:
+        messages = _only_from(args.sender, self.headset)
+        work = self._take(messages, _LISTEN, args, lambda message: _shown_message(message, full=args.full))
+        return Job(work, endless=not (args.count or args.timeout))
+
+    # --- inside ---
+
+    async def _take(
+        self, source: AsyncIterator[Any], what: str, args: argparse.Namespace, show: Callable[[Any], dict[str, Any]]
+    ) -> int:
+        """Emit what ``source`` gives until there were ``--count`` or ``--timeout`` has passed."""
+        taken = 0
+
+        async def take() -> None:
+            nonlocal taken
+            async for item in source:
+                self._emit(show(item))
+                taken += 1
+                self._received[what] += 1
+                self._progress.set()
+                if taken == args.count:
+                    return
+            if self.headset.why_ended:
+                raise Unreachable(self.headset.target, self.headset.why_ended)
+
+        try:
+            await asyncio.wait_for(take(), args.timeout)
+        except asyncio.TimeoutError:
+            log.info("%s: %d within %g s", what, taken, args.timeout)
+            return 0 if taken and not args.count else 1
+        return 0 if not args.count or taken == args.count else 1  # `unsub` in a script ends it early
+
+    async def _robots(self, args: argparse.Namespace) -> Collection[int]:
+        """The robots that a verb names, by default all that are online."""
+        agents: list[int] = args.agents
+        if agents or args.groups:
+            return agents
+        online = (await self.headset.online()).ros_agent_ids
+        if not online:
+            raise Unreachable("any robot", "none is online (name robots that come later with --agents)")
+        return online
+
+    async def _only_robot(self) -> int:
+        online = (await self.headset.online()).ros_agent_ids
+        if not online:
+            raise Unreachable("any robot", "none is online")
+        if len(online) > 1:
+            raise UsageError(f"robots {online} are online: choose one with --agent")
+        return online[0]
+
+    def _message(self, args: argparse.Namespace, number: int) -> bytes:
+        return self.types.serialize(args.type, json_object(args.json.replace("$i", str(number))))
+
+    def _shown_topic(self, args: argparse.Namespace, message: Incoming) -> dict[str, Any]:
+        line: dict[str, Any] = {"topic": args.topic, "from": message.sender_id}
+        if args.raw:
+            return {**line, "bytes": len(message.data)}
+        limit = None if args.full else MAX_BYTES
+        try:
+            return {**line, "message": self.types.deserialize(args.type, message.data, max_bytes=limit)}
+        except WireError as error:
+            return {**line, "bytes": len(message.data), "error": str(error)}
+
+    def _shown_request(self, args: argparse.Namespace, request: ServiceRequest) -> dict[str, Any]:
+        line: dict[str, Any] = {"service": args.topic, "from": request.robot}
+        try:
+            return {**line, "request": self.types.deserialize(request_of(args.type), request.data)}
+        except WireError as error:
+            return {**line, "bytes": len(request.data), "error": str(error)}
+
+
+class Script:
+    """Runs the lines of a script on one session. Results and failures are JSON lines; the exit code sums them up."""
+
+    def __init__(self, session: Session, emit: Emit, *, keep_going: bool = False) -> None:
+        self._session = session
+        self._emit = emit
+        self._keep_going = keep_going
+        self._parser = script_parser()
+        self._jobs: dict[asyncio.Task[int], bool] = {}
+        self._code = 0
+
+    async def run(self, lines: AsyncIterator[str]) -> int:
+        """Perform every line, then wait for the background jobs that have an end. Returns the exit code."""
+        headset = self._session.headset
+        self._emit({"connected": headset.id, "group": headset.group})
+        number = 0
+        try:
+            async for line in lines:
+                number += 1
+                try:
+                    await self._perform(line)
+                except MacsError as error:
+                    self._fail(f"line {number}: {error}", error)
+                    if not self._keep_going:
+                        return self._code
+            await self._wait_all(None)
+        finally:
+            await self._stop_jobs()
+        return self._code
+
+    async def _perform(self, line: str) -> None:
+        try:
+            words = shlex.split(line, comments=True)
+        except ValueError as error:
+            raise UsageError(str(error)) from error
+        if not words:
+            return
+        in_background = words[-1] == "&"
+        args = self._parser.parse_args(words[:-1] if in_background else words)
+        if await self._perform_script_verb(args):
+            return
+        job = await self._session.start(args)
+        if in_background or args.headset_verb in _BACKGROUND:
+            self._emit({"started": args.headset_verb, **_named(args)})
+            task = asyncio.get_running_loop().create_task(self._in_background(job.work))
+            self._jobs[task] = job.endless
+        else:
+            self._code = max(self._code, await job.work)
+
+    async def _perform_script_verb(self, args: argparse.Namespace) -> bool:
+        """Do a verb that only scripts have. Returns whether it was one."""
+        headset = self._session.headset
+        verb = args.headset_verb
+        if verb == "wait":
+            await self._wait(args)
+        elif verb == "sleep":
+            await asyncio.sleep(args.seconds)
+        elif verb == "group":
+            await headset.set_group(args.group)
+        elif verb == "unsub":
+            nodes = [node for node in headset.nodes if node.spec.tos_name == args.topic]
+            if not nodes:
+                raise UsageError(f"there is no node for {args.topic}")
+            for node in nodes:
+                await node.close()
+        elif verb == "pause":
+            headset.pause()
+        elif verb == "resume":
+            headset.resume()
+        elif verb == "drop":
+            headset.drop_connection()
+        else:
+            return False
+        self._emit({"done": verb})
+        return True
+
+    async def _wait(self, args: argparse.Namespace) -> None:
+        if args.what is None:
+            await self._wait_all(args.timeout)
+            return
+        try:
+            await asyncio.wait_for(self._session.wait_for(args.what, args.count), args.timeout)
+        except asyncio.TimeoutError as error:
+            raise CallTimeout(f"{args.count} of {args.what}", args.timeout) from error
+
+    async def _wait_all(self, timeout_s: float | None) -> None:
+        ending = [task for task, endless in self._jobs.items() if not endless and not task.done()]
+        if not ending:
+            return
+        _, waiting = await asyncio.wait(ending, timeout=timeout_s)
+        if waiting:
+            raise CallTimeout("the end of background verbs", timeout_s or 0.0)
+
+    async def _in_background(self, work: Coroutine[Any, Any, int]) -> int:
+        try:
+            code = await work
+        except MacsError as error:
+            self._fail(str(error), error)
+            return self._code
+        self._code = max(self._code, code)
+        return code
+
+    def _fail(self, text: str, error: MacsError) -> None:
+        self._emit({"error": text})
+        self._code = max(self._code, 2 if isinstance(error, UsageError) else 1)
+
+    async def _stop_jobs(self) -> None:
+        for task in self._jobs:
+            task.cancel()
+        await asyncio.gather(*self._jobs, return_exceptions=True)
+
+
+async def file_lines(path: str) -> AsyncIterator[str]:
+    """The lines of a file. Raises UsageError when it cannot be read."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")  # noqa: ASYNC240 - a short file, before anything runs
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from error
+    for line in text.splitlines():
+        yield line
+
+
+async def stdin_lines() -> AsyncIterator[str]:
+    """The lines of stdin as they come, from a terminal, a pipe or a file."""
+    loop = asyncio.get_running_loop()
+    lines: asyncio.Queue[str | None] = asyncio.Queue()
+
+    def read() -> None:
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody wants more lines
+            for line in sys.stdin:
+                loop.call_soon_threadsafe(lines.put_nowait, line)
+            loop.call_soon_threadsafe(lines.put_nowait, None)
+
+    # A daemon thread, because nothing can interrupt a read of stdin.
+    threading.Thread(target=read, name="stdin", daemon=True).start()
+    while (line := await lines.get()) is not None:
+        yield line
+
+
+async def _only_from(sender: str | None, messages: AsyncIterator[Incoming]) -> AsyncIterator[Incoming]:
+    async for message in messages:
+        name = "router" if message.sender_type is None else type_name(message.sender_type)
+        if sender is None or name == sender:
+            yield message
+
+
+async def _until_ended(headset: Headset, requests: asyncio.Queue[ServiceRequest]) -> AsyncIterator[ServiceRequest]:
+    """The requests in a queue, until the headset ends."""
+    loop = asyncio.get_running_loop()
+    ended = loop.create_task(headset.wait_ended())
+    try:
+        while True:
+            next_one = loop.create_task(requests.get())
+            await asyncio.wait((next_one, ended), return_when=asyncio.FIRST_COMPLETED)
+            if not next_one.done():
+                next_one.cancel()
+                return
+            yield next_one.result()
+    finally:
+        ended.cancel()
+
+
+def _check_receivers(args: argparse.Namespace) -> None:
+    """On the wire type 0 goes to everybody whatever else is named, which nobody means who names somebody."""
+    named = bool(args.ids or args.groups)
+    if args.to == "all" and named:
+        raise UsageError("--to all goes to everybody: leave out --ids and --groups, or say --to ros or --to unity")
+    if args.to != "all" and not named:
+        raise UsageError(f"to which agents of type {args.to}? Give --ids or --groups (or --to all)")
+
+
+def _where(node: Subscription | Service) -> str:
+    groups = f" and groups {sorted(node.groups)}" if node.groups else ""
+    return f"{sorted(node.agents)}{groups}"
+
+
+def _named(args: argparse.Namespace) -> dict[str, str]:
+    return {"name": args.topic} if hasattr(args, "topic") else {}
+
+
+def _shown_message(message: Incoming, *, full: bool) -> dict[str, Any]:
+    sender = None
+    if message.sender_type is not None:
+        sender = {"type": type_name(message.sender_type), "id": message.sender_id}
+    line: dict[str, Any] = {"from": sender, "manager": message.metadata.message_manager, "bytes": len(message.data)}
+    if message.metadata.request_id:
+        line["request_id"] = message.metadata.request_id
+    if message.metadata.node_name:
+        line["node"] = message.metadata.node_name
+    if len(message.data) > MAX_BYTES and not full:
+        return line
+    try:
+        return {**line, "text": message.data.decode()}
+    except UnicodeDecodeError:
+        return {**line, "base64": base64.b64encode(message.data).decode("ascii")}

@@ -1,0 +1,378 @@
+"""`macs headset` as its own process against a real gateway, a real router and a robot made of Python."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import macs_zenoh
+from bridge.gateway import Gateway
+from bridge.headset.typed import Types, request_of, response_of
+from macs_zenoh.config import GatewaySettings, MeshSettings
+from macs_zenoh.mesh import Mesh
+from macs_zenoh.messages import AddNode, Metadata, NodeType, RemoveNode, StreamData, decode_data, encode_management
+from macs_zenoh.wire import encode_frame, encode_message
+
+ROOT = Path(__file__).parents[2]
+SET_BOOL = "std_srvs/SetBool"
+TYPES = Types()
+
+
+class EchoRobot:
+    """Robot 1: streams every command back to the subscribers of its topic, and answers every request."""
+
+    def __init__(self, agent: macs_zenoh.Agent) -> None:
+        self.agent = agent
+        self.nodes: dict[tuple[int, str], dict[int, AddNode]] = {}
+        self.answers: asyncio.Queue[bytes] = asyncio.Queue()
+        self._changed = asyncio.Event()
+        agent.serve("add_node", self._add)
+        agent.serve("remove_node", self._remove)
+
+    async def run(self) -> None:
+        """Take messages for ever."""
+        async for message in self.agent:
+            metadata = message.metadata
+            if metadata.node_type == NodeType.PUBLISHER:
+                self.stream(metadata.node_name, metadata.data_exchange_type, message.data)
+            elif metadata.node_type == NodeType.CLIENT:
+                asked = TYPES.deserialize(request_of(metadata.data_exchange_type), message.data)
+                response = {"success": asked["data"], "message": f"asked by {message.sender_id}"}
+                data = TYPES.serialize(response_of(metadata.data_exchange_type), response)
+                self.agent.send(data, to="unity", ids=[message.sender_id], metadata=metadata)
+            elif metadata.node_type == NodeType.SERVICE:
+                self.answers.put_nowait(message.data)
+
+    def stream(self, node: str, data_type: str, cdr: bytes) -> None:
+        """Put topic data for everybody who registered."""
+        registrants = self.nodes.get((NodeType.SUBSCRIBER, node), {})
+        metadata = Metadata(1, self.agent.id, 0, StreamData.manager, NodeType.SUBSCRIBER, node, data_type)
+        management = encode_management(StreamData({"2": sorted(registrants)}))
+        message = encode_message(metadata.encode(), cdr)
+        self.agent.publish_stream(node, encode_frame(1, management=management, message=message))
+
+    async def registered(self, kind: NodeType, node: str, count: int = 1) -> list[int]:
+        """Wait until so many headsets are registered on a node; their ids."""
+
+        async def wait() -> list[int]:
+            while len(ids := sorted(self.nodes.get((kind, node), {}))) != count:
+                self._changed.clear()
+                await self._changed.wait()
+            return ids
+
+        return await asyncio.wait_for(wait(), 10)
+
+    async def _add(self, call: macs_zenoh.Call) -> bytes:
+        node = decode_data(AddNode, call.data)
+        self.nodes.setdefault((node.node_type, node.node_name), {})[node.registrant_agent_id] = node
+        self._changed.set()
+        return b""
+
+    async def _remove(self, call: macs_zenoh.Call) -> bytes:
+        node = decode_data(RemoveNode, call.data)
+        self.nodes.get((node.node_type, node.node_name), {}).pop(node.registrant_agent_id, None)
+        self._changed.set()
+        return b""
+
+
+class Process:
+    """One `macs headset …` with its lines."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self.process = process
+
+    async def line(self) -> dict[str, Any]:
+        """Its next line on stdout."""
+        assert self.process.stdout is not None
+        text = await asyncio.wait_for(self.process.stdout.readline(), 20)
+        assert text, (await self.process.communicate())[1].decode()
+        value: dict[str, Any] = json.loads(text)
+        return value
+
+    def say(self, *lines: str) -> None:
+        """Write lines to its stdin."""
+        assert self.process.stdin is not None
+        self.process.stdin.write("".join(f"{line}\n" for line in lines).encode())
+
+    async def end(self) -> tuple[int, list[dict[str, Any]], str]:
+        """Close its stdin; its exit code, the lines not read yet, and its log."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        out, log = await asyncio.wait_for(self.process.communicate(), 30)
+        return self.process.returncode or 0, [json.loads(line) for line in out.splitlines()], log.decode()
+
+
+Start = Callable[..., Any]
+
+
+@pytest.fixture
+async def mesh_settings() -> AsyncIterator[MeshSettings]:
+    """How to reach a router that runs here."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    async with await Mesh.open(MeshSettings(mode="router", listen=[endpoint])):
+        yield MeshSettings(connect=[endpoint])
+
+
+@contextlib.asynccontextmanager
+async def running_gateway(settings: MeshSettings, port: int = 0) -> AsyncIterator[Gateway]:
+    async with await Mesh.open(settings) as mesh:
+        gateway = Gateway(mesh, GatewaySettings(port=port))
+        await gateway.start()
+        try:
+            yield gateway
+        finally:
+            await gateway.close()
+
+
+@pytest.fixture
+async def gateway(mesh_settings: MeshSettings) -> AsyncIterator[Gateway]:
+    async with running_gateway(mesh_settings) as gateway:
+        yield gateway
+
+
+@pytest.fixture
+async def robot(mesh_settings: MeshSettings, gateway: Gateway) -> AsyncIterator[EchoRobot]:
+    """Robot 1, seen by the gateway."""
+    async with macs_zenoh.join("ros", id=1, settings=mesh_settings) as agent:
+        robot = EchoRobot(agent)
+        running = asyncio.create_task(robot.run())
+        while (1, 1) not in gateway.directory:
+            await asyncio.sleep(0.01)
+        yield robot
+        running.cancel()
+
+
+@pytest.fixture
+async def start(gateway: Gateway) -> AsyncIterator[Start]:
+    """Start `macs headset` with these words, by default at the gateway."""
+    started: list[asyncio.subprocess.Process] = []
+
+    async def start(*words: str, port: int | None = None, options: tuple[str, ...] = ()) -> Process:
+        pipe = asyncio.subprocess.PIPE
+        target = f"127.0.0.1:{port or gateway.port}"
+        arguments = ["-m", "bridge", "headset", target, *options, *words]
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, *arguments, stdin=pipe, stdout=pipe, stderr=pipe, cwd=ROOT, env=dict(os.environ)
+        )
+        started.append(process)
+        return Process(process)
+
+    yield start
+    for process in started:
+        if process.returncode is None:
+            process.kill()
+            await process.communicate()
+
+
+async def test_online(start: Start, robot: EchoRobot) -> None:
+    """`online` prints the own id and who is there."""
+    code, lines, log = await (await start("online")).end()
+    assert code == 0, log
+    assert lines == [{"id": lines[0]["id"], "ros": [1], "unity": [lines[0]["id"]]}]
+
+
+async def test_a_topic_is_published_and_received(start: Start, robot: EchoRobot) -> None:
+    """What one headset publishes, typed from JSON, another one receives typed, in order, each message once."""
+    subscriber = await start("sub", "/talk", "std_msgs/String", "--count", "3", "--timeout", "20")
+    await robot.registered(NodeType.SUBSCRIBER, "nd__talk")
+    publisher = await start("pub", "/talk", "std_msgs/String", '{"data": "$i"}', "--count", "3", "--settle", "0.2")
+    code, lines, log = await publisher.end()
+    assert (code, lines) == (0, [{"topic": "/talk", "published": 3}]), log
+    code, lines, log = await subscriber.end()
+    assert code == 0, log
+    assert lines == [{"topic": "/talk", "from": 1, "message": {"data": str(number)}} for number in range(3)]
+
+
+async def test_sizes_need_no_type(start: Start, robot: EchoRobot) -> None:
+    """With --raw any type is received, as sizes."""
+    subscriber = await start("sub", "/x", "my_msgs/Unknown", "--raw", "--count", "1")
+    await robot.registered(NodeType.SUBSCRIBER, "nd__x")
+    robot.stream("nd__x", "my_msgs/Unknown", bytes(5000))
+    assert (await subscriber.end())[:2] == (0, [{"topic": "/x", "from": 1, "bytes": 5000}])
+
+
+async def test_a_service_is_called(start: Start, robot: EchoRobot) -> None:
+    """`call` prints the typed response of the only robot."""
+    code, lines, log = await (await start("call", "/set", SET_BOOL, '{"data": true}')).end()
+    assert code == 0, log
+    assert lines[0]["response"]["success"] is True
+    assert (lines[0]["service"], lines[0]["from"]) == ("/set", 1)
+
+
+async def test_a_service_is_served(start: Start, robot: EchoRobot) -> None:
+    """`serve` answers a robot's request and prints it."""
+    process = await start("serve", "/ask", SET_BOOL, '{"success": true, "message": "done"}', "--count", "1")
+    (headset_id,) = await robot.registered(NodeType.SERVICE, "nd__ask")
+    request = TYPES.serialize(request_of(SET_BOOL), {"data": True})
+    metadata = Metadata(request_id=5, node_type=NodeType.SERVICE, node_name="nd__ask", data_exchange_type=SET_BOOL)
+    robot.agent.send(request, to="unity", ids=[headset_id], metadata=metadata)
+    response = await asyncio.wait_for(robot.answers.get(), 10)
+    assert TYPES.deserialize(response_of(SET_BOOL), response) == {"success": True, "message": "done"}
+    code, lines, log = await process.end()
+    assert (code, lines) == (0, [{"service": "/ask", "from": 1, "request": {"data": True}}]), log
+
+
+async def test_headsets_reach_each_other(start: Start, gateway: Gateway, mesh_settings: MeshSettings) -> None:
+    """By id, by group and by broadcast, a headset on another gateway gets each message exactly once."""
+    async with running_gateway(mesh_settings) as other:
+        listener = await start("run", "-", options=("--group", "3"))
+        connected = await listener.line()
+        assert connected["group"] == 3
+        listener.say("listen --from unity")
+        assert await listener.line() == {"started": "listen"}
+        sender = await start("run", "-", port=other.port)
+        me = (await sender.line())["connected"]
+        while connected["connected"] not in (await _online(sender))["unity"]:
+            await asyncio.sleep(0.05)
+        sender.say(f"send one --to unity --ids {connected['connected']}")
+        sender.say("send two --to unity --groups 3", "send three --to all", "send four --to unity --groups 9")
+        sender.say(f"send five --to unity --ids {connected['connected']} --groups 3")
+        code, lines, log = await sender.end()
+        assert (code, len(lines)) == (0, 5), log
+        heard = [await listener.line() for _ in range(4)]
+        assert {line["text"] for line in heard} == {"one", "two", "three", "five"}
+        assert all(line["from"] == {"type": "unity", "id": me} for line in heard)
+        assert (await listener.end())[:2] == (0, [])
+
+
+async def _online(process: Process) -> dict[str, Any]:
+    process.say("online")
+    return await process.line()
+
+
+async def test_a_script_uses_one_connection(start: Start, robot: EchoRobot) -> None:
+    """A script subscribes, publishes, waits and calls as one headset; its lines come in order."""
+    process = await start("run", "-")
+    headset_id = (await process.line())["connected"]
+    process.say("# a comment", "", "sub /talk std_msgs/String --agents 1")
+    assert await process.line() == {"started": "sub", "name": "/talk"}
+    assert await robot.registered(NodeType.SUBSCRIBER, "nd__talk") == [headset_id]
+    process.say('pub /talk std_msgs/String \'{"data": "hello"}\' --agents 1 --settle 0.2 --count 2')
+    process.say("wait /talk --count 2 --timeout 10", "unsub /talk")
+    process.say(f"call /set {SET_BOOL} '{{\"data\": true}}' --agent 1")
+    code, lines, log = await process.end()
+    assert code == 0, log
+    received = {"topic": "/talk", "from": 1, "message": {"data": "hello"}}
+    assert [line for line in lines if line == received] == [received] * 2
+    rest = [line for line in lines if line != received]
+    assert rest[:3] == [{"topic": "/talk", "published": 2}, {"done": "wait"}, {"done": "unsub"}]
+    assert rest[3]["response"]["message"] == f"asked by {headset_id}"
+
+
+async def test_a_failing_line_ends_a_script(start: Start, robot: EchoRobot, tmp_path: Path) -> None:
+    """A script stops at a line that fails and says which; with --keep-going it goes on, and fails in the end."""
+    script = tmp_path / "script.txt"
+    script.write_text("online\nwait /nothing --timeout 0.01\nonline\n")
+    code, lines, _ = await (await start("run", str(script))).end()
+    assert (code, len(lines)) == (1, 3)
+    assert lines[2]["error"].startswith("line 2: ")
+    script.write_text("fly\nonline\n")
+    code, lines, _ = await (await start("run", "--keep-going", str(script))).end()
+    assert code == 2
+    assert "invalid choice" in lines[1]["error"]
+    assert lines[2]["ros"] == [1]
+
+
+async def test_a_stopped_subscription_ends_well(start: Start, robot: EchoRobot, gateway: Gateway) -> None:
+    """Ctrl-C on a verb without an end is its end: exit code 0, and the headset is offline at once."""
+    process = await start("sub", "/talk", "std_msgs/String")
+    (headset_id,) = await robot.registered(NodeType.SUBSCRIBER, "nd__talk")
+    gone = asyncio.Event()
+    robot.agent.on_presence(lambda who, here: gone.set() if who.key == (2, headset_id) and not here else None)
+    process.process.send_signal(signal.SIGINT)
+    code, lines, log = await process.end()
+    assert (code, lines) == (0, []), log
+    assert "Traceback" not in log
+    await asyncio.wait_for(gone.wait(), 5)
+
+
+async def test_an_interrupted_count_is_130(start: Start, robot: EchoRobot) -> None:
+    """Ctrl-C before a verb has done what was asked is exit code 130."""
+    process = await start("sub", "/talk", "std_msgs/String", "--count", "5")
+    await robot.registered(NodeType.SUBSCRIBER, "nd__talk")
+    process.process.send_signal(signal.SIGINT)
+    assert (await process.end())[0] == 130
+
+
+async def test_too_few_messages_are_a_failure(start: Start, robot: EchoRobot) -> None:
+    """Fewer messages than asked for within the time are exit code 1."""
+    code, lines, _ = await (await start("sub", "/talk", "std_msgs/String", "--count", "1", "--timeout", "0.3")).end()
+    assert (code, lines) == (1, [])
+
+
+async def test_a_reader_that_leaves_ends_it(start: Start, robot: EchoRobot) -> None:
+    """When the reader of stdout leaves, as `head` does, the headset ends without a traceback."""
+    process = await start("sub", "/talk", "std_msgs/String")
+    await robot.registered(NodeType.SUBSCRIBER, "nd__talk")
+    process.process._transport.get_pipe_transport(1).close()  # type: ignore[attr-defined]
+    cdr = TYPES.serialize("std_msgs/String", {"data": "hello"})
+    while process.process.returncode is None:
+        robot.stream("nd__talk", "std_msgs/String", cdr)
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(process.process.wait(), 0.1)
+    assert process.process.stderr is not None
+    log = (await process.process.stderr.read()).decode()
+    assert process.process.returncode == 1
+    assert "Traceback" not in log
+
+
+async def test_nobody_is_there(start: Start, unused_tcp_port: int) -> None:
+    """Without a gateway, or without a robot to talk to, one line says so and the exit code is 1."""
+    code, lines, log = await (await start("online", port=unused_tcp_port)).end()
+    assert (code, lines) == (1, [])
+    assert log.startswith(f"macs headset: 127.0.0.1:{unused_tcp_port} cannot be reached")
+    code, lines, log = await (await start("sub", "/talk", "std_msgs/String")).end()
+    assert (code, lines) == (1, [])
+    assert "none is online" in log
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (("pub", "/cmd_vel", "geometry_msgs/Twist", '{"linear": {"q": 1}}'), "linear.q: no such field"),
+        (("pub", "/cmd_vel", "geometry_msgs/Twist", "{"), "is not JSON"),
+        (("sub", "/talk", "std_msgs/Sting"), "no definition found"),
+        (("call", "/set", SET_BOOL, '{"data": 1}'), "a bool was expected"),
+        (("send", "hello", "--to", "unity"), "Give --ids or --groups"),
+        (("send", "hello", "--ids", "3"), "--to all goes to everybody"),
+    ],
+)
+async def test_wrong_values_are_wrong_usage(start: Start, words: tuple[str, ...], problem: str) -> None:
+    """A value that does not fit its type is exit code 2 with one line that names the field."""
+    code, lines, log = await (await start(*words)).end()
+    assert (code, lines) == (2, [])
+    assert problem in log
+    assert "Traceback" not in log
+
+
+async def test_a_subscription_survives_its_gateway(
+    start: Start, robot: EchoRobot, gateway: Gateway, mesh_settings: MeshSettings
+) -> None:
+    """With --reconnect a subscription goes on when the gateway is restarted; without, it ends with exit code 1."""
+    staying = await start("sub", "/talk", "std_msgs/String", "--count", "1", options=("--reconnect",))
+    await robot.registered(NodeType.SUBSCRIBER, "nd__talk")
+    leaving = await start("sub", "/talk", "std_msgs/String")
+    await robot.registered(NodeType.SUBSCRIBER, "nd__talk", 2)
+    port = gateway.port
+    robot.nodes.clear()
+    await gateway.close()
+    code, _, log = await leaving.end()
+    assert code == 1
+    assert "the router closed the connection" in log
+    async with running_gateway(mesh_settings, port):
+        await robot.registered(NodeType.SUBSCRIBER, "nd__talk")
+        robot.stream("nd__talk", "std_msgs/String", TYPES.serialize("std_msgs/String", {"data": "again"}))
+        code, lines, log = await staying.end()
+    assert (code, lines) == (0, [{"topic": "/talk", "from": 1, "message": {"data": "again"}}]), log
