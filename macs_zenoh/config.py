@@ -19,6 +19,7 @@ values end up in Zenoh, and Zenoh does not forgive (a transmit queue above 16 pa
 from __future__ import annotations
 
 import difflib
+import ipaddress
 import json
 import os
 import re
@@ -209,7 +210,11 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     host: str = "127.0.0.1"
     """Address to listen on. The protocol has no authentication, so the network is opened on purpose: 0.0.0.0."""
     port: Port = 7000
-    max_connections: Annotated[int, Meta(ge=1, le=65_535)] = 512
+    allow: list[str] = []
+    """Networks whose addresses may connect, as in 192.168.1.0/24. Empty: everybody who reaches the port."""
+    max_connections: Annotated[int, Meta(ge=1, le=65_535)] = 2048
+    max_connections_per_address: Annotated[int, Meta(ge=1, le=65_535)] = 2048
+    """Lower it where headsets have addresses of their own; behind NAT they share one."""
     max_frame_bytes: Bytes = 32 * 1024 * 1024
     """A larger declared frame closes its connection before a byte of it is stored."""
     handshake_s: Seconds = 10.0
@@ -222,6 +227,13 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     """A connection that takes nothing for so long while something waits is closed."""
     block: GroupId | None = None
     """The block of 256 agent ids this gateway gives out, 0 being 1..255; unset: lease the first free one."""
+
+    def _check(self) -> None:
+        for network in self.allow:
+            try:
+                ipaddress.ip_network(network, strict=False)
+            except ValueError as error:
+                raise self._wrong("allow", f"{network!r} is not a network, as in 192.168.1.0/24: {error}") from None
 
 
 class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

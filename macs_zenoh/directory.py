@@ -45,6 +45,7 @@ class Directory:
     def __init__(self, grace_s: float = 2.0) -> None:
         self.grace_s = grace_s
         self._claims: dict[tuple[int, int], dict[str, AgentInfo]] = {}
+        self._ids: dict[int, set[int]] = {}
         self._doubtful: set[AgentInfo] = set()
         self._linked = True
         self._settled_at = 0.0
@@ -66,11 +67,15 @@ class Directory:
 
     def ids(self, agent_type: int) -> list[int]:
         """Ids of all agents of a type, ascending."""
-        return sorted(agent_id for kind, agent_id in self._claims if kind == agent_type)
+        return sorted(self._ids.get(agent_type, ()))
 
-    def members(self, group: int, agent_type: int) -> list[int]:
-        """Ids of a type's agents that are in a group, ascending."""
-        return [agent.id for agent in self if agent.type == agent_type and agent.group == group]
+    def all_ids(self) -> set[int]:
+        """Ids that an agent of any type has."""
+        return set().union(*self._ids.values())
+
+    def of_type(self, agent_type: int) -> list[AgentInfo]:
+        """All agents of a type, by id."""
+        return [self._current((agent_type, agent_id)) for agent_id in self.ids(agent_type)]
 
     def claimants(self, agent_type: int, agent_id: int) -> list[AgentInfo]:
         """Everybody who holds a token for this (type, id): more than one is a conflict."""
@@ -116,6 +121,7 @@ class Directory:
         before = self._current(agent.key) if claims else None
         claims.pop(agent.zid, None)
         claims[agent.zid] = agent
+        self._ids.setdefault(agent.type, set()).add(agent.id)
         return [] if before == agent else [Change(agent, online=True)]
 
     def _release(self, agent: AgentInfo) -> list[Change]:
@@ -126,6 +132,7 @@ class Directory:
         del claims[agent.zid]
         if not claims:
             del self._claims[agent.key]
+            self._ids[agent.type].discard(agent.id)
             return [Change(agent, online=False)]
         current = self._current(agent.key)
         return [] if current == before else [Change(current, online=True)]

@@ -23,8 +23,8 @@ WRITE_BUFFER_BYTES = 256 << 10
 class Owner(Protocol):
     """What a connection needs of its gateway."""
 
-    def opened(self, connection: Connection) -> Peer | None:
-        """A socket connected: its protocol, or None to refuse it."""
+    def opened(self, connection: Connection) -> bool:
+        """A socket connected: False refuses it; otherwise it is greeted, now or soon."""
 
     def forward(self, connection: Connection, sent: Sent) -> None:
         """The agent sent a frame to others."""
@@ -48,7 +48,8 @@ class Connection(asyncio.BufferedProtocol):
     def __init__(self, owner: Owner, *, outbox_bytes: int, stall_s: float) -> None:
         self.owner = owner
         self.peer: Peer
-        self.address = "?"
+        self.greeted = False
+        self.host = self.address = "?"
         self.drops: Counter[str] = Counter()
         self._outbox = Outbox(outbox_bytes)
         self._stall_s = stall_s
@@ -84,15 +85,21 @@ class Connection(asyncio.BufferedProtocol):
         self._transport = transport
         _tune(transport.get_extra_info("socket"))
         peer_name = transport.get_extra_info("peername")
-        self.address = f"{peer_name[0]}:{peer_name[1]}" if peer_name else "?"
-        peer = self.owner.opened(self)
-        if peer is None:
+        self.host = str(peer_name[0]) if peer_name else "?"
+        self.address = f"{self.host}:{peer_name[1]}" if peer_name else "?"
+        transport.set_write_buffer_limits(high=WRITE_BUFFER_BYTES)
+        transport.pause_reading()  # until it is greeted
+        self._pauses = 1
+        if not self.owner.opened(self):
             self._refused = True
             transport.abort()
-            return
+
+    def greet(self, peer: Peer) -> None:
+        """The agent has an id: tell it, and begin to listen."""
         self.peer = peer
-        transport.set_write_buffer_limits(high=WRITE_BUFFER_BYTES)
-        transport.write(peer.welcome())
+        self.greeted = True
+        self._transport.write(peer.welcome())
+        self.resume()
         self._schedule()
 
     def get_buffer(self, sizehint: int) -> memoryview:
@@ -118,7 +125,8 @@ class Connection(asyncio.BufferedProtocol):
             self._timer.cancel()
         if self._refused:
             return
-        self.peer.lost()
+        if self.greeted:
+            self.peer.lost()
         self.brake.release()
         self.owner.closed(self)
 
@@ -195,6 +203,9 @@ class Connection(asyncio.BufferedProtocol):
     def close(self, reason: str) -> None:
         """Send what is gathered, then FIN."""
         if self._transport.is_closing():
+            return
+        if not self.greeted:
+            self._transport.abort()
             return
         self.peer.lost()
         level = logging.INFO if reason == "went offline" else logging.WARNING

@@ -86,7 +86,7 @@ class RobotCalls:
                 self._start(task)
 
     def _robots(self) -> Robots:
-        return {agent.id: agent.group for agent in self._directory if agent.type == ROS}
+        return {agent.id: agent.group for agent in self._directory.of_type(ROS)}
 
     def _streams_changed(self) -> None:
         self._on_streams(self._registrations.streams(NodeType.SUBSCRIBER, self._robots()))

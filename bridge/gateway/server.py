@@ -1,8 +1,8 @@
 """The gateway: all sockets of one process, and their place on the mesh.
 
-A frame from a headset: socket → `Connection` → `Peer` (whole? allowed? from whom?) → `handle` → routing → mesh.
-A frame to a headset: mesh → `_inbox`, `_group`, `_broadcast` or `_stream` → `Connection` → socket. It never turns
-back: two headsets on one gateway talk through the mesh as well, inside this process's own Zenoh session.
+A frame from a headset: socket → `Connection` → `Peer` (whole? allowed? from whom?) → `forward` → routing → mesh.
+A frame to a headset: mesh → `Delivery` (for whom?) → `Connection` → socket. It never turns back: two headsets on one
+gateway talk through the mesh as well, inside this process's own Zenoh session.
 """
 
 from __future__ import annotations
@@ -10,19 +10,15 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Awaitable, Callable
 from typing import NamedTuple
 
-from macs_zenoh import blocks
 from macs_zenoh.config import GatewaySettings
 from macs_zenoh.directory import Change, Directory
-from macs_zenoh.errors import ConfigError, Refused, Unreachable, WireError
-from macs_zenoh.keyexpr import BROADCAST, CALL, GROUP, LEASE, PRESENCE, STREAM, UNICAST, block_of, type_name
-from macs_zenoh.mesh import Mesh, Sample, Subscription, Token, Traffic
-from macs_zenoh.messages import (
-    BROADCAST as EVERYBODY,
-)
+from macs_zenoh.errors import Refused, Unreachable
+from macs_zenoh.keyexpr import BROADCAST, CALL, GROUP, PRESENCE, STREAM, UNICAST, type_name
+from macs_zenoh.mesh import Mesh, OnBatch, Subscription, Traffic
 from macs_zenoh.messages import (
     ROS,
     UNITY,
@@ -33,24 +29,24 @@ from macs_zenoh.messages import (
     NodeType,
     OnlineReply,
     RemoveNode,
-    StreamData,
-    decode_management,
     encode_data,
 )
 from macs_zenoh.peer import AskedOnline, Event, Joined, Limits, Peer, Registering, Sent, Streamed
-from macs_zenoh.routing import inbox, keys_of, takes_group_copy
-from macs_zenoh.wire import Frame, FrameDecoder, Header, Layout, encode_message, parse_frame
+from macs_zenoh.routing import inbox, keys_of
+from macs_zenoh.wire import FrameDecoder, Header, Layout, encode_message, parse_frame
 
+from .agents import Agents
 from .brake import Brake
 from .connection import Connection
+from .delivery import Delivery
+from .door import Door
+from .leases import Leases
 from .robots import RobotCalls
 
 log = logging.getLogger("macs.gateway")
 
 PUBLISHER = int(NodeType.PUBLISHER)
-
-SETTLE_S = 0.3
-"""How long a claimed block waits for somebody else's claim on it to show up."""
+KNOWN_ROUTES = 4096
 
 
 class Route(NamedTuple):
@@ -63,34 +59,39 @@ class Route(NamedTuple):
 class Gateway:
     """A TCP server whose connections are agents on the mesh. ``drops`` counts what was lost, by name."""
 
-    KNOWN = 4096
-
     def __init__(self, mesh: Mesh, settings: GatewaySettings) -> None:
         self.mesh = mesh
         self.settings = settings
-        self.block = -1
         self.port = 0
         self.directory = Directory()
-        self.drops: Counter[str] = Counter()
+        self.agents = Agents()
+        self._drops: Counter[str] = Counter()
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
         self._limits = Limits(settings.max_frame_bytes, settings.handshake_s, settings.silence_s)
         self._scratch = bytearray(FrameDecoder.SMALL_BYTES)  # sockets of one loop receive one after the other
-        self._connections: dict[int, Connection] = {}
+        self._door = Door(settings.allow, settings.max_connections, settings.max_connections_per_address)
         self._numbers = 0
-        self._tokens: dict[Connection, Token] = {}
+        self._waiting: deque[Connection] = deque()  # connections for which there is no id yet
         self._routes: dict[Connection, dict[bytes, Route]] = {}
-        self._subscriptions: dict[str, Subscription] = {}  # inboxes, groups and calls of our agents
-        self._streams: dict[str, Subscription] = {}
-        self._always: list[Subscription] = []
-        self._targets: dict[str, Connection | None] = {}
-        self._metadata: dict[bytes, Metadata] = {}
-        self._stream_targets: dict[bytes, dict[str, list[int]]] = {}
-        self._dirty: list[Connection] = []
-        self._sweep: asyncio.TimerHandle | None = None
+        self._subscriptions: dict[str, Subscription] = {}
+        self._streams: set[str] = set()
         self._server: asyncio.Server | None = None
+        self._sweep: asyncio.TimerHandle | None = None
         self._brake = Brake()
         mesh.on_room(self._brake.release)
-        self._robots = RobotCalls(mesh, self.directory, self._layout, on_streams=self._subscribe_streams)
+        self._delivery = Delivery(self.agents, self.directory, self._layout)
+        self._leases = Leases(mesh, settings.block, self._block_leased)
+        self._robots = RobotCalls(mesh, self.directory, self._layout, on_streams=self._streams_wanted)
+
+    @property
+    def blocks(self) -> list[int]:
+        """The blocks of ids that this gateway gives out."""
+        return self._leases.blocks
+
+    @property
+    def drops(self) -> Counter[str]:
+        """What was lost, by name: here, and for connections that have ended."""
+        return self._drops + self._delivery.drops
 
     # -- life ----------------------------------------------------------------------------------------------------
 
@@ -100,111 +101,93 @@ class Gateway:
         Raises ConfigError when the block is somebody else's, Unreachable when the port cannot be had.
         """
         self.mesh.on_link(self._link)
-        self._always.append(self.mesh.watch_tokens(PRESENCE.every(), self._token))
+        self._subscriptions[PRESENCE.every()] = self.mesh.watch_tokens(PRESENCE.every(), self._token)
         for key in await self.mesh.tokens(PRESENCE.every()):
             self._token(key, True)
-        await self._lease_block()
-        self._always += [
-            self.mesh.subscribe(UNICAST.every(type=UNITY, block=self.block), self._inbox),
-            self.mesh.subscribe(BROADCAST.every(), self._broadcast),
-        ]
+        await self._leases.take()
+        self._subscribe(BROADCAST.every(), self._delivery.broadcast)
         host, port = self.settings.host, self.settings.port
         try:
             self._server = await asyncio.get_running_loop().create_server(self._connection, host, port, backlog=1024)
         except OSError as error:
             raise Unreachable(f"{host}:{port}", f"cannot listen there: {error.strerror or error}") from error
         self.port = self._server.sockets[0].getsockname()[1]
-        first = max(1, self.block * 256)
-        log.info("listening on %s:%d, giving out agent ids %d..%d", host, self.port, first, self.block * 256 + 255)
+        log.info("listening on %s:%d", host, self.port)
 
     async def close(self) -> None:
         """Stop accepting, send what is gathered, leave the mesh."""
         if self._server is not None:
             self._server.close()
-        for connection in list(self._connections.values()):
+        for connection in [*self.agents.connections(), *self._waiting]:
             connection.close("the gateway stops")
         self._robots.close()
-        for subscription in [
-            *self._always,
-            *self._subscriptions.values(),
-            *self._streams.values(),
-            *self._tokens.values(),
-        ]:
+        self._leases.close()
+        for subscription in self._subscriptions.values():
             subscription.close()
         if self._sweep is not None:
             self._sweep.cancel()
         if self.drops:
             log.info("lost in all: %s", ", ".join(f"{name} {count}" for name, count in sorted(self.drops.items())))
 
-    async def _lease_block(self) -> None:
-        """Take the lowest free block, or the configured one."""
-        wanted = self.settings.block
-        while True:
-            taken = {int(lease["block"]) for key in await self._leases() if (lease := LEASE.parse(key))}
-            block = wanted if wanted is not None else blocks.free_block(taken)
-            if block is None:
-                raise Unreachable("a free block of ids", "all 256 are leased")
-            if block in taken:
-                raise ConfigError(
-                    "gateway.block", f"block {block} is another gateway's; leave it out to take a free one"
-                )
-            token = self.mesh.declare_token(LEASE.of(block=block, zid=self.mesh.zid))
-            await asyncio.sleep(SETTLE_S)
-            holders = [
-                str(lease["zid"])
-                for key in await self._leases()
-                if (lease := LEASE.parse(key)) and lease["block"] == block
-            ]
-            if blocks.keeps(self.mesh.zid, holders):
-                self.block = block
-                self._always.append(token)
-                return
-            token.close()
-
-    async def _leases(self) -> list[str]:
-        return await self.mesh.tokens(LEASE.every())
-
     # -- connections ---------------------------------------------------------------------------------------------
 
     def _connection(self) -> Connection:
         return Connection(self, outbox_bytes=self.settings.outbox_bytes, stall_s=self.settings.stall_s)
 
-    def opened(self, connection: Connection) -> Peer | None:
-        """Give a new connection an id, the lowest free one of our block."""
-        if len(self._connections) >= self.settings.max_connections:
-            self._refuse(connection, "too_many_connections", f"{len(self._connections)} are connected")
-            return None
-        online = {agent.id for agent in self.directory if block_of(agent.id) == self.block}
-        agent_id = blocks.free_id_in(self.block, online | self._connections.keys())
-        if agent_id is None:
-            self._refuse(connection, "block_full", f"all ids of block {self.block} are taken")
-            return None
-        self._connections[agent_id] = connection
-        self._routes[connection] = {}
-        self._numbers += 1
-        return Peer(
-            agent_id,
-            self._numbers,
-            time.monotonic(),
-            limits=self._limits,
-            layout=self._layout,
-            scratch=self._scratch,
-        )
+    def opened(self, connection: Connection) -> bool:
+        """Let a connection in, or not. It is greeted at once, or as soon as there is an id for it."""
+        refusal = self._door.judge(connection.host)
+        if refusal is not None:
+            name, why = refusal
+            self._drops[name] += 1
+            if self._drops[name] == 1:
+                log.warning("%s is refused: %s (logged once, counted as %s)", connection.address, why, name)
+            return False
+        self._door.enter(connection.host)
+        self._waiting.append(connection)
+        self._greet_waiting()
+        return True
 
-    def _refuse(self, connection: Connection, name: str, why: str) -> None:
-        self.drops[name] += 1
-        log.warning("connection from %s refused: %s", connection.address, why)
+    def _greet_waiting(self) -> None:
+        """Give waiting connections ids: the lowest of our blocks that no agent of any type has."""
+        while self._waiting:
+            agent_id = self._leases.free_id(self.agents.ids | self.directory.all_ids())
+            if agent_id is None:
+                return
+            connection = self._waiting.popleft()
+            self._numbers += 1
+            peer = Peer(
+                agent_id,
+                self._numbers,
+                time.monotonic(),
+                limits=self._limits,
+                layout=self._layout,
+                scratch=self._scratch,
+            )
+            self.agents.enter(agent_id, connection)
+            self._routes[connection] = {}
+            connection.greet(peer)
+
+    def _block_leased(self, block: int) -> None:
+        self._subscribe(UNICAST.every(type=UNITY, block=block), self._delivery.inbox)
+        self._greet_waiting()
 
     def closed(self, connection: Connection) -> None:
         """Forget a connection; its presence ends at once."""
-        self._connections.pop(connection.agent_id, None)
+        self._door.leave(connection.host)
+        if not connection.greeted:
+            self._waiting.remove(connection)
+            return
         self._routes.pop(connection, None)
-        self.drops += connection.all_drops()
-        token = self._tokens.pop(connection, None)
-        if token is not None:
-            token.close()
+        self._drops += connection.all_drops()
+        self._delivery.forget()
+        was_online, empty_group = self.agents.leave(connection)
+        if empty_group is not None:
+            self._unsubscribe(GROUP.every(type=empty_group[0], group=empty_group[1]))
+        if was_online:
+            for key in self._own_keys(connection):
+                self._unsubscribe(key)
             self._robots.leave(connection.key)
-            self._membership_changed()
             log.info("%s is offline", connection)
 
     def stream_depth(self, connection: Connection, node: str) -> tuple[int, bool]:
@@ -212,18 +195,11 @@ class Gateway:
         registered = self._robots.find(connection.key, NodeType.SUBSCRIBER, node)
         return (registered.buffer_size, registered.drop_new) if registered else (10, False)
 
-    # -- from a TCP agent to the mesh ----------------------------------------------------------------------------
+    def dirty(self, connection: Connection) -> None:
+        """A connection has messages to flush."""
+        self._delivery.dirty(connection)
 
-    def handle(self, connection: Connection, event: Event) -> None:
-        """One thing a TCP agent did."""
-        if isinstance(event, Streamed):
-            self._forward_stream(connection, event)
-        elif isinstance(event, Joined):
-            self._joined(connection, event)
-        elif isinstance(event, Registering):
-            self._robots.register(event.node, event.robot_ids, event.groups)
-        elif isinstance(event, AskedOnline):
-            self._answer_online(connection, event.request_id)
+    # -- from a TCP agent to the mesh ----------------------------------------------------------------------------
 
     def forward(self, connection: Connection, sent: Sent) -> None:
         """Put a frame on the keys of its destinations."""
@@ -232,235 +208,106 @@ class Gateway:
         routes = self._routes[connection]
         route = routes.get(destination)
         if route is None:
-            if len(routes) >= self.KNOWN:
+            if len(routes) >= KNOWN_ROUTES:
                 routes.clear()
             header = frame.header
             route = routes[destination] = Route(keys_of(header, *connection.key), header)
-        if not route.keys:
-            connection.complain("no_destination", "a message names no agent and no group")
-            return
+            if not route.keys:
+                connection.complain("no_destination", "a message names no agent and no group")
         kind = route.header.agent_type
-        for agent_id in route.header.ids:
-            if (kind, agent_id) not in self.directory and kind != EVERYBODY:
-                connection.complain("unknown_agent", f"a message goes to {type_name(kind)}/{agent_id}, not online")
+        if kind:
+            for agent_id in route.header.ids:
+                if (kind, agent_id) not in self.directory:
+                    connection.complain("unknown_agent", f"a message goes to {type_name(kind)}/{agent_id}, not online")
         traffic = Traffic.COMMAND if sent.metadata.node_type == PUBLISHER else Traffic.CALL
         for key in route.keys:
             self.mesh.put(key, frame.data, traffic)
         if self.mesh.backlogged:
             self._brake.hold(connection)
 
-    def _forward_stream(self, connection: Connection, event: Streamed) -> None:
-        key = STREAM.of(type=ROS, id=connection.agent_id, node=event.metadata.node_name or "_")
-        self.mesh.put(key, event.frame.data, Traffic.STREAM)
+    def handle(self, connection: Connection, event: Event) -> None:
+        """One thing a TCP agent did."""
+        if isinstance(event, Streamed):
+            key = STREAM.of(type=ROS, id=connection.agent_id, node=event.metadata.node_name or "_")
+            self.mesh.put(key, event.frame.data, Traffic.STREAM)
+        elif isinstance(event, Joined):
+            self._joined(connection, event)
+        elif isinstance(event, Registering):
+            self._robots.register(event.node, event.robot_ids, event.groups)
+        elif isinstance(event, AskedOnline):
+            self._answer_online(connection, event.request_id)
 
     def _joined(self, connection: Connection, event: Joined) -> None:
-        if (before := self._tokens.pop(connection, None)) is not None:
-            before.close()
         kind, agent_id = connection.key
-        presence = PRESENCE.of(type=kind, id=agent_id, group=event.group, zid=self.mesh.zid)
-        self._membership_changed()
+        if kind != UNITY:
+            self._subscribe(inbox(kind, agent_id), self._delivery.inbox)
         if kind == ROS:
             self._serve_robot(connection)
-        elif kind != UNITY:
-            self._subscribe(inbox(kind, agent_id), self._inbox)
+        if event.group:
+            self._subscribe(GROUP.every(type=kind, group=event.group), self._delivery.group)
         # the token last: whoever sees the agent can reach it
-        self._tokens[connection] = self.mesh.declare_token(presence)
+        presence = PRESENCE.of(type=kind, id=agent_id, group=event.group, zid=self.mesh.zid)
+        self.agents.join(connection, self.mesh.declare_token(presence))
+        self._delivery.forget()
         log.info("%s is online%s", connection, f" in group {event.group}" if event.group else "")
 
     def _answer_online(self, connection: Connection, request_id: int) -> None:
         ids = {kind: set(self.directory.ids(kind)) for kind in (ROS, UNITY)}
-        for own in self._tokens:  # presence comes back through the mesh a moment later
+        for own in self.agents.online():  # their presence comes back through the mesh a moment later
             ids.setdefault(own.key[0], set()).add(own.agent_id)
         reply = OnlineReply(ros_agent_ids=sorted(ids[ROS]), unity_agent_ids=sorted(ids[UNITY]))
-        self._call(connection, encode_message(Metadata(request_id=request_id).encode(), encode_data(reply)))
-
-    # -- from the mesh to TCP agents -----------------------------------------------------------------------------
-
-    def _inbox(self, batch: list[Sample]) -> None:
-        for key, payload in batch:
-            connection = self._targets.get(key)
-            if connection is None:
-                connection = self._find_target(key)
-                if connection is None:
-                    continue
-            if (frame := self._frame(key, payload)) is not None:
-                connection.send_call(frame.message)
-                if connection.congested:
-                    self._hold_sender(key, connection)
-        self._flush()
-
-    def _hold_sender(self, key: str, receiver: Connection) -> None:
-        """Slow down a sender on this gateway. Those elsewhere are slowed by nobody: the outbox's limit decides."""
-        fields = UNICAST.parse(key)
-        sender = self._connections.get(int(fields["from_id"])) if fields else None
-        if fields and sender is not None and sender.key == (fields["from_type"], fields["from_id"]):
-            receiver.brake.hold(sender)
-
-    def _find_target(self, key: str) -> Connection | None:
-        fields = UNICAST.parse(key)
-        if fields is None:
-            return None
-        connection = self._connections.get(int(fields["id"]))
-        if connection is None or connection not in self._tokens or connection.peer.agent_type != fields["type"]:
-            if (fields["type"], fields["id"]) not in self.directory:
-                self.drops["nobody_with_this_id"] += 1
-            return None  # or the agent of this id in our block is somebody else's
-        if len(self._targets) >= self.KNOWN:
-            self._targets.clear()
-        self._targets[key] = connection
-        return connection
-
-    def _group(self, batch: list[Sample]) -> None:
-        for key, payload in batch:
-            fields = GROUP.parse(key)
-            frame = self._frame(key, payload)
-            if fields is None or frame is None:
-                continue
-            sender = (int(fields["from_type"]), int(fields["from_id"]))
-            header = frame.header
-            for connection in self._members(int(fields["type"]), int(fields["group"])):
-                if takes_group_copy(header, connection.agent_id, sender, connection.peer.agent_type):
-                    connection.send_call(frame.message)
-        self._flush()
-
-    def _broadcast(self, batch: list[Sample]) -> None:
-        for key, payload in batch:
-            fields = BROADCAST.parse(key)
-            frame = self._frame(key, payload)
-            if fields is None or frame is None:
-                continue
-            sender = (fields["from_type"], fields["from_id"])
-            for connection in self._tokens:
-                if connection.key != sender:
-                    connection.send_call(frame.message)
-        self._flush()
-
-    def _stream(self, batch: list[Sample]) -> None:
-        for key, payload in batch:
-            frame = self._frame(key, payload)
-            if frame is None:
-                continue
-            node = self._metadata[frame.metadata].node_name
-            for agent_type, ids in self._registrants(frame).items():
-                for agent_id in ids:
-                    connection = self._connections.get(agent_id)
-                    if (
-                        connection is not None
-                        and connection in self._tokens
-                        and (str(connection.peer.agent_type) == agent_type)
-                    ):
-                        connection.send_stream(node, frame.message)
-        self._flush()
-
-    def _registrants(self, frame: Frame) -> dict[str, list[int]]:
-        """Who gets this topic message. The management data of a stream changes only with its registrants."""
-        raw = frame.management
-        targets = self._stream_targets.get(raw)
-        if targets is None:
-            try:
-                management = decode_management(raw)
-            except WireError as error:
-                self._bad_frame("stream", error)
-                return {}
-            targets = management.dest_agents if isinstance(management, StreamData) else {}
-            if len(self._stream_targets) >= self.KNOWN:
-                self._stream_targets.clear()
-            self._stream_targets[raw] = targets
-        return targets
-
-    def _frame(self, key: str, payload: bytes) -> Frame | None:
-        """The frame of a sample, or None when an agent must not see it: some existing headsets go deaf for good
-        on metadata that is empty or no JSON, or on sizes that do not add up."""
-        try:
-            frame = parse_frame(payload, self._layout)
-            raw = frame.metadata
-            if raw not in self._metadata:
-                if len(self._metadata) >= self.KNOWN:
-                    self._metadata.clear()
-                self._metadata[raw] = Metadata.decode(raw)
-        except WireError as error:
-            self._bad_frame(key, error)
-            return None
-        return frame
-
-    def _bad_frame(self, key: str, error: WireError) -> None:
-        self.drops["bad_frame"] += 1
-        if self.drops["bad_frame"] == 1:
-            log.warning("a frame on %s cannot be used: %s (logged once, counted as bad_frame)", key, error)
-
-    def dirty(self, connection: Connection) -> None:
-        """Remember a connection for the next flush."""
-        self._dirty.append(connection)
-
-    def _call(self, connection: Connection, message: bytes) -> None:
-        connection.send_call(message)
-        self._flush()
-
-    def _flush(self) -> None:
-        dirty, self._dirty = self._dirty, []
-        for connection in dirty:
-            connection.flush()
+        connection.send_call(encode_message(Metadata(request_id=request_id).encode(), encode_data(reply)))
+        self._delivery.flush()
 
     # -- TCP robots ----------------------------------------------------------------------------------------------
 
     def _serve_robot(self, connection: Connection) -> None:
-        """An existing robot program behind this gateway: its inbox, and the calls that it answers with nothing."""
-        self._subscribe(inbox(ROS, connection.agent_id), self._inbox)
+        """Registrations for an existing robot program: passed on as the message it knows, which it never answers."""
 
-        def deliver(kind: type[AddNode | RemoveNode]) -> Callable[[str, bytes], asyncio.Future[bytes]]:
-            async def pass_on(key: str, payload: bytes) -> bytes:
-                fields = CALL.parse(key) or {}
-                sender = (int(fields.get("from_type", 0)), int(fields.get("from_id", 0)))
-                if connection not in self._tokens:
+        def pass_on(kind: type[AddNode | RemoveNode]) -> Callable[[str, bytes], Awaitable[bytes]]:
+            async def deliver(key: str, payload: bytes) -> bytes:
+                fields = CALL.parse(key)
+                if fields is None or self.agents.find(*connection.key) is not connection:
                     raise Refused("the robot is not connected")
-                body = parse_frame(payload, self._layout).body
-                metadata = Metadata(*sender, message_manager=kind.manager)
-                self._call(connection, encode_message(metadata.encode(), body))
+                sender = Metadata(int(fields["from_type"]), int(fields["from_id"]), message_manager=kind.manager)
+                connection.send_call(encode_message(sender.encode(), parse_frame(payload, self._layout).body))
+                self._delivery.flush()
                 return b""
 
-            return pass_on  # type: ignore[return-value]
+            return deliver
 
         for verb, kind in (("add_node", AddNode), ("remove_node", RemoveNode)):
             key = CALL.every(type=ROS, id=connection.agent_id, verb=verb)
             if key not in self._subscriptions:
-                self._subscriptions[key] = self.mesh.serve(key, deliver(kind))
+                self._subscriptions[key] = self.mesh.serve(key, pass_on(kind))
 
     # -- subscriptions -------------------------------------------------------------------------------------------
 
-    def _members(self, agent_type: int, group: int) -> list[Connection]:
-        return [c for c in self._tokens if c.peer.group == group and c.peer.agent_type == agent_type]
+    def _own_keys(self, connection: Connection) -> list[str]:
+        """What is subscribed for one agent alone."""
+        kind, agent_id = connection.key
+        if kind == UNITY:
+            return []
+        verbs = [CALL.every(type=ROS, id=agent_id, verb=verb) for verb in ("add_node", "remove_node")]
+        return [inbox(kind, agent_id), *(verbs if kind == ROS else [])]
 
-    def _membership_changed(self) -> None:
-        """Subscribe once per group that one of our agents is in; forget inboxes that are nobody's."""
-        self._targets.clear()
-        online = [c for c in self._connections.values() if c.peer.agent_type]
-        groups = {GROUP.every(group=c.peer.group, type=c.peer.agent_type) for c in online if c.peer.group}
-        for key in groups:
-            self._subscribe(key, self._group)
-        own = {
-            str(key)
-            for c in online
-            for key in (
-                inbox(*c.key),
-                CALL.every(type=ROS, id=c.agent_id, verb="add_node"),
-                CALL.every(type=ROS, id=c.agent_id, verb="remove_node"),
-            )
-        }
-        for key in list(self._subscriptions):
-            if key not in groups and key not in own:
-                self._subscriptions.pop(key).close()
-
-    def _subscribe_streams(self, streams: set[tuple[int, str]]) -> None:
+    def _streams_wanted(self, streams: set[tuple[int, str]]) -> None:
         """Listen to exactly these streams of robots: (robot id, node name)."""
         wanted = {STREAM.of(type=ROS, id=robot_id, node=node) for robot_id, node in streams}
-        for key in wanted - self._streams.keys():
-            self._streams[key] = self.mesh.subscribe(key, self._stream)
-        for key in self._streams.keys() - wanted:
-            self._streams.pop(key).close()
+        for key in wanted - self._streams:
+            self._subscribe(key, self._delivery.stream)
+        for key in self._streams - wanted:
+            self._unsubscribe(key)
+        self._streams = wanted
 
-    def _subscribe(self, key: str, on_batch: Callable[[list[Sample]], None]) -> None:
+    def _subscribe(self, key: str, on_batch: OnBatch) -> None:
         if key not in self._subscriptions:
             self._subscriptions[key] = self.mesh.subscribe(key, on_batch)
+
+    def _unsubscribe(self, key: str) -> None:
+        subscription = self._subscriptions.pop(key, None)
+        if subscription is not None:
+            subscription.close()
 
     # -- presence ------------------------------------------------------------------------------------------------
 
@@ -478,8 +325,9 @@ class Gateway:
         if gone:
             metadata = Metadata(message_manager=AgentsGone.manager)
             message = encode_message(metadata.encode(), encode_data(AgentsGone(gone)))
-            for connection in self._tokens:
-                self._call(connection, message)
+            for connection in self.agents.online():
+                connection.send_call(message)
+            self._delivery.flush()
         for change in changes:
             self._robots.presence(change)
         self._schedule_sweep()

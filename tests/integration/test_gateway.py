@@ -118,7 +118,7 @@ async def test_a_bad_frame_costs_that_frame(name: str, start_gateway: StartGatew
         message = await neighbour.receive(5)
         assert bytes(message.data) == b"good"
         assert (await agent.online())[1] == [neighbour.id, agent.id]
-        connection = gateway._connections[agent.id]
+        connection = gateway.agents.find(2, agent.id)
         assert sum(connection.all_drops().values()) >= 1
     assert neighbour.connected
 
@@ -199,16 +199,16 @@ async def test_ids_are_used_again(start_gateway: StartGateway, connect: Connect)
 
 async def test_a_block_has_one_gateway(start_gateway: StartGateway) -> None:
     """A second gateway on a leased block is refused with a clear error; without a wish it takes the next one."""
-    assert (await start_gateway(block=3)).block == 3
+    assert (await start_gateway(block=3)).blocks == [3]
     with pytest.raises(ConfigError, match="block 3 is another gateway's"):
         await start_gateway(block=3)
-    assert (await start_gateway()).block == 0
+    assert (await start_gateway()).blocks == [0]
 
 
 async def test_two_gateways_at_once_take_two_blocks(start_gateway: StartGateway) -> None:
     """Gateways that start in the same moment do not share a block."""
     gateways = await asyncio.gather(*(start_gateway() for _ in range(4)))
-    assert sorted(gateway.block for gateway in gateways) == [0, 1, 2, 3]
+    assert sorted(gateway.blocks[0] for gateway in gateways) == [0, 1, 2, 3]
 
 
 async def test_an_existing_robot_program_is_reached(start_gateway: StartGateway, connect: Connect) -> None:

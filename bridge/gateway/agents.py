@@ -1,0 +1,84 @@
+"""The TCP agents of one gateway: connections by id, and who of them is online in which group."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from macs_zenoh.mesh import Token
+
+from .connection import Connection
+
+Group = tuple[int, int]
+"""(agent type, group id)."""
+
+
+class Agents:
+    """Every connection from its handshake on. An agent is *online* once it has told its type and group."""
+
+    def __init__(self) -> None:
+        self._by_id: dict[int, Connection] = {}
+        self._tokens: dict[Connection, Token] = {}
+        self._groups: dict[Group, set[Connection]] = {}
+        self._group_of: dict[Connection, Group] = {}
+
+    def __len__(self) -> int:
+        return len(self._by_id)
+
+    @property
+    def ids(self) -> set[int]:
+        """Ids given out."""
+        return set(self._by_id)
+
+    def connections(self) -> list[Connection]:
+        """All connections."""
+        return list(self._by_id.values())
+
+    def online(self) -> Iterator[Connection]:
+        """Those that are configured."""
+        return iter(list(self._tokens))
+
+    def enter(self, agent_id: int, connection: Connection) -> None:
+        """A connection was given an id."""
+        self._by_id[agent_id] = connection
+
+    def join(self, connection: Connection, token: Token) -> Group | None:
+        """An agent told its type and group; its presence is ``token``. Returns a group that has its first member."""
+        self._unjoin(connection)
+        self._tokens[connection] = token
+        group = (connection.peer.agent_type, connection.peer.group)
+        if not connection.peer.group:
+            return None
+        self._group_of[connection] = group
+        members = self._groups.setdefault(group, set())
+        members.add(connection)
+        return group if len(members) == 1 else None
+
+    def leave(self, connection: Connection) -> tuple[bool, Group | None]:
+        """A connection ended. Returns whether it was online, and a group that lost its last member."""
+        self._by_id.pop(connection.agent_id, None)
+        return self._unjoin(connection)
+
+    def find(self, agent_type: object, agent_id: object) -> Connection | None:
+        """The online agent with this type and id, if it is ours."""
+        connection = self._by_id.get(agent_id)  # type: ignore[call-overload]
+        if connection in self._tokens and connection.peer.agent_type == agent_type:
+            return connection  # type: ignore[no-any-return]
+        return None
+
+    def members(self, agent_type: int, group: int) -> list[Connection]:
+        """Our online agents of a type in a group."""
+        return list(self._groups.get((agent_type, group), ()))
+
+    def _unjoin(self, connection: Connection) -> tuple[bool, Group | None]:
+        token = self._tokens.pop(connection, None)
+        if token is not None:
+            token.close()
+        group = self._group_of.pop(connection, None)
+        if group is None:
+            return token is not None, None
+        members = self._groups[group]
+        members.discard(connection)
+        if members:
+            return token is not None, None
+        del self._groups[group]
+        return token is not None, group

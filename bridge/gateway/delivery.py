@@ -1,0 +1,165 @@
+"""From the mesh to TCP agents: who of ours gets a sample, and that nothing reaches them that would harm them.
+
+Some existing headsets go deaf for good on metadata that is empty or no JSON, or on sizes that do not add up. So every
+sample is checked here again, whoever put it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+
+from macs_zenoh.directory import Directory
+from macs_zenoh.errors import WireError
+from macs_zenoh.keyexpr import BROADCAST, GROUP, UNICAST
+from macs_zenoh.mesh import Sample
+from macs_zenoh.messages import Metadata, StreamData, decode_management
+from macs_zenoh.routing import takes_group_copy
+from macs_zenoh.wire import Frame, Layout, parse_frame
+
+from .agents import Agents
+from .connection import Connection
+
+log = logging.getLogger("macs.gateway")
+
+KNOWN = 4096
+"""How many keys, metadata and registrant lists are remembered as already read."""
+
+
+class Delivery:
+    """Samples of the mesh → messages to connections. Each method takes a batch and flushes at its end.
+
+    ``drops`` counts ``bad_frame`` and ``nobody_with_this_id``.
+    """
+
+    def __init__(self, agents: Agents, directory: Directory, layout: Layout) -> None:
+        self.drops: Counter[str] = Counter()
+        self._agents = agents
+        self._directory = directory
+        self._layout = layout
+        self._targets: dict[str, Connection] = {}
+        self._metadata: dict[bytes, Metadata] = {}
+        self._registrants: dict[bytes, list[tuple[int, int]]] = {}
+        self._dirty: list[Connection] = []
+
+    def inbox(self, batch: list[Sample]) -> None:
+        """Frames sent to ids of ours."""
+        for key, payload in batch:
+            connection = self._targets.get(key) or self._find(key)
+            if connection is None:
+                continue
+            frame = self._frame(key, payload)
+            if frame is not None:
+                connection.send_call(frame.message)
+                if connection.congested:
+                    self._hold_sender(key, connection)
+        self.flush()
+
+    def group(self, batch: list[Sample]) -> None:
+        """Frames sent to groups that one of ours is in."""
+        for key, payload in batch:
+            fields = GROUP.parse(key)
+            frame = self._frame(key, payload)
+            if fields is None or frame is None:
+                continue
+            sender = (int(fields["from_type"]), int(fields["from_id"]))
+            header = frame.header
+            for connection in self._agents.members(int(fields["type"]), int(fields["group"])):
+                if takes_group_copy(header, connection.agent_id, sender, connection.peer.agent_type):
+                    connection.send_call(frame.message)
+        self.flush()
+
+    def broadcast(self, batch: list[Sample]) -> None:
+        """Frames sent to everybody."""
+        for key, payload in batch:
+            fields = BROADCAST.parse(key)
+            frame = self._frame(key, payload)
+            if fields is None or frame is None:
+                continue
+            sender = (fields["from_type"], fields["from_id"])
+            for connection in self._agents.online():
+                if connection.key != sender:
+                    connection.send_call(frame.message)
+        self.flush()
+
+    def stream(self, batch: list[Sample]) -> None:
+        """A robot's topic data, for those of its registrants that are ours."""
+        for key, payload in batch:
+            frame = self._frame(key, payload)
+            if frame is None:
+                continue
+            node = self._metadata[frame.metadata].node_name
+            for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
+                connection = self._agents.find(*registrant)
+                if connection is not None:
+                    connection.send_stream(node, frame.message)
+        self.flush()
+
+    def dirty(self, connection: Connection) -> None:
+        """A connection has messages to flush."""
+        self._dirty.append(connection)
+
+    def flush(self) -> None:
+        """Write what was gathered, one write per connection."""
+        dirty, self._dirty = self._dirty, []
+        for connection in dirty:
+            connection.flush()
+
+    def forget(self) -> None:
+        """Agents came or went: look keys up anew."""
+        self._targets.clear()
+
+    def _find(self, key: str) -> Connection | None:
+        fields = UNICAST.parse(key)
+        if fields is None:
+            return None
+        connection = self._agents.find(fields["type"], fields["id"])
+        if connection is None:
+            if (fields["type"], fields["id"]) not in self._directory:  # else it is in our block, but somebody else's
+                self.drops["nobody_with_this_id"] += 1
+            return None
+        if len(self._targets) >= KNOWN:
+            self._targets.clear()
+        self._targets[key] = connection
+        return connection
+
+    def _hold_sender(self, key: str, receiver: Connection) -> None:
+        """Slow down a sender on this gateway. Those elsewhere are slowed by nobody: the outbox's limit decides."""
+        fields = UNICAST.parse(key)
+        sender = self._agents.find(fields["from_type"], fields["from_id"]) if fields else None
+        if sender is not None:
+            receiver.brake.hold(sender)
+
+    def _read_registrants(self, key: str, frame: Frame) -> list[tuple[int, int]]:
+        """(type, id) of each registrant. The list changes only with registrations, so each is read once."""
+        try:
+            management = decode_management(frame.management)
+        except WireError as error:
+            self._bad(key, error)
+            return []
+        found = management.dest_agents if isinstance(management, StreamData) else {}
+        registrants = [(int(kind), i) for kind, ids in found.items() if kind.isascii() and kind.isdigit() for i in ids]
+        if len(self._registrants) >= KNOWN:
+            self._registrants.clear()
+        self._registrants[frame.management] = registrants
+        return registrants
+
+    def _frame(self, key: str, payload: bytes) -> Frame | None:
+        """The frame of a sample, None when no agent must see it."""
+        try:
+            frame = parse_frame(payload, self._layout)
+            raw = frame.metadata
+            if raw not in self._metadata:
+                metadata = Metadata.decode(raw)
+                if len(self._metadata) >= KNOWN:
+                    self._metadata.clear()
+                self._metadata[raw] = metadata
+        except WireError as error:
+            self._bad(key, error)
+            return None
+        return frame
+
+    def _bad(self, key: str, error: WireError) -> None:
+        self.drops["bad_frame"] += 1
+        if self.drops["bad_frame"] == 1:
+            log.warning("a frame on %s cannot be used: %s (logged once, counted as bad_frame)", key, error)

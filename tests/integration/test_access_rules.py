@@ -1,0 +1,121 @@
+"""The shipped access rules (config/router-access.json5) on a real router, with passwords in place of certificates."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import macs_zenoh
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.errors import Unreachable
+from macs_zenoh.keyexpr import PRESENCE, STREAM
+from macs_zenoh.mesh import Mesh
+
+RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
+USERS = ("robot-7", "gateway-1", "observer")
+
+
+@pytest.fixture
+async def as_user(tmp_path: Path) -> AsyncIterator[Callable[[str], MeshSettings]]:
+    """A router with the rules; gives the settings with which a user connects to it."""
+    rules = tmp_path / "rules.json5"
+    rules.write_text(RULES.read_text().replace("cert_common_names", "usernames"))
+    passwords = tmp_path / "passwords"
+    passwords.write_text("".join(f"{user}:secret\n" for user in USERS))
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    router = MeshSettings(
+        mode="router",
+        listen=[endpoint],
+        config_file=str(rules),
+        overrides=[f"transport/auth/usrpwd/dictionary_file:'{passwords}'", *credentials("observer")],
+    )
+
+    def settings(user: str) -> MeshSettings:
+        return MeshSettings(connect=[endpoint], overrides=credentials(user))
+
+    async with await Mesh.open(router):
+        yield settings
+
+
+def credentials(user: str) -> list[str]:
+    return [f"transport/auth/usrpwd/user:'{user}'", "transport/auth/usrpwd/password:'secret'"]
+
+
+async def online(agent: Any, agent_type: int, agent_id: int) -> None:
+    """Wait until the agent sees the other one."""
+    seen = asyncio.Event()
+    agent.on_presence(lambda who, here: seen.set() if here and (who.type, who.id) == (agent_type, agent_id) else None)
+    await asyncio.wait_for(seen.wait(), 5)
+
+
+async def test_what_the_rules_allow_works(as_user: Callable[[str], MeshSettings]) -> None:
+    """Robot 7 and a gateway's headset see each other, send by id, by group and to all, and call each other."""
+    async with (
+        macs_zenoh.join("ros", id=7, group=3, settings=as_user("robot-7")) as robot,
+        macs_zenoh.join("unity", id=9, settings=as_user("gateway-1")) as headset,
+    ):
+        await online(robot, 2, 9)
+        await online(headset, 1, 7)
+
+        async def answer(call: macs_zenoh.Call) -> bytes:
+            return b"yes, " + call.data
+
+        robot.serve("ask", answer)
+        headset.serve("ask", answer)
+        assert await headset.call("ros", 7, "ask", b"headset") == b"yes, headset"
+        assert await robot.call("unity", 9, "ask", b"robot") == b"yes, robot"
+
+        headset.send(b"by id", to="ros", ids=[7])
+        headset.send(b"by group", to="ros", groups=[3])
+        headset.broadcast(b"to all")
+        got = {(await asyncio.wait_for(robot.receive(), 5)).data for _ in range(3)}
+        assert got == {b"by id", b"by group", b"to all"}
+
+        robot.send(b"back", to="unity", ids=[9])
+        assert (await asyncio.wait_for(headset.receive(), 5)).data == b"back"
+
+        streamed: asyncio.Queue[bytes] = asyncio.Queue()
+
+        def take(batch: list[tuple[str, bytes]]) -> None:
+            for _, payload in batch:
+                streamed.put_nowait(payload)
+
+        headset.mesh.subscribe(STREAM.every(type=1, id=7), take)
+        await headset.call("ros", 7, "ask")  # by its answer the robot knows of the subscription
+        robot.publish_stream("nd__pose", b"topic data")
+        assert await asyncio.wait_for(streamed.get(), 5) == b"topic data"
+
+
+async def test_a_robot_cannot_speak_as_another(as_user: Callable[[str], MeshSettings]) -> None:
+    """With robot 7's credentials, robot 8 is neither seen nor heard."""
+    async with (
+        macs_zenoh.join("unity", id=9, settings=as_user("gateway-1")) as headset,
+        macs_zenoh.join("ros", id=7, settings=as_user("robot-7")) as robot,
+        macs_zenoh.join("ros", id=8, settings=as_user("robot-7")) as thief,
+    ):
+        await online(headset, 1, 7)
+        await online(thief, 2, 9)
+        await online(robot, 2, 9)
+        thief.send(b"I am robot 8", to="unity", ids=[9])
+        with pytest.raises(Unreachable):
+            await headset.call("ros", 8, "ask", timeout_s=1)
+        robot.send(b"I am robot 7", to="unity", ids=[9])
+        assert (await asyncio.wait_for(headset.receive(), 5)).data == b"I am robot 7"
+        assert {agent.id for agent in headset.online() if agent.type == 1} == {7}
+
+
+async def test_an_observer_sees_who_is_online(as_user: Callable[[str], MeshSettings]) -> None:
+    """The observer gets the list of agents."""
+    async with (
+        macs_zenoh.join("ros", id=7, group=3, settings=as_user("robot-7")),
+        await Mesh.open(as_user("observer")) as mesh,
+    ):
+        keys = await mesh.tokens(PRESENCE.every())
+    assert [fields["id"] for key in keys if (fields := PRESENCE.parse(key))] == [7]

@@ -1,0 +1,167 @@
+"""The verbs as real processes: they start in any order, are listed, and stop on a signal."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+
+import pytest
+
+import macs_zenoh
+from bridge.headset.client import Headset
+from tests.programs import ROOT, Program, free_port, macs
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+async def ended(*argv: str) -> tuple[int | None, str, str]:
+    """Run ``macs ...`` to its end: exit code, stdout, stderr."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "bridge", *argv, cwd=ROOT, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
+    )
+    out, errors = await asyncio.wait_for(process.communicate(), 20)
+    return process.returncode, out.decode(), errors.decode()
+
+
+async def test_ls_lists_robots_and_headsets(endpoint: str) -> None:
+    """Everybody online is in `macs ls --json`, with type, id and group."""
+    async with (
+        Program("router", "-l", endpoint),
+        Program("gateway", "--port", "0", "-e", endpoint) as gateway,
+        macs_zenoh.join("ros", id=7, group=3, connect=[endpoint]),
+        await Headset.connect("127.0.0.1", gateway.port, group=4) as headset,
+    ):
+        while 7 not in (await headset.online()).ros_agent_ids:
+            await asyncio.sleep(0.02)
+        listed = await macs("ls", "--json", "-e", endpoint)
+        assert [(agent["type"], agent["id"], agent["group"]) for agent in listed] == [
+            ("ros", 7, 3),
+            ("unity", headset.id, 4),
+        ]
+        code, shown, _ = await ended("ls", "-e", endpoint)
+        assert code == 0
+        assert [line.split()[:3] for line in shown.splitlines()] == [
+            ["TYPE", "ID", "GROUP"],
+            ["ros", "7", "3"],
+            ["unity", str(headset.id), "4"],
+        ]
+
+
+async def test_ls_of_an_empty_mesh_is_an_empty_list(endpoint: str) -> None:
+    """A router with nobody on it is no failure."""
+    async with Program("router", "-l", endpoint):
+        assert await macs("ls", "--json", "-e", endpoint) == []
+
+
+async def test_ls_without_a_router_is_exit_code_1(endpoint: str) -> None:
+    """When no router answers, one line says so."""
+    code, out, errors = await ended("ls", "-e", endpoint, "--timeout", "0.5")
+    assert (code, out) == (1, "")
+    assert errors.startswith(f"macs ls: {endpoint} cannot be reached")
+    assert len(errors.splitlines()) == 1
+
+
+async def test_a_namespace_is_a_mesh_of_its_own(endpoint: str) -> None:
+    """Programs in one namespace do not see those of another on the same router."""
+    site = macs_zenoh.MeshSettings(connect=[endpoint], namespace="site1")
+    async with Program("router", "-l", endpoint), macs_zenoh.join("ros", id=7, settings=site):
+        assert await macs("ls", "--json", "-e", endpoint) == []
+        assert [agent["id"] for agent in await macs("ls", "--json", "-e", endpoint, "--namespace", "site1")] == [7]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+async def test_servers_stop_on_a_signal(endpoint: str, number: signal.Signals) -> None:
+    """Router and gateway end with 0 within 2 s, the gateway also when its router is gone before it."""
+    router = Program("router", "-l", endpoint)
+    gateway = Program("gateway", "--port", "0", "-e", endpoint)
+    async with router, gateway:
+        assert await asyncio.wait_for(router.stop(number), 2) == 0
+        assert await asyncio.wait_for(gateway.stop(number), 2) == 0
+
+
+async def test_a_gateway_waits_for_its_router(endpoint: str) -> None:
+    """Started first, a gateway says what it waits for, and works once the router is there."""
+    gateway = Program("gateway", "--port", "0", "-e", endpoint)
+    start = asyncio.create_task(gateway.start())
+    while not any(endpoint in line for line in gateway.log):
+        await asyncio.sleep(0.02)
+    assert not start.done()
+    async with Program("router", "-l", endpoint):
+        await start
+        assert await gateway.stop() == 0
+
+
+async def test_a_waiting_gateway_stops_too(endpoint: str) -> None:
+    """SIGTERM ends a gateway that still waits for a router."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-m",
+        "bridge",
+        "gateway",
+        "--port",
+        "0",
+        "-e",
+        endpoint,
+        cwd=ROOT,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    assert process.stderr is not None
+    assert endpoint in (await asyncio.wait_for(process.stderr.readline(), 20)).decode()
+    process.send_signal(signal.SIGTERM)
+    assert await asyncio.wait_for(process.wait(), 2) == 0
+
+
+async def test_a_taken_port_is_one_line(endpoint: str) -> None:
+    """A router or gateway that cannot listen says where and ends with 1."""
+    async with Program("router", "-l", endpoint), Program("gateway", "--port", "0", "-e", endpoint) as gateway:
+        for argv, where in (
+            (["router", "-l", endpoint], endpoint),
+            (["gateway", "--port", str(gateway.port), "-e", endpoint], str(gateway.port)),
+        ):
+            code, _, errors = await ended(*argv)
+            assert code == 1
+            assert "Traceback" not in errors
+            assert where in errors.splitlines()[-1]
+
+
+async def test_up_runs_router_and_gateway(endpoint: str) -> None:
+    """`macs up` without a robot's ROS side still serves headsets, and stops all its programs within 2 s."""
+    port, router_port = free_port(), free_port()
+    # rclpy is hidden by an empty package of its name without an import path to the real one
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-c",
+        "import sys, importlib.util as u; real = u.find_spec;"
+        "u.find_spec = lambda name, *rest: None if name == 'rclpy' else real(name, *rest);"
+        "from bridge.cli import main; sys.exit(main())",
+        *("up", "--port", str(port), "--router-port", str(router_port)),
+        cwd=ROOT,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    shown = b""
+    while b"A Unity headset connects" not in shown:
+        line = await asyncio.wait_for(process.stdout.readline(), 20)
+        assert line, (await process.communicate())[1].decode()
+        shown += line
+    async with await Headset.connect("127.0.0.1", port) as headset:
+        assert (await headset.online()).unity_agent_ids == [headset.id]
+        assert len(await macs("ls", "--json", "-e", f"tcp/127.0.0.1:{router_port}")) == 1
+    process.send_signal(signal.SIGINT)
+    _, errors = await asyncio.wait_for(process.communicate(), 2)
+    assert process.returncode == 0
+    assert "no rclpy here, so no robot" in errors.decode()
+    assert "killed" not in errors.decode()
+
+
+async def test_keys_as_a_program() -> None:
+    """`macs keys --json` is JSON and needs no router."""
+    code, out, _ = await ended("keys", "--json")
+    assert code == 0
+    assert json.loads(out)
