@@ -37,6 +37,10 @@ SETTLE_S = 0.3
 """How long a claimed id waits for somebody else's claim on it to show up."""
 
 
+RETRY_S = 0.05
+"""How long a call waits before it asks again an agent that is online and does not serve it yet."""
+
+
 class Message(NamedTuple):
     """What an agent receives. The sender comes from the key, which a router can hold it to, not from the JSON."""
 
@@ -77,6 +81,7 @@ class Agent:
         self.drops: Counter[str] = Counter()
         self.directory = Directory()
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
+        self._stream_keys: dict[str, str] = {}
         self._inbox: deque[Message] = deque()
         self._arrived = asyncio.Event()
         self._closed = False
@@ -121,7 +126,9 @@ class Agent:
 
         ``frame`` is a whole frame whose management data lists who gets it (StreamData).
         """
-        key = STREAM.of(type=self.type_number, id=self.id, node=node)
+        key = self._stream_keys.get(node)
+        if key is None:
+            key = self._stream_keys[node] = STREAM.of(type=self.type_number, id=self.id, node=node)
         self.mesh.put(key, frame, Traffic.STREAM)
 
     def _send(
@@ -219,15 +226,23 @@ class Agent:
         key = CALL.of(type=kind, id=id, verb=verb, from_type=self.type_number, from_id=self.id)
         message = encode_message(self._stamp(metadata or Metadata()).encode(), data)
         frame = encode_frame(kind, (id,), message=message, layout=self._layout)
-        try:
-            return await self.mesh.query(key, frame, timeout_s=timeout_s)
-        except CallTimeout:
-            raise CallTimeout(f"{to}/{id} {verb}", timeout_s) from None
-        except Unreachable as error:
-            raise Unreachable(f"{to}/{id} {verb}", error.why) from None
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                return await self.mesh.query(key, frame, timeout_s=max(0.001, deadline - time.monotonic()))
+            except CallTimeout:
+                raise CallTimeout(f"{to}/{id} {verb}", timeout_s) from None
+            except Unreachable as error:
+                # an agent that has just come is online a moment before it serves
+                if (kind, id) not in self.directory or time.monotonic() + RETRY_S > deadline:
+                    raise Unreachable(f"{to}/{id} {verb}", error.why) from None
+            await asyncio.sleep(RETRY_S)
 
     def serve(self, verb: str, handler: CallHandler) -> Subscription:
-        """Answer calls of ``verb`` with ``await handler(call)``; raise Refused in it to refuse with a reason."""
+        """Answer calls of ``verb`` with ``await handler(call)``; raise Refused in it to refuse with a reason.
+
+        It takes a moment until the whole mesh knows; callers who see this agent online ask again meanwhile.
+        """
 
         async def answer(key: str, payload: bytes) -> bytes:
             fields = CALL.parse(key)
@@ -261,7 +276,8 @@ class Agent:
 
     def _tell(self, changes: list[Change]) -> None:
         for agent, online in changes:
-            log.info("%s/%d %s", agent.type_name, agent.id, "is online" if online else "has left")
+            if agent.zid != self.mesh.zid:
+                log.info("%s/%d %s", agent.type_name, agent.id, "is online" if online else "has left")
             for callback in self._on_presence:
                 callback(agent, online)
         self._schedule_sweep()

@@ -52,7 +52,7 @@ Handler = Callable[[str, bytes], Awaitable[bytes]]
 
 
 class Subscription:
-    """Something declared on the mesh, until `close`."""
+    """Something declared on the mesh, until `close`. Keep it: Zenoh undeclares what nobody refers to."""
 
     def __init__(self, *declared: Any) -> None:
         self._declared = declared
@@ -135,6 +135,7 @@ class Mesh:
 
         Raises ConfigError when Zenoh does not accept the configuration, Unreachable when a router cannot listen.
         """
+        zenoh.init_log_from_env_or("error")  # RUST_LOG, as with Zenoh's own tools
         waiting = False
         while True:
             config = _zenoh_config(settings)

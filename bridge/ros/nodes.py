@@ -7,6 +7,7 @@ crosses as bytes, never decoded: from the ROS thread straight into the mesh, fro
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import re
 from abc import ABC, abstractmethod
@@ -168,6 +169,7 @@ class InterfaceNodes:
     async def _open(self, node: InterfaceNode, opened: asyncio.Future[None]) -> None:
         try:
             await opened
+            await node.settle()
         except BaseException:
             if self._nodes.get(node.key) is node:
                 del self._nodes[node.key]
@@ -254,6 +256,9 @@ class InterfaceNode(ABC):
     @abstractmethod
     def open(self) -> None:
         """Create the rclpy entity. In the ROS thread. Raises Refused."""
+
+    async def settle(self) -> None:  # noqa: B027 - only some nodes have to wait
+        """Wait, on the loop and not for long, until the entity can do its work."""
 
     @abstractmethod
     def close(self) -> None:
@@ -378,10 +383,16 @@ class PublisherNode(InterfaceNode):
     NODE_TYPE = NodeType.PUBLISHER
     ROLE = "publisher"
 
+    MATCH_S = 0.5
+    """How long a new publisher waits for the subscriptions that exist to find it."""
+
     def __init__(self, robot: Robot, request: AddNode) -> None:
         super().__init__(robot, request)
         self._publisher: Any = None
         self._least_bytes = 4
+        self._expected = 0
+        self._matched = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
 
     def open(self) -> None:
         message = resolve(str(self.interface))
@@ -392,9 +403,23 @@ class PublisherNode(InterfaceNode):
         profile = qos.for_publisher(
             subscriptions, qos.depth_of(self.request.buffer_size), latched=self.request.is_latched
         )
-        events = PublisherEventCallbacks(use_default_callbacks=False)
+        self._expected = len(subscriptions)
+        events = PublisherEventCallbacks(matched=self._subscription_matched, use_default_callbacks=False)
         with _ros_errors(topic):
-            self._publisher = node.create_publisher(message, topic, profile, event_callbacks=events)
+            try:
+                self._publisher = node.create_publisher(message, topic, profile, event_callbacks=events)
+            except UnsupportedEventTypeError:  # of some middlewares; then the time decides
+                self._publisher = node.create_publisher(message, topic, profile)
+
+    async def settle(self) -> None:
+        """Let the subscriptions that exist find the new publisher: what is published before that, ROS loses."""
+        if self._expected:
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._matched.wait(), self.MATCH_S)
+
+    def _subscription_matched(self, status: Any) -> None:
+        if status.current_count >= self._expected:
+            self._loop.call_soon_threadsafe(self._matched.set)
 
     def close(self) -> None:
         publisher, self._publisher = self._publisher, None

@@ -69,6 +69,10 @@ async def test_what_the_rules_allow_works(as_user: Callable[[str], MeshSettings]
 
         robot.serve("ask", answer)
         headset.serve("ask", answer)
+        robot.broadcast(b"serving")  # what a session declares arrives before what it sends afterwards
+        headset.broadcast(b"serving")
+        for agent in (robot, headset):
+            assert (await asyncio.wait_for(agent.receive(), 5)).data == b"serving"
         assert await headset.call("ros", 7, "ask", b"headset") == b"yes, headset"
         assert await robot.call("unity", 9, "ask", b"robot") == b"yes, robot"
 

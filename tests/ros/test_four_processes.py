@@ -1,4 +1,4 @@
-"""The main job on real parts: a router, two gateways and a robot agent as four processes, a headset on each gateway."""
+"""The main job on real parts: router, two gateways and a robot agent as four processes, a headset on each gateway."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ import pytest
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
+import macs_zenoh
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Incoming
+from macs_zenoh.messages import Functionality, decode_data
 from tests.programs import Program, free_port, macs
 from tests.ros.ros_peer import Peer, get
 
@@ -93,6 +95,10 @@ async def test_both_get_the_same_topic(site: Site, peer: Peer) -> None:
 async def test_both_publish_to_one_topic(site: Site, peer: Peer) -> None:
     """What headsets on two gateways publish arrives on the robot's topic, each message once."""
     received = await peer.subscription(String, "/orders")
+    async with macs_zenoh.join("unity", id=9, connect=[site.endpoint]) as observer:
+        offers = Functionality()
+        while "/orders" not in offers.subscribers:  # what ROS has not discovered yet, nobody can publish to
+            offers = decode_data(Functionality, await observer.call("ros", 1, "offers"))
     for headset in site.headsets:
         await headset.publish(
             "/orders", "std_msgs/String", serialize_message(String(data=f"from {headset.id}")), agents=[1]
