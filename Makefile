@@ -18,6 +18,8 @@ EXTRAS ?= ros,headset,dev
 else
 EXTRAS ?= headset,dev
 endif
+# What a ROS installation needs besides its own path (yaml, numpy) is among the system's packages.
+VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)
 
 .DEFAULT_GOAL := help
 .PHONY: help run install test lint format bench clean
@@ -33,11 +35,11 @@ install: $(STAMP)
 # Installed again only when the dependencies may have changed: the package itself is linked, not copied.
 $(STAMP): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || { \
-	  echo "macs-zenoh needs Python 3.10 or newer; $(PYTHON) is: $$($(PYTHON) --version 2>&1 || true)"; \
+	  echo "macs-zenoh needs Python 3.10 or newer; $(PYTHON) is: $$($(PYTHON) --version 2>&1 | head -n 1 || true)"; \
 	  echo "Install one and name it, as in: make $(MAKECMDGOALS) PYTHON=python3.12"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "$(PYTHON) cannot make a virtual environment. On Debian and Ubuntu: sudo apt install python3-venv"; exit 1; }
-	@test -x $(BIN)/python || { echo "making $(VENV)"; $(PYTHON) -m venv $(VENV); }
+	@test -x $(BIN)/python || { echo "making $(VENV)"; $(PYTHON) -m venv $(VENV_OPTIONS) $(VENV); }
 	@echo "installing macs-zenoh [$(EXTRAS)] into $(VENV); the first time this takes a minute or two"
 	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off -e ".[$(EXTRAS)]" | \
 	  sed -u -n -e 's/^Collecting \([^ ]*\).*/  \1/p' -e 's/^\(Downloading\|Installing\|Building\)/  &/p'

@@ -18,7 +18,11 @@ class _RosTests:
         self.passed = 0
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        if report.when == "call" and report.passed and Path(report.nodeid.partition("::")[0]).parts[:2] == ("tests", "ros"):
+        if (
+            report.when == "call"
+            and report.passed
+            and Path(report.nodeid.partition("::")[0]).parts[:2] == ("tests", "ros")
+        ):
             self.passed += 1
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:

@@ -15,7 +15,7 @@ from macs_zenoh.config import Settings
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("-v", "--verbose", action="store_true", help="log more (Zenoh's own log: RUST_LOG=debug)")
+    parser.add_argument("-v", "--verbose", action="store_true", help="log more")
 
 
 def add_settings_option(parser: argparse.ArgumentParser) -> None:
@@ -39,9 +39,14 @@ def add_mesh_options(parser: argparse.ArgumentParser, *, modes: tuple[str, ...] 
     zenoh.add_argument("--namespace", metavar="KEY", help="put before every key: several meshes on one router")
 
 
+def settings_file(args: argparse.Namespace) -> Settings:
+    """What the settings file says, all defaults without one. Raises `ConfigError`."""
+    return config.load(args.settings) if args.settings else Settings()
+
+
 def settings(args: argparse.Namespace) -> Settings:
     """The settings file, changed by the options given. Raises `ConfigError`."""
-    base = config.load(args.settings) if args.settings else Settings()
+    base = settings_file(args)
     mesh = config.changed(
         base.mesh,
         mode=getattr(args, "mode", None),
@@ -54,7 +59,16 @@ def settings(args: argparse.Namespace) -> Settings:
     return config.changed(base, mesh=mesh)
 
 
+LOG_FORMAT = "%(asctime)s %(levelname).1s %(name)s: %(message)s"
+
+
 def start_logging(args: argparse.Namespace) -> None:
     """Log ``macs.*`` to stderr, one short line each; other libraries only from WARNING on."""
-    logging.basicConfig(format="%(asctime)s %(levelname).1s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    logging.basicConfig(format=LOG_FORMAT, datefmt="%H:%M:%S")
     logging.getLogger("macs").setLevel(logging.DEBUG if args.verbose else logging.INFO)
+
+
+def prefix_logs(prefix: str) -> None:
+    """Put ``prefix`` before each line of our own log, as before those of other programs on the same terminal."""
+    for handler in logging.getLogger().handlers:
+        handler.setFormatter(logging.Formatter(prefix + LOG_FORMAT, datefmt="%H:%M:%S"))

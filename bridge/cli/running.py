@@ -9,6 +9,9 @@ import sys
 from collections.abc import Callable, Coroutine
 from typing import Any
 
+READY = "ready: "
+"""How a program that serves begins its first line on stdout."""
+
 STOP_WITH_STDIN = "MACS_STOP_WITH_STDIN"
 """Set by ``macs up`` for its children: end of stdin means that it is gone, however it went."""
 
@@ -61,3 +64,9 @@ def _new_loop() -> asyncio.AbstractEventLoop:
         return asyncio.new_event_loop()
     loop: asyncio.AbstractEventLoop = uvloop.new_event_loop()
     return loop
+
+
+def say_ready(what: str) -> None:
+    """Print on stdout that this program does its work now, and where: people and ``macs up`` wait for this line."""
+    sys.stdout.write(f"{READY}{what}\n")
+    sys.stdout.flush()

@@ -16,15 +16,24 @@ BRIDGE = sorted((ROOT / "bridge").rglob("*.py"))
 WITH_ZENOH = {"mesh.py"}
 WITH_ASYNCIO = {"mesh.py", "agent.py"}
 NEEDED_FROM_OUTSIDE = {"msgspec", "zenoh", "tomli"}
-INPUT_OUTPUT = {"socket", "socketserver", "selectors", "ssl", "subprocess", "multiprocessing", "rclpy", "bridge", "tests"}
+INPUT_OUTPUT = {
+    "socket",
+    "socketserver",
+    "selectors",
+    "ssl",
+    "subprocess",
+    "multiprocessing",
+    "rclpy",
+    "bridge",
+    "tests",
+}
 
 
 def imported(path: Path) -> Iterator[tuple[str, bool]]:
     """The modules that a file imports, absolute, each with whether it is imported when the file is."""
     package = path.relative_to(ROOT).with_suffix("").parts[:-1]
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    inside = {id(node) for scope in ast.walk(tree) if isinstance(scope, ast.FunctionDef | ast.AsyncFunctionDef)
-              for node in ast.walk(scope)}
+    later = {id(node) for scope in ast.walk(tree) if runs_later(scope) for node in ast.walk(scope)}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -35,7 +44,14 @@ def imported(path: Path) -> Iterator[tuple[str, bool]]:
         else:
             continue
         for name in names:
-            yield name, id(node) not in inside
+            yield name, id(node) not in later
+
+
+def runs_later(scope: ast.AST) -> bool:
+    """Whether what is inside runs not when the file is imported: in a function, or for the type checker only."""
+    if isinstance(scope, ast.If):
+        return isinstance(scope.test, ast.Name) and scope.test.id == "TYPE_CHECKING"
+    return isinstance(scope, ast.FunctionDef | ast.AsyncFunctionDef)
 
 
 def roots(path: Path) -> set[str]:
@@ -64,7 +80,9 @@ def test_the_core_needs_only_what_it_declares(path: Path) -> None:
     assert roots(path) <= sys.stdlib_module_names | NEEDED_FROM_OUTSIDE | {"macs_zenoh"}
 
 
-@pytest.mark.parametrize("path", [p for p in CORE if p.name not in WITH_ASYNCIO | {"__init__.py"}], ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    "path", [p for p in CORE if p.name not in WITH_ASYNCIO | {"__init__.py"}], ids=lambda p: p.name
+)
 def test_pure_modules_do_not_reach_back(path: Path) -> None:
     """A pure module never imports the mesh or the agent API."""
     assert not {name for name, _ in imported(path)} & {"macs_zenoh.mesh", "macs_zenoh.agent"}
@@ -82,6 +100,13 @@ def test_the_bridge_does_not_import_tests_or_zenoh(path: Path) -> None:
 @pytest.mark.parametrize("path", [p for p in BRIDGE if p.parent.name == "cli"], ids=lambda path: path.name)
 def test_help_is_instant(path: Path) -> None:
     """A CLI module imports what is heavy inside its functions, not when it is loaded."""
-    heavy = ("macs_zenoh.mesh", "macs_zenoh.agent", "macs_zenoh.join", "bridge.ros", "bridge.gateway", "bridge.headset")
+    heavy = (
+        "macs_zenoh.mesh",
+        "macs_zenoh.agent",
+        "macs_zenoh.join",
+        "bridge.ros",
+        "bridge.gateway",
+        "bridge.headset",
+    )
     at_once = {name for name, when_loaded in imported(path) if when_loaded}
     assert not {name for name in at_once if name.startswith(heavy) or name.partition(".")[0] in {"zenoh", "rosbags"}}

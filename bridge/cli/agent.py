@@ -1,0 +1,42 @@
+"""Make this machine's ROS 2 graph a robot on the mesh.
+
+Headsets name the topics and services they want; this agent subscribes, publishes and calls for
+them, and passes ROS messages on as they are. It needs rclpy: from a sourced ROS 2 installation,
+or from pip install 'macs-zenoh[ros]'.
+
+examples:
+  macs agent --id 7 --group 3 -e tcp/192.168.1.10:7447
+  macs agent --id 7 --ros-args -r __ns:=/robot7
+  ROS_DOMAIN_ID=5 macs agent --id 7"""
+
+from __future__ import annotations
+
+import argparse
+
+from bridge.cli import options, running
+from macs_zenoh.config import Settings, changed
+
+SUMMARY = "a robot: this machine's ROS 2 graph"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--id", type=int, help="id of this robot, 1 to 65535 (default: the first free one)")
+    parser.add_argument("--group", type=int, help="group of this robot, 1 to 255 (default: 0, none)")
+    options.add_mesh_options(parser)
+    parser.add_argument(
+        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help="ROS arguments, to the end of the line"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    settings = options.settings(args)
+    settings = changed(settings, robot=changed(settings.robot, id=args.id, group=args.group))
+    ros_args = ["--ros-args", *args.ros_args] if args.ros_args else []
+    return running.until_stopped(lambda: _serve(settings, ros_args))
+
+
+async def _serve(settings: Settings, ros_args: list[str]) -> int:
+    from bridge.ros import agent
+
+    await agent.run(settings, ros_args=ros_args, on_ready=lambda robot: running.say_ready(f"robot {robot.id}"))
+    return 0

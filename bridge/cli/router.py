@@ -1,0 +1,37 @@
+"""Run a Zenoh router: where robots and gateways meet.
+
+It is the same router as zenohd, without plugins. Any Zenoh program can connect to it, and a
+zenohd that runs already does as well: then no `macs router` is needed.
+
+examples:
+  macs router
+  macs router -l tcp/10.0.0.1:7447 -l tls/0.0.0.0:7448 -c tls.json5
+  macs router -e tcp/other-site:7447             linked to another router"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+
+from bridge.cli import options, running
+from macs_zenoh.config import EVERY_INTERFACE, MeshSettings, changed
+
+SUMMARY = "a Zenoh router, where robots and gateways meet"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    options.add_mesh_options(parser, modes=())
+
+
+def run(args: argparse.Namespace) -> int:
+    mesh = changed(options.settings(args).mesh, mode="router")
+    return running.until_stopped(lambda: _serve(mesh))
+
+
+async def _serve(settings: MeshSettings) -> int:
+    from macs_zenoh.mesh import Mesh
+
+    async with await Mesh.open(settings):
+        running.say_ready("router on " + ", ".join(settings.listen or [EVERY_INTERFACE]))
+        await asyncio.Event().wait()
+    return 0

@@ -1,0 +1,235 @@
+"""Start router, gateway and robot agent on this machine, in one command.
+
+Each is a program of its own, started again when it ends; their logs come with their names in
+front. Ctrl-C stops them all. Without rclpy the robot is left out.
+
+--demo adds a robot without hardware (a camera image, a pose, /cmd_vel) and a headset that
+shows what it receives and drives it. The demo has a ROS domain of its own, so that it never
+moves a real robot.
+
+examples:
+  macs up --demo
+  macs up --host 0.0.0.0 --id 7             headsets and other robots from the network
+  macs up -e tcp/192.168.1.10:7447          gateway and robot here, router there"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import importlib.util
+import logging
+import os
+import socket
+import sys
+from contextlib import suppress
+from dataclasses import dataclass
+
+from bridge.cli import children, options, running
+from bridge.cli.children import Child, stop_in_order
+from macs_zenoh.config import GatewaySettings, RobotSettings, Settings, changed
+from macs_zenoh.errors import MacsError, Unreachable, UsageError
+
+log = logging.getLogger("macs.up")
+
+SUMMARY = "all of it on this machine: router, gateway, robot"
+
+DEFAULT_ROBOT = 1
+DEMO_DOMAIN = "42"
+DRIVE = """'{"linear": {"x": 0.2}}' --rate 10"""
+EVERYWHERE = {"0.0.0.0", "::", ""}  # noqa: S104 - recognised, not bound here
+
+
+class PortTaken(Unreachable):
+    """Somebody else listens there."""
+
+    def __init__(self, host: str, port: int, advice: str) -> None:
+        super().__init__(f"{host}:{port}", f"the port is taken; {advice}")
+        self.port = port
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--demo", action="store_true", help="add a demo robot, and a headset that drives it")
+    parser.add_argument("--once", action="store_true", help="with --demo: end after the show, 0 if all of it worked")
+    parser.add_argument("--host", help="where gateway and router listen (default: 127.0.0.1; 0.0.0.0: network)")
+    parser.add_argument("--port", type=int, help="TCP port for headsets (default: 7000; 0: a free one)")
+    parser.add_argument("--router-port", type=int, default=7447, help="port of the router (default: 7447; 0: free)")
+    parser.add_argument("--id", type=int, help=f"id of the robot (default: {DEFAULT_ROBOT})")
+    parser.add_argument("--group", type=int, help="group of the robot (default: none)")
+    parser.add_argument(
+        "-e", "--connect", metavar="ENDPOINT", action="append", help="use this router, start none here"
+    )
+    options.add_settings_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    if args.once and not args.demo:
+        raise UsageError("--once belongs to --demo")
+    options.prefix_logs(children.prefix("up"))
+    plan = make_plan(args, options.settings_file(args))
+    return running.until_stopped(lambda: _up(plan))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to start, and where it listens: every port is known before the first program starts."""
+
+    gateway: GatewaySettings
+    robot: RobotSettings
+    router_port: int | None
+    """None: there is a router already."""
+    routers: list[str]
+    settings_file: str | None
+    demo: bool
+    once: bool
+    verbose: bool
+
+    def router_child(self) -> Child | None:
+        """The router, on the same addresses as the gateway: nothing is open to the network unless asked for."""
+        if self.router_port is None:
+            return None
+        host = "[::]" if self.gateway.host in EVERYWHERE else self.gateway.host
+        return self._child("router", ["-l", f"tcp/{host}:{self.router_port}"])
+
+    def gateway_child(self) -> Child:
+        return self._child("gateway", [*self._mesh(), "--host", self.gateway.host, "--port", str(self.gateway.port)])
+
+    def robot_children(self) -> list[Child]:
+        robot = ["--id", str(self.robot.id), "--group", str(self.robot.group)]
+        agent = self._child("agent", [*self._mesh(), *robot])
+        return [Child("demo", ["bridge.cli.demo"]), agent] if self.demo else [agent]
+
+    def _mesh(self) -> list[str]:
+        return [word for router in self.routers for word in ("-e", router)]
+
+    def _child(self, verb: str, argv: list[str]) -> Child:
+        common = ["--settings", self.settings_file] if self.settings_file else []
+        return Child(verb, ["bridge", verb, *common, *(["-v"] if self.verbose else []), *argv])
+
+
+def make_plan(args: argparse.Namespace, settings: Settings) -> Plan:
+    """Settle every choice. Raises ConfigError for what is out of range, PortTaken."""
+    gateway = changed(settings.gateway, host=args.host, port=args.port)
+    gateway = changed(gateway, port=_port(gateway.host, gateway.port, "choose another one with --port"))
+    routers = args.connect or settings.mesh.connect
+    router_port = None
+    if not routers:
+        advice = "join the router there with -e tcp/127.0.0.1:{0}, or choose another port with --router-port"
+        router_port = _port(gateway.host, args.router_port, advice.format(args.router_port))
+        routers = [f"tcp/127.0.0.1:{router_port}"]
+    return Plan(
+        gateway=gateway,
+        robot=changed(settings.robot, id=args.id or settings.robot.id or DEFAULT_ROBOT, group=args.group),
+        router_port=router_port,
+        routers=routers,
+        settings_file=args.settings,
+        demo=args.demo,
+        once=args.once,
+        verbose=args.verbose,
+    )
+
+
+def _port(host: str, port: int, advice: str) -> int:
+    """The port, if it can be listened on; a free one for 0."""
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise PortTaken(host, port, advice) from error
+        number: int = probe.getsockname()[1]
+        return number
+
+
+async def _up(plan: Plan) -> int:
+    if plan.demo:
+        # The scripted headset drives: in the default domain that could be somebody's real robot.
+        os.environ.setdefault("ROS_DOMAIN_ID", DEMO_DOMAIN)
+        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    router, gateway, robot = plan.router_child(), plan.gateway_child(), _robot_if_possible(plan)
+    needed = [router] if router else []
+    others = [gateway, *robot]
+    tasks: list[asyncio.Task[None]] = []
+    try:
+        tasks = [asyncio.create_task(child.run(), name=child.name) for child in [*needed, *others]]
+        work = asyncio.create_task(_when_ready(plan, [*needed, gateway, *robot[-1:]]))
+        return await _first_failure_or(work, tasks)
+    finally:
+        await stop_in_order([(others, 1.2), (needed, 0.5)])
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _robot_if_possible(plan: Plan) -> list[Child]:
+    if importlib.util.find_spec("rclpy") is not None:
+        return plan.robot_children()
+    if plan.demo:
+        raise Unreachable("the demo robot", "rclpy is missing: pip install 'macs-zenoh[ros]', or source your ROS 2")
+    log.warning("no rclpy here, so no robot: pip install 'macs-zenoh[ros]', or source your ROS 2 installation")
+    return []
+
+
+async def _first_failure_or(work: asyncio.Task[int], tasks: list[asyncio.Task[None]]) -> int:
+    """The result of ``work``, unless a program fails for good before."""
+    try:
+        await asyncio.wait([work, *tasks], return_when=asyncio.FIRST_COMPLETED)
+        for task in tasks:
+            if task.done():
+                task.result()
+        return await work
+    finally:
+        work.cancel()
+        with suppress(asyncio.CancelledError, MacsError):
+            await work
+
+
+async def _when_ready(plan: Plan, programs: list[Child]) -> int:
+    await asyncio.gather(*(child.ready.wait() for child in programs))
+    if plan.demo:
+        from bridge.cli.demo import show
+
+        worked = await show(plan.gateway.host, plan.gateway.port, plan.robot.id or DEFAULT_ROBOT, _say)
+        if plan.once:
+            return 0 if worked else 1
+    _say(what_next(plan))
+    await asyncio.Event().wait()
+    return 0
+
+
+def what_next(plan: Plan) -> str:
+    """What to type now, and where to point a headset."""
+    host = "127.0.0.1" if plan.gateway.host in EVERYWHERE else plan.gateway.host
+    target = f"{host}:{plan.gateway.port}"
+    endpoint = "" if plan.routers == ["tcp/127.0.0.1:7447"] else "".join(f" -e {router}" for router in plan.routers)
+    seen_from_outside = plan.gateway.host in EVERYWHERE
+    topic = "/pose geometry_msgs/PoseStamped" if plan.demo else "/TOPIC pkg/Type"
+    where = f"{_own_address()}:{plan.gateway.port}" if seen_from_outside else f"{target}, from this machine only"
+    lines = [
+        "",
+        "It runs. Ctrl-C stops it; meanwhile, in another terminal:",
+        f"  who is online      macs ls{endpoint}",
+        f"  receive a topic    macs headset {target} sub {topic}",
+        f"  drive              macs headset {target} pub /cmd_vel geometry_msgs/Twist {DRIVE}",
+        f"A Unity headset connects to {where}.",
+    ]
+    if not seen_from_outside:
+        lines.append("To let headsets and robots in from the network, start with --host 0.0.0.0.")
+    if plan.demo:
+        lines.append(f"Its ROS side: ROS_DOMAIN_ID={os.environ.get('ROS_DOMAIN_ID', DEMO_DOMAIN)} ros2 topic list")
+    return "\n".join(lines)
+
+
+def _own_address() -> str:
+    """This machine's address in its network; connecting a UDP socket sends nothing."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return socket.gethostname()
+        address: str = probe.getsockname()[0]
+        return address
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()

@@ -1,0 +1,267 @@
+"""The command line: help, exit codes, how options, files and the environment become settings, and the key map."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import socket
+from pathlib import Path
+
+import pytest
+
+from bridge.cli import VERBS, build_parser, children, main, options, up
+from macs_zenoh.config import MeshSettings, Settings
+from macs_zenoh.errors import ConfigError
+from macs_zenoh.keyexpr import KEYS
+
+
+def parsed(*argv: str) -> argparse.Namespace:
+    return build_parser().parse_args(argv)
+
+
+# -- help and errors -------------------------------------------------------------------------------------------------
+
+
+def test_help_names_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    """`macs --help` has a line for each verb, and examples."""
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    assert ended.value.code == 0
+    shown = capsys.readouterr().out
+    for verb, module in VERBS.items():
+        assert f"    {verb:10}{module.SUMMARY}" in shown
+    assert shown.count("\n  macs ") == 3
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_of_a_verb_has_examples(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each verb explains itself and shows how it is called."""
+    with pytest.raises(SystemExit) as ended:
+        main([verb, "--help"])
+    assert ended.value.code == 0
+    shown = capsys.readouterr().out
+    assert f"\n  macs {verb}" in shown
+    assert max(len(line) for line in shown.splitlines()) < 120
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        [],
+        ["fly"],
+        ["gateway", "--port", "many"],
+        ["up", "--once"],
+        ["gateway", "--port", "70000"],
+        ["agent", "--id", "0"],
+        ["gateway", "-e", "10.0.0.1:7447"],
+        ["router", "--cfg", "mode"],
+        ["ls", "--settings", "/nowhere/macs.toml"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_usage_is_one_line_and_exit_code_2(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """What the user wrote wrong is told in one line, without a traceback."""
+    try:
+        code = main(argv)
+    except SystemExit as ended:
+        code = ended.code if isinstance(ended.code, int) else 1
+    assert code == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "Traceback" not in captured.err
+    assert captured.err.strip().splitlines()[-1].startswith("macs")
+
+
+# -- settings --------------------------------------------------------------------------------------------------------
+
+
+def test_options_are_spelled_as_zenohs_tools_spell_them() -> None:
+    """-c -m -e -l --cfg reach the mesh settings."""
+    args = parsed(
+        "gateway",
+        "-c",
+        "z.json5",
+        "-m",
+        "peer",
+        "-e",
+        "tcp/a:1",
+        "-e",
+        "tcp/b:2",
+        "-l",
+        "tcp/0.0.0.0:0",
+        "--cfg",
+        "x:1",
+    )
+    assert options.settings(args).mesh == MeshSettings(
+        config_file="z.json5",
+        mode="peer",
+        connect=["tcp/a:1", "tcp/b:2"],
+        listen=["tcp/0.0.0.0:0"],
+        overrides=["x:1"],
+    )
+
+
+def test_no_options_are_all_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without options, files and environment the defaults hold."""
+    monkeypatch.delenv("ZENOH_CONFIG", raising=False)
+    assert options.settings(parsed("gateway")) == Settings()
+
+
+def test_the_environment_names_a_zenoh_file_unless_an_option_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ZENOH_CONFIG is the default of -c."""
+    monkeypatch.setenv("ZENOH_CONFIG", "env.json5")
+    assert options.settings(parsed("ls")).mesh.config_file == "env.json5"
+    assert options.settings(parsed("ls", "-c", "option.json5")).mesh.config_file == "option.json5"
+
+
+def test_an_option_wins_over_the_settings_file(tmp_path: Path) -> None:
+    """What is given on the command line replaces the file's value; --cfg is added to the file's overrides."""
+    file = tmp_path / "macs.toml"
+    file.write_text('[mesh]\nconnect = ["tcp/file:1"]\nlease_ms = 3000\noverrides = ["a:1"]\n')
+    settings = options.settings(parsed("ls", "--settings", str(file), "-e", "tcp/option:1", "--cfg", "b:2"))
+    assert settings.mesh == MeshSettings(connect=["tcp/option:1"], lease_ms=3000, overrides=["a:1", "b:2"])
+
+
+def test_ros_arguments_go_to_the_end_of_the_line() -> None:
+    """Everything after --ros-args is ROS's, also what looks like an option of ours."""
+    assert parsed("agent", "--id", "7", "--ros-args", "-r", "__ns:=/r7", "-e", "x").ros_args == [
+        "-r",
+        "__ns:=/r7",
+        "-e",
+        "x",
+    ]
+
+
+# -- keys ------------------------------------------------------------------------------------------------------------
+
+
+def test_keys_prints_every_key_space(capsys: pytest.CaptureFixture[str]) -> None:
+    """The table has each plane with its key."""
+    assert main(["keys"]) == 0
+    shown = capsys.readouterr().out
+    for plane, key in KEYS.items():
+        assert plane in shown
+        assert key.template in shown
+
+
+def test_keys_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    """--json is the same table for programs."""
+    assert main(["keys", "--json"]) == 0
+    assert {row["plane"]: row["key"] for row in json.loads(capsys.readouterr().out)} == {
+        plane: key.template for plane, key in KEYS.items()
+    }
+
+
+def test_keys_explains_a_key(capsys: pytest.CaptureFixture[str]) -> None:
+    """A concrete key is taken apart."""
+    assert main(["keys", "macs/to/ros/0/7/unity/9"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("unicast: ")
+    assert "id        7" in shown
+    assert "from_type unity (type 2)" in shown
+
+
+def test_keys_does_not_know_every_key(capsys: pytest.CaptureFixture[str]) -> None:
+    """A key of nobody's space, or with a wildcard, is exit code 1."""
+    assert main(["keys", "macs/to/ros/**"]) == 1
+    assert "no concrete key" in capsys.readouterr().err
+
+
+# -- up --------------------------------------------------------------------------------------------------------------
+
+
+def plan(*argv: str) -> up.Plan:
+    args = parsed("up", "--port", "0", "--router-port", "0", *argv)
+    return up.make_plan(args, options.settings_file(args))
+
+
+def test_up_listens_on_this_machine_only() -> None:
+    """Unless asked for, nothing that `macs up` starts can be reached from the network."""
+    here = plan()
+    router = here.router_child()
+    assert router is not None
+    assert router.argv[-2:] == ["-l", f"tcp/127.0.0.1:{here.router_port}"]
+    assert here.gateway.host == "127.0.0.1"
+
+
+def test_up_opens_gateway_and_router_together() -> None:
+    """--host 0.0.0.0 lets headsets and other robots in."""
+    router = plan("--host", "0.0.0.0").router_child()
+    assert router is not None
+    assert router.argv[-1].startswith("tcp/[::]:")
+
+
+def test_up_joins_a_router_that_is_there() -> None:
+    """With -e no router is started, and gateway and robot use that one."""
+    joined = plan("-e", "tcp/10.0.0.1:7447")
+    assert joined.router_child() is None
+    for child in [joined.gateway_child(), *joined.robot_children()]:
+        assert child.argv[child.argv.index("-e") + 1] == "tcp/10.0.0.1:7447"
+
+
+def test_up_has_robot_1_unless_told() -> None:
+    """The robot's id is fixed, 1 by default."""
+    assert plan().robot.id == 1
+    assert plan("--id", "7", "--group", "3").robot.id == 7
+
+
+def test_up_tells_that_a_port_is_taken() -> None:
+    """A port in use is found before anything is started, with what to do."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        with pytest.raises(up.PortTaken, match="--port"):
+            plan("--port", port)
+        with pytest.raises(up.PortTaken, match=f"-e tcp/127.0.0.1:{port}"):
+            plan("--router-port", port)
+
+
+def test_up_refuses_an_id_out_of_range() -> None:
+    """The ranges of the settings hold for options."""
+    with pytest.raises(ConfigError, match=r"robot\.id"):
+        plan("--id", "70000")
+
+
+def test_what_next_names_the_addresses_in_use() -> None:
+    """The closing hints work as they are printed."""
+    here = plan("--demo")
+    hints = up.what_next(here)
+    assert f"macs ls -e tcp/127.0.0.1:{here.router_port}" in hints
+    assert f"macs headset 127.0.0.1:{here.gateway.port} sub /pose" in hints
+
+
+# -- children --------------------------------------------------------------------------------------------------------
+
+
+def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> children.Child:
+    """A child that runs some code instead of a verb."""
+    (tmp_path / "child_program.py").write_text(code)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return children.Child("child", ["child_program"])
+
+
+async def test_a_child_that_cannot_start_is_not_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that ends at once, before it was ready, ends `macs up` with it."""
+    child = script(tmp_path, monkeypatch, "raise SystemExit(1)")
+    with pytest.raises(children.ChildFailed):
+        await child.run()
+    assert child.starts == 1
+
+
+async def test_a_child_that_dies_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that was ready once is kept alive; one that finds its configuration wrong is not."""
+    monkeypatch.setattr(children, "FIRST_PAUSE_S", 0.01)
+    code = f"""
+import pathlib, sys
+marks = pathlib.Path({str(tmp_path)!r}, "starts")
+marks.write_text(marks.read_text() + "x" if marks.exists() else "x")
+print("ready: here")
+sys.exit(2 if len(marks.read_text()) == 3 else 1)
+"""
+    child = script(tmp_path, monkeypatch, code)
+    with pytest.raises(children.ChildFailed) as failed:
+        await child.run()
+    assert failed.value.code == 2
+    assert child.starts == 3
+    assert child.ready.is_set()

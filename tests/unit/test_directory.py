@@ -1,0 +1,214 @@
+"""Who is online is what the tokens say, and what was told about it adds up to the same."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from macs_zenoh.directory import AgentInfo, Change, Directory
+from macs_zenoh.keyexpr import LEASE, PRESENCE, UNICAST
+
+GRACE_S = 2.0
+
+agents = st.builds(AgentInfo, st.integers(1, 3), st.integers(1, 2), st.integers(0, 2), st.sampled_from("ab"))
+steps = st.lists(
+    st.tuples(st.just("alive"), agents)
+    | st.tuples(st.just("ended"), agents)
+    | st.tuples(st.just("link"), st.booleans())
+    | st.tuples(st.just("time"), st.floats(0, 3))
+    | st.tuples(st.just("tick"), st.none()),
+    max_size=40,
+)
+
+
+def key(agent: AgentInfo) -> str:
+    """An agent's presence token."""
+    return PRESENCE.of(type=agent.type, id=agent.id, group=agent.group, zid=agent.zid)
+
+
+class Story:
+    """A directory, what it was told, and what an observer of its changes believes."""
+
+    def __init__(self) -> None:
+        self.directory = Directory(GRACE_S)
+        self.now = 100.0
+        self.linked = True
+        self.quiet_until = 0.0
+        self.told: dict[tuple[int, int], AgentInfo] = {}
+        self.tokens: dict[tuple[int, int], dict[str, AgentInfo]] = {}
+
+    def happen(self, what: str, value: AgentInfo | bool | float | None) -> list[Change]:
+        """One thing happens; returns the changes that the directory tells."""
+        changes: list[Change] = []
+        if isinstance(value, AgentInfo):
+            self._note(what, value)
+            changes = self.directory.token(key(value), what == "alive", self.now)
+        elif what == "link":
+            if not (value and self.linked):
+                self.quiet_until = self.now + GRACE_S
+            self.linked = bool(value)
+            self.directory.link(self.linked, self.now)
+        elif what == "time":
+            self.now += float(value or 0)
+        else:
+            changes = self.directory.tick(self.now)
+        for agent, online in changes:
+            if online:
+                self.told[agent.key] = agent
+            else:
+                del self.told[agent.key]
+        return changes
+
+    def _note(self, what: str, agent: AgentInfo) -> None:
+        """The tokens as Zenoh has them: per session the newest group, per agent the newest session last."""
+        claims = self.tokens.setdefault(agent.key, {})
+        if what == "alive":
+            claims.pop(agent.zid, None)
+            claims[agent.zid] = agent
+        elif claims.get(agent.zid) == agent:
+            del claims[agent.zid]
+
+    @property
+    def quiet(self) -> bool:
+        """Whether nobody may be said to have left."""
+        return not self.linked or self.now < self.quiet_until
+
+    def truth(self) -> list[AgentInfo]:
+        """Who is online, by the tokens alone."""
+        return [next(reversed(claims.values())) for _, claims in sorted(self.tokens.items()) if claims]
+
+
+@given(steps)
+def test_what_is_told_adds_up(story_steps: list[tuple[str, AgentInfo | bool | float | None]]) -> None:
+    """After any sequence of events, who follows the changes knows exactly who is in the directory, and nobody is
+    told to have left who was not there."""
+    story = Story()
+    for what, value in story_steps:
+        story.happen(what, value)
+        directory = story.directory
+        assert list(directory) == [agent for _, agent in sorted(story.told.items())]
+        assert len(directory) == len(story.told)
+        for kind in (1, 2, 3):
+            of_type = [agent for agent in directory if agent.type == kind]
+            assert directory.of_type(kind) == of_type
+            assert directory.ids(kind) == [agent.id for agent in of_type]
+        assert directory.all_ids() == {agent.id for agent in directory}
+        for agent in directory:
+            assert agent.key in directory
+            assert directory.get(*agent.key) == agent
+            assert directory.claimants(*agent.key)[-1] == agent
+
+
+@given(steps)
+def test_in_the_end_the_tokens_are_right(story_steps: list[tuple[str, AgentInfo | bool | float | None]]) -> None:
+    """Once the link is up and the grace over, exactly those are online whose tokens are, whatever happened before."""
+    story = Story()
+    for what, value in [*story_steps, ("link", True), ("time", GRACE_S), ("tick", None)]:
+        story.happen(what, value)
+    assert list(story.directory) == story.truth()
+    assert story.directory.next_deadline() is None
+
+
+@given(steps)
+def test_nobody_leaves_while_we_cannot_know(story_steps: list[tuple[str, AgentInfo | bool | float | None]]) -> None:
+    """While our own link is down, and for the grace after it came back, nobody is said to have left; later, nothing
+    waits longer than the deadline says."""
+    story = Story()
+    for what, value in story_steps:
+        changes = story.happen(what, value)
+        deadline = story.directory.next_deadline()
+        if story.quiet:
+            assert all(change.online for change in changes)
+            assert deadline is None or (story.linked and deadline == story.quiet_until)
+        elif what == "tick":
+            assert deadline is None
+
+
+def test_a_deadline_is_when_a_tick_has_effect() -> None:
+    """An agent in doubt leaves at the deadline: not at a tick before it, and once."""
+    story = Story()
+    robot = AgentInfo(1, 7, 3, "a1")
+    story.happen("alive", robot)
+    story.happen("link", False)
+    assert story.happen("ended", robot) == []
+    assert story.directory.next_deadline() is None, "the link is down: nothing to wait for"
+    story.happen("link", True)
+    assert story.directory.next_deadline() == story.now + GRACE_S
+    story.happen("time", GRACE_S - 0.1)
+    assert story.happen("tick", None) == []
+    story.happen("time", 0.1)
+    assert story.happen("tick", None) == [Change(robot, online=False)]
+    assert story.happen("tick", None) == []
+
+
+def test_who_comes_back_within_the_grace_never_left() -> None:
+    """When our router fails over and all tokens return, nothing is told."""
+    story = Story()
+    robot = AgentInfo(1, 7, 3, "a1")
+    story.happen("alive", robot)
+    for what, value in [("link", False), ("ended", robot), ("link", True), ("alive", robot)]:
+        assert story.happen(what, value) == []
+    story.happen("time", GRACE_S)
+    assert story.happen("tick", None) == []
+    assert list(story.directory) == [robot]
+
+
+@pytest.mark.parametrize("old_token_first", [True, False])
+def test_a_change_of_group_keeps_the_agent(old_token_first: bool) -> None:
+    """An agent that declares itself in another group is there in the new one, whichever token's news comes first."""
+    story = Story()
+    before, after = AgentInfo(2, 7, 3, "a1"), AgentInfo(2, 7, 5, "a1")
+    story.happen("alive", before)
+    for what, agent in sorted([("ended", before), ("alive", after)], reverse=old_token_first):
+        story.happen(what, agent)
+    assert list(story.directory) == [after]
+    assert story.told == {(2, 7): after}
+
+
+def test_two_sessions_with_one_id_are_seen() -> None:
+    """Of two that claim one id the newest counts and both are claimants; when it goes, the other is there."""
+    story = Story()
+    first, second = AgentInfo(1, 7, 3, "a1"), AgentInfo(1, 7, 0, "b2")
+    story.happen("alive", first)
+    assert story.happen("alive", second) == [Change(second, online=True)]
+    assert story.directory.claimants(1, 7) == [first, second]
+    assert len(story.directory) == 1
+    assert story.happen("ended", second) == [Change(first, online=True)]
+    assert story.happen("ended", first) == [Change(first, online=False)]
+    assert story.directory.claimants(1, 7) == []
+    assert story.directory.get(1, 7) is None
+
+
+def test_a_token_told_twice_is_told_once() -> None:
+    """The history of a late watcher and the live token of the same agent make one agent and one change."""
+    story = Story()
+    robot = AgentInfo(1, 7, 0, "a1")
+    assert story.happen("alive", robot) == [Change(robot, online=True)]
+    assert story.happen("alive", robot) == []
+    assert story.happen("ended", robot) == [Change(robot, online=False)]
+    assert story.happen("ended", robot) == []
+
+
+def test_ids_are_per_type() -> None:
+    """A robot and a headset with the same id are two agents."""
+    story = Story()
+    robot, headset = AgentInfo(1, 7, 0, "a1"), AgentInfo(2, 7, 0, "a1")
+    story.happen("alive", robot)
+    story.happen("alive", headset)
+    story.happen("ended", robot)
+    assert list(story.directory) == [headset]
+    assert headset.type_name == "unity"
+
+
+def test_other_keys_are_not_presence() -> None:
+    """Keys of other spaces and keys that are none change nothing."""
+    directory = Directory()
+    others = [
+        LEASE.of(block=0, zid="a1"),
+        UNICAST.of(type=1, block=0, id=7, from_type=2, from_id=8),
+        "",
+        "macs/live/**",
+    ]
+    assert [directory.token(other, True, 0.0) for other in others] == [[], [], [], []]
+    assert len(directory) == 0

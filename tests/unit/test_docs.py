@@ -1,0 +1,68 @@
+"""What the pages and the shipped settings say is what the code has."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from bridge.cli import VERBS
+from macs_zenoh import config
+from macs_zenoh.config import Settings
+from macs_zenoh.messages import MANAGERS, NodeType
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+
+
+def page(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_links_lead_somewhere(path: Path) -> None:
+    """No page links to a file that does not exist."""
+    links = re.findall(r"\]\(([^)]+)\)", path.read_text(encoding="utf-8"))
+    targets = [link.partition("#")[0] for link in links if "://" not in link]
+    assert [target for target in targets if target and not (path.parent / target).exists()] == []
+
+
+def test_the_protocol_page_has_every_manager() -> None:
+    """Each kind of management data is in the table, under its name on the wire and its name here."""
+    rows = re.findall(r"^\| `(\w+)` \| `(\w+)` \|", page("docs/protocol.md"), re.MULTILINE)
+    assert dict(rows) == {name: kind.__name__ for name, kind in MANAGERS.items()}
+
+
+def test_the_protocol_page_has_every_node_type() -> None:
+    """The four node types are in the table."""
+    rows = re.findall(r"^\| (\d) \| ROS", page("docs/protocol.md"), re.MULTILINE)
+    assert [int(number) for number in rows] == sorted(NodeType)
+
+
+def test_the_design_page_names_modules_that_exist() -> None:
+    """The table of rooms is the core's list of modules."""
+    rooms = page("docs/design.md").partition("## Rooms")[2].partition("\nImports go")[0]
+    named = set(re.findall(r"[\w/]+\.py", rooms))
+    assert {name.removeprefix("macs_zenoh/") for name in named} == {
+        path.name for path in (ROOT / "macs_zenoh").glob("*.py") if path.name != "__init__.py"
+    }
+
+
+def test_the_readme_has_every_verb() -> None:
+    """Each verb of `macs` is in the table of commands."""
+    assert set(re.findall(r"`macs (\w+)", page("README.md").partition("## Commands")[2])) >= set(VERBS)
+
+
+def test_the_settings_file_explains_every_setting() -> None:
+    """config/macs.toml has every field of every section, commented out, with its default if there is one."""
+    text = page("config/macs.toml")
+    shown = config.parse(re.sub(r"^#(?=\w+ = )", "", text, flags=re.MULTILINE))
+    for section in ("mesh", "gateway", "robot"):
+        part = text.partition(f"\n[{section}]")[2].partition("\n[")[0]
+        defaults = getattr(Settings(), section)
+        assert set(re.findall(r"^#(\w+) = ", part, re.MULTILINE)) == set(defaults.__struct_fields__)
+        for name in defaults.__struct_fields__:
+            default = getattr(defaults, name)
+            if default not in (None, []):  # without a default the file shows an example
+                assert getattr(getattr(shown, section), name) == default, name
