@@ -217,6 +217,8 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     """Lower it where headsets have addresses of their own; behind NAT they share one."""
     max_frame_bytes: Bytes = 32 * 1024 * 1024
     """A larger declared frame closes its connection before a byte of it is stored."""
+    max_frames_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0
+    """What one connection may send to others; the rest is dropped and counted. 0: no limit."""
     handshake_s: Seconds = 10.0
     """A connection that has not configured itself by then is closed."""
     silence_s: Seconds = 10.0
@@ -226,7 +228,13 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     stall_s: Seconds = 30.0
     """A connection that takes nothing for so long while something waits is closed."""
     block: GroupId | None = None
-    """The block of 256 agent ids this gateway gives out, 0 being 1..255; unset: lease the first free one."""
+    """The block of 256 agent ids this gateway gives out first, 0 being 1..255; unset: lease the first free one."""
+    managers: list[str] = []
+    """Own management messages, as my_package.world_class_manager:WorldClassManager (docs/managers.md)."""
+    tell_refusals: bool = True
+    """Tell a headset when a robot refused its registration, by a management message that existing programs ignore."""
+    reuse_port: bool = False
+    """Share the port with other gateway processes (SO_REUSEPORT); set by ``--workers``."""
 
     def _check(self) -> None:
         for network in self.allow:

@@ -9,7 +9,8 @@
     │   ├── BadJson
     │   ├── BadField
     │   ├── UnknownManager
-    │   └── NotAllowed
+    │   ├── NotAllowed
+    │   └── TooFast
     ├── UsageError                our caller
     │   ├── TooManyDestinations
     │   └── OutOfRange
@@ -79,6 +80,14 @@ class UnknownManager(WireError):
 
 class NotAllowed(WireError):
     """A peer asked for something that its place on the mesh does not permit."""
+
+
+class TooFast(WireError):
+    """A peer sends more than its rate limit."""
+
+    def __init__(self, frames_per_s: float) -> None:
+        super().__init__(f"more than {frames_per_s:g} frames/s")
+        self.frames_per_s = frames_per_s
 
 
 class UsageError(MacsError):

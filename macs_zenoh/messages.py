@@ -11,10 +11,10 @@ for what it says, with the wire's name in ``manager``.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import IntEnum
 from functools import cache, lru_cache
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -197,6 +197,17 @@ class AgentsGone(Management, frozen=True):
     agents: list[GoneAgent]
 
 
+class NodeRefused(Management, frozen=True):
+    """Router → headset, ours: a robot refused an interface node. Existing programs have no such manager."""
+
+    manager: ClassVar[str] = "InterfaceNodeRefused"
+    robot_id: AgentId
+    node_type: Annotated[int, Meta(ge=0, le=255)]
+    node_name: str
+    tos_name: str
+    reason: str
+
+
 class FunctionalityRequest(Management, frozen=True):
     """Anyone → robot: report your topics and services."""
 
@@ -206,19 +217,32 @@ class FunctionalityRequest(Management, frozen=True):
 MANAGERS: dict[str, type[Management]] = {kind.manager: kind for kind in Management.__subclasses__()}
 """Every manager by its name on the wire. Nothing is ever imported or created because a message names it."""
 
+NO_CUSTOM: Mapping[str, type[Struct]] = {}
+
 StructT = TypeVar("StructT", bound=Struct)
 
 
-def decode_management(data: bytes) -> Management:
-    """Read management data. Raises BadJson, BadField or UnknownManager."""
+class Custom(NamedTuple):
+    """Management data of a manager that somebody added: its name and its typed data."""
+
+    manager: str
+    data: Struct
+
+
+def decode_management(data: bytes, custom: Mapping[str, type[Struct]] = NO_CUSTOM) -> Management | Custom:
+    """Read management data; ``custom`` has the managers that somebody added.
+
+    Raises BadJson, BadField or UnknownManager.
+    """
     fields = _json_object("management data", data)
     name = fields.pop("message_manager", None)
     if not isinstance(name, str):
         raise BadField("management data", "the key 'messageManager' is missing or not a string")
-    kind = MANAGERS.get(name)
-    if kind is None:
-        raise UnknownManager(name)
-    return _convert(name, fields, kind)
+    if (kind := MANAGERS.get(name)) is not None:
+        return _convert(name, fields, kind)
+    if name in custom:
+        return Custom(name, _convert(name, fields, custom[name]))
+    raise UnknownManager(name)
 
 
 def encode_management(value: Management) -> bytes:

@@ -13,16 +13,19 @@ Frames that come before the configuration are held until it is there, because he
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Mapping
 from enum import Enum
 from typing import NamedTuple
 
-from msgspec import structs
+from msgspec import Struct, structs
 
-from .errors import BadField, NotAllowed, WireError
+from .errors import BadField, NotAllowed, TooFast, WireError
 from .messages import (
+    NO_CUSTOM,
     ROS,
     AddNode,
     Configuration,
+    Custom,
     Functionality,
     GoOffline,
     Heartbeat,
@@ -57,6 +60,8 @@ class Limits(NamedTuple):
     silence_s: float = 10.0
     held_frames: int = 256
     held_bytes: int = 1 << 20
+    frames_per_s: float = 0.0
+    """Frames for others beyond this rate (a second's worth at once) are dropped; 0 is no limit."""
 
 
 DEFAULT_LIMITS = Limits()
@@ -102,6 +107,14 @@ class AskedOnline(NamedTuple):
     request_id: int
 
 
+class Asked(NamedTuple):
+    """A management message for a manager that somebody added."""
+
+    manager: str
+    data: Struct
+    request_id: int
+
+
 class Rejected(NamedTuple):
     """A frame was not accepted. The connection goes on unless a `Left` follows."""
 
@@ -114,7 +127,7 @@ class Left(NamedTuple):
     reason: str
 
 
-Event = Joined | Sent | Streamed | Registering | AskedOnline | Rejected | Left
+Event = Joined | Sent | Streamed | Registering | AskedOnline | Asked | Rejected | Left
 
 
 class Peer:
@@ -132,6 +145,7 @@ class Peer:
         now: float,
         *,
         limits: Limits = DEFAULT_LIMITS,
+        custom: Mapping[str, type[Struct]] = NO_CUSTOM,
         layout: Layout = MACS,
         scratch: bytearray | None = None,
     ) -> None:
@@ -143,6 +157,8 @@ class Peer:
         self.drops: Counter[str] = Counter()
         self.corrected = 0
         self._limits = limits
+        self._custom = custom
+        self._credit = limits.frames_per_s
         self._layout = layout
         self._decoder = FrameDecoder(limits.max_frame_bytes, layout, scratch)
         self._held: deque[Frame] = deque()
@@ -172,6 +188,9 @@ class Peer:
         """``size`` bytes were received into `space`."""
         if self.state is State.GONE:
             return []
+        if self._limits.frames_per_s:
+            earned = (now - self._heard_at) * self._limits.frames_per_s
+            self._credit = min(self._limits.frames_per_s, self._credit + earned)
         self._heard_at = now
         events: list[Event] = []
         for frame in self._decoder.advance(size):
@@ -226,7 +245,7 @@ class Peer:
 
     def _frame(self, frame: Frame, events: list[Event]) -> None:
         if frame.has_management:
-            management = decode_management(frame.management)
+            management = decode_management(frame.management, self._custom)
             if isinstance(management, Configuration):
                 self._configure(management, events)
                 return
@@ -278,7 +297,9 @@ class Peer:
             raise NotAllowed(f"agent {self.agent_id} cannot send agent {message.agent_id} offline")
         events.append(self._leave("went offline"))
 
-    def _manage(self, management: Management, frame: Frame) -> Event:
+    def _manage(self, management: Management | Custom, frame: Frame) -> Event:
+        if isinstance(management, Custom):
+            return Asked(management.manager, management.data, self._decode(frame).request_id)
         if isinstance(management, OnlineRequest):
             return AskedOnline(self._decode(frame).request_id)
         if isinstance(management, Registration):
@@ -309,6 +330,10 @@ class Peer:
         return Streamed(sent.frame, sent.metadata, targets)
 
     def _sent(self, frame: Frame) -> Sent:
+        if self._limits.frames_per_s:
+            if self._credit < 1.0:
+                raise TooFast(self._limits.frames_per_s)
+            self._credit -= 1.0
         raw = frame.metadata
         known = self._metadata.get(raw)
         if known is None:

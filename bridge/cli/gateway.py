@@ -5,15 +5,22 @@ Headsets need nothing but this address. Without a router yet, the gateway waits 
 examples:
   macs gateway                                             headsets on this machine, router on this machine
   macs gateway --host 0.0.0.0                              headsets from the network
+  macs gateway --workers 4                                 four processes behind one port
   macs gateway --port 7001 -e tcp/10.0.0.1:7447 -e tcp/10.0.0.2:7447   two routers, for fail-over"""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import resource
+import socket
+import sys
+from contextlib import suppress
 
 from bridge.cli import options, running
-from macs_zenoh.config import Settings, changed
+from bridge.cli.children import Child, stop_in_order
+from macs_zenoh.config import GatewaySettings, Settings, changed
+from macs_zenoh.errors import UsageError
 
 SUMMARY = "where headsets connect over TCP"
 
@@ -25,21 +32,92 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--allow", metavar="NETWORK", action="append", help="who may connect, as 192.168.1.0/24; repeat for more"
     )
     parser.add_argument("--block", type=int, help="block of 256 agent ids to give out (default: the first free one)")
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="processes that share the port (default: 1)"
+    )
+    parser.add_argument("--reuse-port", action="store_true", help=argparse.SUPPRESS)
     options.add_mesh_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     settings = options.settings(args)
-    listen_on = changed(settings.gateway, host=args.host, port=args.port, allow=args.allow, block=args.block)
+    listen_on = changed(
+        settings.gateway,
+        host=args.host,
+        port=args.port,
+        allow=args.allow,
+        block=args.block,
+        reuse_port=args.reuse_port or None,
+    )
+    if args.workers < 1:
+        raise UsageError(f"--workers is {args.workers}, at least 1 is needed")
+    if args.workers > 1:
+        if listen_on.block is not None:
+            raise UsageError("--block and --workers exclude each other: every worker leases a block of its own")
+        return running.until_stopped(lambda: _supervise(args.workers, listen_on))
     return running.until_stopped(lambda: _serve(changed(settings, gateway=listen_on)))
+
+
+async def _supervise(workers: int, settings: GatewaySettings) -> int:
+    """Run several gateways on one port, each with ids of its own; one that ends is started again."""
+    with _reserve(settings) as reserved:
+        port = str(reserved.getsockname()[1])
+        argv = [*_without_workers(sys.argv[1:]), "--reuse-port", "--port", port]
+        children = [Child(f"gw{number}", ["bridge", *argv]) for number in range(1, workers + 1)]
+        tasks = [asyncio.create_task(child.run()) for child in children]
+        try:
+            announcing = asyncio.create_task(_announce(children, f"gateway on {settings.host}:{port}"))
+            await asyncio.gather(announcing, *tasks)
+        finally:
+            await stop_in_order([(children, 1.8)])
+            for task in tasks:
+                task.cancel()
+    return 0
+
+
+async def _announce(children: list[Child], what: str) -> None:
+    for child in children:
+        await child.ready.wait()
+    running.say_ready(what)
+
+
+def _reserve(settings: GatewaySettings) -> socket.socket:
+    """Hold the port, without listening, so that all workers find the same one."""
+    reserved = socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET)
+    reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+    try:
+        reserved.bind((settings.host, settings.port))
+    except OSError as error:
+        reserved.close()
+        raise UsageError(f"cannot listen on {settings.host}:{settings.port}: {error.strerror}") from error
+    return reserved
+
+
+def _without_workers(argv: list[str]) -> list[str]:
+    """The command line as one worker needs it."""
+    kept = list(argv)
+    if "--workers" in kept:
+        at = kept.index("--workers")
+        del kept[at : at + 2]
+    return [word for word in kept if not word.startswith("--workers=")]
+
+
+def _raise_descriptor_limit() -> None:
+    """A thousand headsets need more descriptors than most shells allow by default."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 async def _serve(settings: Settings) -> int:
     from bridge.gateway import Gateway
+    from macs_zenoh import managers
     from macs_zenoh.mesh import Mesh
 
+    _raise_descriptor_limit()
+    own = managers.load(settings.gateway.managers)
     async with await Mesh.open(settings.mesh) as mesh:
-        gateway = Gateway(mesh, settings.gateway)
+        gateway = Gateway(mesh, settings.gateway, own)
         try:
             await gateway.start()
             running.say_ready(f"gateway on {settings.gateway.host}:{gateway.port}")

@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from typing import Protocol, cast
 
+from macs_zenoh.messages import Metadata
 from macs_zenoh.peer import Event, Left, Peer, Rejected, Sent, State
 from macs_zenoh.queues import Chunk, Outbox
 
@@ -58,6 +59,7 @@ class Connection(asyncio.BufferedProtocol):
         self._paused_at: float | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._complained: set[str] = set()
+        self._nodes: dict[str, set[int]] = {}
         self._refused = False
         self._pauses = 0
         self.congested = False
@@ -166,6 +168,16 @@ class Connection(asyncio.BufferedProtocol):
         depth, drop_new = self.owner.stream_depth(self, node)
         self._outbox.put_stream(node, message, depth=depth, drop_new=drop_new)
 
+    def registered(self, node_name: str, node_type: int) -> None:
+        """The agent has an interface node of this name and type."""
+        self._nodes.setdefault(node_name, set()).add(node_type)
+
+    def takes(self, metadata: Metadata) -> bool:
+        """Whether a node's message can be sent: an existing headset goes deaf for good on a message under the name
+        of one of its nodes that has another type."""
+        types = self._nodes.get(metadata.node_name)
+        return types is None or metadata.node_type in types
+
     def flush(self) -> None:
         """Write what was sent since the last flush, in one go."""
         if self._ready:
@@ -204,9 +216,6 @@ class Connection(asyncio.BufferedProtocol):
         """Send what is gathered, then FIN."""
         if self._transport.is_closing():
             return
-        if not self.greeted:
-            self._transport.abort()
-            return
         self.peer.lost()
         level = logging.INFO if reason == "went offline" else logging.WARNING
         log.log(level, "%s leaves: %s", self, reason)
@@ -214,7 +223,22 @@ class Connection(asyncio.BufferedProtocol):
         if self._paused_at is None:
             self._transport.close()
         else:
-            self._transport.abort()  # it does not read: closing politely would wait for ever
+            self.abort()  # it does not read: closing politely would wait for ever
+
+    def finish(self, reason: str) -> None:
+        """Send all that waits, then FIN; `abort` whoever does not take it in time."""
+        if not self.greeted:
+            self.abort()
+        elif not self._transport.is_closing():
+            self.peer.lost()
+            log.info("%s leaves: %s", self, reason)
+            self.flush()
+            self._write(self._outbox.take(self._outbox.limit_bytes))
+            self._transport.close()
+
+    def abort(self) -> None:
+        """End the connection at once; does nothing to one that has ended."""
+        self._transport.abort()
 
     def all_drops(self) -> Counter[str]:
         """Everything that was dropped for this agent, by name."""

@@ -48,9 +48,9 @@ class Delivery:
             connection = self._targets.get(key) or self._find(key)
             if connection is None:
                 continue
-            frame = self._frame(key, payload)
-            if frame is not None:
-                connection.send_call(frame.message)
+            read = self._read(key, payload)
+            if read is not None:
+                self._send(connection, *read)
                 if connection.congested:
                     self._hold_sender(key, connection)
         self.flush()
@@ -59,40 +59,40 @@ class Delivery:
         """Frames sent to groups that one of ours is in."""
         for key, payload in batch:
             fields = GROUP.parse(key)
-            frame = self._frame(key, payload)
-            if fields is None or frame is None:
+            read = self._read(key, payload)
+            if fields is None or read is None:
                 continue
             sender = (int(fields["from_type"]), int(fields["from_id"]))
-            header = frame.header
+            header = read[0].header
             for connection in self._agents.members(int(fields["type"]), int(fields["group"])):
                 if takes_group_copy(header, connection.agent_id, sender, connection.peer.agent_type):
-                    connection.send_call(frame.message)
+                    self._send(connection, *read)
         self.flush()
 
     def broadcast(self, batch: list[Sample]) -> None:
         """Frames sent to everybody."""
         for key, payload in batch:
             fields = BROADCAST.parse(key)
-            frame = self._frame(key, payload)
-            if fields is None or frame is None:
+            read = self._read(key, payload)
+            if fields is None or read is None:
                 continue
             sender = (fields["from_type"], fields["from_id"])
             for connection in self._agents.online():
                 if connection.key != sender:
-                    connection.send_call(frame.message)
+                    self._send(connection, *read)
         self.flush()
 
     def stream(self, batch: list[Sample]) -> None:
         """A robot's topic data, for those of its registrants that are ours."""
         for key, payload in batch:
-            frame = self._frame(key, payload)
-            if frame is None:
+            read = self._read(key, payload)
+            if read is None:
                 continue
-            node = self._metadata[frame.metadata].node_name
+            frame, metadata = read
             for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
                 connection = self._agents.find(*registrant)
                 if connection is not None:
-                    connection.send_stream(node, frame.message)
+                    connection.send_stream(metadata.node_name, frame.message)
         self.flush()
 
     def dirty(self, connection: Connection) -> None:
@@ -108,6 +108,13 @@ class Delivery:
     def forget(self) -> None:
         """Agents came or went: look keys up anew."""
         self._targets.clear()
+
+    def _send(self, connection: Connection, frame: Frame, metadata: Metadata) -> None:
+        if metadata.node_name and not connection.takes(metadata):
+            name = f"{metadata.node_name[:80]} of type {metadata.node_type}"
+            connection.complain("wrong_node_type", f"a message for its node {name}, which has another type there")
+            return
+        connection.send_call(frame.message)
 
     def _find(self, key: str) -> Connection | None:
         fields = UNICAST.parse(key)
@@ -144,12 +151,13 @@ class Delivery:
         self._registrants[frame.management] = registrants
         return registrants
 
-    def _frame(self, key: str, payload: bytes) -> Frame | None:
-        """The frame of a sample, None when no agent must see it."""
+    def _read(self, key: str, payload: bytes) -> tuple[Frame, Metadata] | None:
+        """The frame of a sample and its metadata, None when no agent must see it."""
         try:
             frame = parse_frame(payload, self._layout)
             raw = frame.metadata
-            if raw not in self._metadata:
+            metadata = self._metadata.get(raw)
+            if metadata is None:
                 metadata = Metadata.decode(raw)
                 if len(self._metadata) >= KNOWN:
                     self._metadata.clear()
@@ -157,7 +165,7 @@ class Delivery:
         except WireError as error:
             self._bad(key, error)
             return None
-        return frame
+        return frame, metadata
 
     def _bad(self, key: str, error: WireError) -> None:
         self.drops["bad_frame"] += 1

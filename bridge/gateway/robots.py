@@ -14,7 +14,7 @@ from macs_zenoh.directory import Change, Directory
 from macs_zenoh.errors import Refused, Unreachable
 from macs_zenoh.keyexpr import CALL
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import ROS, AddNode, Metadata, NodeType, RemoveNode, encode_data
+from macs_zenoh.messages import ROS, AddNode, Metadata, NodeRefused, NodeType, RemoveNode, encode_data
 from macs_zenoh.registrations import AgentKey, Registrations, Robots, Task
 from macs_zenoh.wire import Layout, encode_frame, encode_message
 
@@ -36,11 +36,13 @@ class RobotCalls:
         layout: Layout,
         *,
         on_streams: Callable[[set[tuple[int, str]]], None],
+        on_refused: Callable[[AgentKey, NodeRefused], None],
     ) -> None:
         self._mesh = mesh
         self._directory = directory
         self._layout = layout
         self._on_streams = on_streams
+        self._on_refused = on_refused
         self._registrations = Registrations()
         self._running: dict[TaskKey, asyncio.Task[None]] = {}
 
@@ -110,6 +112,7 @@ class RobotCalls:
                 return
             except Refused as refusal:
                 log.warning("%s was refused: %s", what, refusal.reason)
+                self._refused(task, refusal.reason)
                 return
             except Unreachable as error:
                 log.debug("%s: %s", what, error)
@@ -119,6 +122,18 @@ class RobotCalls:
                     return
             elif not self._registrations.holds(task, self._robots()):
                 return
+
+    def _refused(self, task: Task, reason: str) -> None:
+        node = task.node
+        if isinstance(node, AddNode):
+            refused = NodeRefused(
+                robot_id=task.robot_id,
+                node_type=node.node_type,
+                node_name=node.node_name,
+                tos_name=node.tos_name,
+                reason=reason,
+            )
+            self._on_refused((node.registrant_agent_type, node.registrant_agent_id), refused)
 
     async def _ask(self, task: Task) -> None:
         node = task.node

@@ -12,12 +12,14 @@ import logging
 import time
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from typing import NamedTuple
 
 from macs_zenoh.config import GatewaySettings
 from macs_zenoh.directory import Change, Directory
 from macs_zenoh.errors import Refused, Unreachable
 from macs_zenoh.keyexpr import BROADCAST, CALL, GROUP, PRESENCE, STREAM, UNICAST, type_name
+from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import Mesh, OnBatch, Subscription, Traffic
 from macs_zenoh.messages import (
     ROS,
@@ -26,12 +28,14 @@ from macs_zenoh.messages import (
     AgentsGone,
     GoneAgent,
     Metadata,
+    NodeRefused,
     NodeType,
     OnlineReply,
     RemoveNode,
     encode_data,
 )
-from macs_zenoh.peer import AskedOnline, Event, Joined, Limits, Peer, Registering, Sent, Streamed
+from macs_zenoh.peer import Asked, AskedOnline, Event, Joined, Limits, Peer, Registering, Sent, Streamed
+from macs_zenoh.registrations import AgentKey
 from macs_zenoh.routing import inbox, keys_of
 from macs_zenoh.wire import FrameDecoder, Header, Layout, encode_message, parse_frame
 
@@ -47,6 +51,8 @@ log = logging.getLogger("macs.gateway")
 
 PUBLISHER = int(NodeType.PUBLISHER)
 KNOWN_ROUTES = 4096
+FLUSH_S = 1.0
+NO_MANAGERS: Managers = {}
 
 
 class Route(NamedTuple):
@@ -59,15 +65,23 @@ class Route(NamedTuple):
 class Gateway:
     """A TCP server whose connections are agents on the mesh. ``drops`` counts what was lost, by name."""
 
-    def __init__(self, mesh: Mesh, settings: GatewaySettings) -> None:
+    def __init__(self, mesh: Mesh, settings: GatewaySettings, managers: Managers = NO_MANAGERS) -> None:
         self.mesh = mesh
+        self._managers = managers
+        self._custom = {name: manager.Data for name, manager in managers.items()}
+        self._all_closed = asyncio.Event()
         self.settings = settings
         self.port = 0
         self.directory = Directory()
         self.agents = Agents()
         self._drops: Counter[str] = Counter()
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
-        self._limits = Limits(settings.max_frame_bytes, settings.handshake_s, settings.silence_s)
+        self._limits = Limits(
+            max_frame_bytes=settings.max_frame_bytes,
+            handshake_s=settings.handshake_s,
+            silence_s=settings.silence_s,
+            frames_per_s=settings.max_frames_per_s,
+        )
         self._scratch = bytearray(FrameDecoder.SMALL_BYTES)  # sockets of one loop receive one after the other
         self._door = Door(settings.allow, settings.max_connections, settings.max_connections_per_address)
         self._numbers = 0
@@ -81,7 +95,9 @@ class Gateway:
         mesh.on_room(self._brake.release)
         self._delivery = Delivery(self.agents, self.directory, self._layout)
         self._leases = Leases(mesh, settings.block, self._block_leased)
-        self._robots = RobotCalls(mesh, self.directory, self._layout, on_streams=self._streams_wanted)
+        self._robots = RobotCalls(
+            mesh, self.directory, self._layout, on_streams=self._streams_wanted, on_refused=self._tell_refusal
+        )
 
     @property
     def blocks(self) -> list[int]:
@@ -108,19 +124,27 @@ class Gateway:
         self._subscribe(BROADCAST.every(), self._delivery.broadcast)
         host, port = self.settings.host, self.settings.port
         try:
-            self._server = await asyncio.get_running_loop().create_server(self._connection, host, port, backlog=1024)
+            self._server = await asyncio.get_running_loop().create_server(
+                self._connection, host, port, backlog=1024, reuse_port=self.settings.reuse_port
+            )
         except OSError as error:
             raise Unreachable(f"{host}:{port}", f"cannot listen there: {error.strerror or error}") from error
         self.port = self._server.sockets[0].getsockname()[1]
         log.info("listening on %s:%d", host, self.port)
 
     async def close(self) -> None:
-        """Stop accepting, send what is gathered, leave the mesh."""
+        """Stop accepting, tell the mesh, send what waits for ``FLUSH_S`` at most, leave."""
         if self._server is not None:
             self._server.close()
-        for connection in [*self.agents.connections(), *self._waiting]:
-            connection.close("the gateway stops")
         self._robots.close()
+        connections = [*self.agents.connections(), *self._waiting]
+        if connections:
+            for connection in connections:
+                connection.finish("the gateway stops")
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._all_closed.wait(), FLUSH_S)
+            for connection in connections:
+                connection.abort()
         self._leases.close()
         for subscription in self._subscriptions.values():
             subscription.close()
@@ -161,6 +185,7 @@ class Gateway:
                 self._numbers,
                 time.monotonic(),
                 limits=self._limits,
+                custom=self._custom,
                 layout=self._layout,
                 scratch=self._scratch,
             )
@@ -189,6 +214,8 @@ class Gateway:
                 self._unsubscribe(key)
             self._robots.leave(connection.key)
             log.info("%s is offline", connection)
+        if not self.agents:
+            self._all_closed.set()
 
     def stream_depth(self, connection: Connection, node: str) -> tuple[int, bool]:
         """What the headset asked for when it registered on this topic."""
@@ -233,9 +260,37 @@ class Gateway:
         elif isinstance(event, Joined):
             self._joined(connection, event)
         elif isinstance(event, Registering):
+            if isinstance(event.node, AddNode):
+                connection.registered(event.node.node_name, event.node.node_type)
             self._robots.register(event.node, event.robot_ids, event.groups)
         elif isinstance(event, AskedOnline):
             self._answer_online(connection, event.request_id)
+        elif isinstance(event, Asked):
+            self._manage(connection, event)
+
+    def _manage(self, connection: Connection, event: Asked) -> None:
+        """A management message for a manager that somebody added."""
+        asker = Asker(*connection.key, connection.peer.group)
+        try:
+            answer = self._managers[event.manager].manage(event.data, asker)
+        except Refused as refusal:
+            connection.complain("refused_by_manager", f"{event.manager}: {refusal.reason}")
+            return
+        except Exception:
+            log.exception("%s failed on a message of %s", event.manager, connection)
+            connection.complain("manager_failed", f"{event.manager} failed, see above")
+            return
+        if answer is not None:
+            self._reply(connection, Metadata(request_id=event.request_id), encode_data(answer))
+
+    def _tell_refusal(self, agent: AgentKey, refused: NodeRefused) -> None:
+        connection = self.agents.find(*agent)
+        if connection is not None and self.settings.tell_refusals:
+            self._reply(connection, Metadata(message_manager=NodeRefused.manager), encode_data(refused))
+
+    def _reply(self, connection: Connection, metadata: Metadata, data: bytes) -> None:
+        connection.send_call(encode_message(metadata.encode(), data))
+        self._delivery.flush()
 
     def _joined(self, connection: Connection, event: Joined) -> None:
         kind, agent_id = connection.key
@@ -256,8 +311,7 @@ class Gateway:
         for own in self.agents.online():  # their presence comes back through the mesh a moment later
             ids.setdefault(own.key[0], set()).add(own.agent_id)
         reply = OnlineReply(ros_agent_ids=sorted(ids[ROS]), unity_agent_ids=sorted(ids[UNITY]))
-        connection.send_call(encode_message(Metadata(request_id=request_id).encode(), encode_data(reply)))
-        self._delivery.flush()
+        self._reply(connection, Metadata(request_id=request_id), encode_data(reply))
 
     # -- TCP robots ----------------------------------------------------------------------------------------------
 
