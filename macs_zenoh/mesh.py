@@ -164,7 +164,15 @@ class Mesh:
         """Leave the mesh: what was put is sent first, tokens end. A process must not exit without it."""
         for task in self._tasks:
             task.cancel()
-        await asyncio.to_thread(self._close)
+        closing = asyncio.ensure_future(asyncio.to_thread(self._close))
+        cancelled = False
+        while not closing.done():
+            try:
+                await asyncio.shield(closing)
+            except asyncio.CancelledError:  # a second signal: a process that exits with an open session hangs
+                cancelled = True
+        if cancelled:
+            raise asyncio.CancelledError
 
     def _close(self) -> None:
         self._sender.close(timeout_s=1.0)

@@ -101,6 +101,17 @@ async def test_sigterm_is_a_clean_goodbye() -> None:
         assert await asyncio.wait_for(headset.wait_ended(), 2)
 
 
+async def test_two_signals_at_once_are_a_goodbye_too() -> None:
+    """SIGTERM twice, as service managers and `timeout` send it, still closes the session: the process ends."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    async with Program("router", "-l", endpoint):
+        for _ in range(3):
+            gateway = Program("gateway", "--port", "0", "-e", endpoint)
+            await gateway.start()
+            gateway.send_signal(signal.SIGTERM)
+            assert await gateway.stop() == 0
+
+
 async def test_a_waiting_gateway_stops_on_sigint() -> None:
     """Ctrl-C ends a gateway that still waits for its router, within 2 s."""
     gateway = Program("gateway", "--port", "0", "-e", f"tcp/127.0.0.1:{free_port()}")
