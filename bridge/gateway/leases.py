@@ -23,11 +23,15 @@ LOW = 64
 class Leases:
     """This gateway's blocks. ``wanted`` is the configured first one, None for whatever is free."""
 
-    def __init__(self, mesh: Mesh, wanted: int | None, on_block: Callable[[int], None]) -> None:
+    def __init__(
+        self, mesh: Mesh, wanted: int | None, on_block: Callable[[int], None], on_ids: Callable[[], None]
+    ) -> None:
+        """``on_block`` is called for each block that is ours, before ``on_ids``: ids may be given out now."""
         self.blocks: list[int] = []
         self._mesh = mesh
         self._wanted = wanted
         self._on_block = on_block
+        self._on_ids = on_ids
         self._tokens: list[Token] = []
         self._taking: asyncio.Task[None] | None = None
 
@@ -80,6 +84,7 @@ class Leases:
             await asyncio.sleep(10.0)
         finally:
             self._taking = None
+        self._on_ids()
 
     async def _held(self) -> dict[int, list[str]]:
         """Every leased block and the Zenoh ids of its holders."""

@@ -94,7 +94,7 @@ class Gateway:
         self._brake = Brake()
         mesh.on_room(self._brake.release)
         self._delivery = Delivery(self.agents, self.directory, self._layout)
-        self._leases = Leases(mesh, settings.block, self._block_leased)
+        self._leases = Leases(mesh, settings.block, self._block_leased, self._greet_waiting)
         self._robots = RobotCalls(
             mesh, self.directory, self._layout, on_streams=self._streams_wanted, on_refused=self._tell_refusal
         )
@@ -195,7 +195,6 @@ class Gateway:
 
     def _block_leased(self, block: int) -> None:
         self._subscribe(UNICAST.every(type=UNITY, block=block), self._delivery.inbox)
-        self._greet_waiting()
 
     def closed(self, connection: Connection) -> None:
         """Forget a connection; its presence ends at once."""
@@ -213,7 +212,7 @@ class Gateway:
             for key in self._own_keys(connection):
                 self._unsubscribe(key)
             self._robots.leave(connection.key)
-            log.info("%s is offline", connection)
+            log.debug("%s is offline", connection)
         if not self.agents:
             self._all_closed.set()
 
