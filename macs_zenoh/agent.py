@@ -29,7 +29,7 @@ from .mesh import Mesh, Sample, Subscription, Traffic
 from .messages import BROADCAST as EVERYBODY
 from .messages import Metadata, NodeType
 from .routing import inbox, keys_of, takes_group_copy
-from .wire import Layout, encode_frame, encode_message, parse_frame
+from .wire import Layout, encode_frame, encode_message, parse_frame, parse_frames
 
 log = logging.getLogger("macs.agent")
 
@@ -177,33 +177,34 @@ class Agent:
     def _receive(self, batch: list[Sample], *, by_group: bool = False) -> None:
         for key, payload in batch:
             try:
-                message = self._read(key, payload, by_group=by_group)
+                messages = self._read(key, payload, by_group=by_group)
             except WireError as error:
                 self.drops["bad_frame"] += 1
                 log.warning("a frame on %s cannot be used: %s", key, error)
                 continue
-            if message is None:
-                continue
-            if len(self._inbox) >= self.INBOX:
-                self._inbox.popleft()
-                self.drops["inbox_full"] += 1
-            self._inbox.append(message)
+            for message in messages:
+                if len(self._inbox) >= self.INBOX:
+                    self._inbox.popleft()
+                    self.drops["inbox_full"] += 1
+                self._inbox.append(message)
         self._arrived.set()
 
-    def _read(self, key: str, payload: bytes, *, by_group: bool) -> Message | None:
+    def _read(self, key: str, payload: bytes, *, by_group: bool) -> list[Message]:
         parsed = keyexpr.parse(key)
         if parsed is None:
-            return None
-        sender = (int(parsed[1]["from_type"]), int(parsed[1]["from_id"]))
-        frame = parse_frame(payload, self._layout)
-        if by_group and not takes_group_copy(frame.header, self.id, sender, self.type_number):
-            return None
-        if parsed[0] == "broadcast" and sender == (self.type_number, self.id):
-            return None
-        metadata = frame.metadata
-        return Message(
-            type_name(sender[0]), sender[1], Metadata.decode(metadata) if metadata else Metadata(), bytes(frame.body)
-        )
+            return []
+        plane, fields = parsed
+        sender = (int(fields["from_type"]), int(fields["from_id"]))
+        if plane == "broadcast" and sender == (self.type_number, self.id):
+            return []
+        messages = []
+        for frame in parse_frames(payload, self._layout):
+            if by_group and not takes_group_copy(frame.header, self.id, sender, self.type_number):
+                continue
+            raw = frame.metadata
+            metadata = Metadata.decode(raw) if raw else Metadata()
+            messages.append(Message(type_name(sender[0]), sender[1], metadata, bytes(frame.body)))
+        return messages
 
     # -- call and serve ------------------------------------------------------------------------------------------
 

@@ -21,9 +21,16 @@ _TYPE_NUMBERS = {name: number for number, name in _TYPE_NAMES.items()}
 
 FieldValue = int | str
 
-_NUMBERS = frozenset({"id", "from_id", "group", "block"})
 _TYPES = frozenset({"type", "from_type"})
-_SAFE = "".join(sorted({chr(c) for c in range(33, 127)} - set("/*$?#%"))) + " "
+_RANGES = {
+    "type": (1, 255),
+    "from_type": (1, 255),
+    "id": (0, 0xFFFF),
+    "from_id": (0, 0xFFFF),
+    "group": (0, 255),
+    "block": (0, 255),
+}
+_SAFE = "".join({chr(c) for c in range(32, 127)} - set("/*$?#%"))
 
 
 def type_name(agent_type: int) -> str:
@@ -35,7 +42,7 @@ def type_number(name: str) -> int:
     """The agent type behind a name: ``ros`` → 1, ``unity`` → 2, ``"7"`` → 7. Raises UsageError."""
     number = _TYPE_NUMBERS.get(name)
     if number is None:
-        if not name.isascii() or not name.isdigit() or not 1 <= int(name) <= 255:
+        if len(name) > 3 or not name.isascii() or not name.isdigit() or not 1 <= int(name) <= 255:
             raise UsageError(f"unknown agent type {name!r}: use 'ros', 'unity' or a number from 1 to 255")
         number = int(name)
     return number
@@ -104,29 +111,35 @@ class Key:
 
 
 def _write(name: str, value: FieldValue) -> str:
-    if name in _TYPES:
-        return type_name(value) if isinstance(value, int) else type_name(type_number(value))
-    if name in _NUMBERS:
-        if not isinstance(value, int) or value < 0:
-            raise UsageError(f"{name} must be a number from 0, not {value!r}")
-        return str(value)
+    if name in _TYPES and isinstance(value, str):
+        value = type_number(value)
+    if name in _RANGES:
+        low, high = _RANGES[name]
+        if type(value) is not int or not low <= value <= high:
+            raise UsageError(f"{name} must be a number from {low} to {high}, not {value!r}")
+        return type_name(value) if name in _TYPES else str(value)
     text = str(value)
     if not text:
         raise UsageError(f"{name} is empty")
-    return quote(text, safe=_SAFE)
+    try:
+        chunk = quote(text, safe=_SAFE)
+    except UnicodeEncodeError as error:
+        raise UsageError(f"{name} {text!r} is no Unicode text") from error
+    return "%40" + chunk[1:] if chunk.startswith("@") else chunk  # Zenoh's wildcards do not match what starts with @
 
 
 def _read(name: str, text: str) -> FieldValue:
+    value: FieldValue = unquote(text)
     if name in _TYPES:
-        return type_number(text)
-    if name in _NUMBERS:
-        if not text.isascii() or not text.isdigit():
-            raise ValueError(text)
-        return int(text)
-    return unquote(text)
+        value = type_number(text)
+    elif name in _RANGES:
+        value = int(text)
+    if _write(name, value) != text:  # one way to write an agent: access rules for it cover all that is taken for it
+        raise ValueError(text)
+    return value
 
 
-FRAME = "one frame"
+FRAME = "one frame, or several that one sender sent the same way at once, back to back"
 
 UNICAST = Key(
     "macs/to/{type}/{block}/{id}/{from_type}/{from_id}",
@@ -171,6 +184,37 @@ CALL = Key(
     payload="one frame; the reply is one message",
 )
 
+NAME = Key(
+    "macs/name/{name}/{type}/{id}/{zid}",
+    publisher="an agent that other agents send to by name (liveliness token); id 0: a name without an agent",
+    subscriber="agents that send by name, `macs ls`",
+    payload="none",
+)
+WANTED = Key(
+    "macs/ca/wanted/{name}/{message_type}/{zid}",
+    publisher="a named agent, for each message type that somebody there has registered (liveliness token)",
+    subscriber="agents that send by name",
+    payload="none",
+)
+NAMED = Key(
+    "macs/ca/to/{name}/{message_type}/{from_name}",
+    publisher="the sender; a query where it wants to know that the message has arrived",
+    subscriber="the named agent (also queryable)",
+    payload="one message: envelope and data",
+)
+NAMED_ALL = Key(
+    "macs/ca/all/{message_type}/{from_name}",
+    publisher="the sender",
+    subscriber="every named agent that has this message type registered",
+    payload="one message: envelope and data",
+)
+LAST = Key(
+    "macs/ca/last/{name}/{message_type}/{from_name}",
+    publisher="who wants the named agent's last message of a type to all (query)",
+    subscriber="the named agent (queryable)",
+    payload="none; the reply is one message: envelope and data",
+)
+
 KEYS: dict[str, Key] = {
     "unicast": UNICAST,
     "group": GROUP,
@@ -179,6 +223,11 @@ KEYS: dict[str, Key] = {
     "presence": PRESENCE,
     "lease": LEASE,
     "call": CALL,
+    "name": NAME,
+    "wanted": WANTED,
+    "named": NAMED,
+    "named all": NAMED_ALL,
+    "last value": LAST,
 }
 """Every key space by the name of its plane."""
 

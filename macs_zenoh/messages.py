@@ -11,7 +11,7 @@ for what it says, with the wire's name in ``manager``.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from enum import IntEnum
 from functools import cache, lru_cache
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar
@@ -45,10 +45,16 @@ class NodeType(IntEnum):
     """A ROS service client: a headset calls a service that runs on the robot."""
     SERVICE = 4
     """A ROS service: a node on the robot calls a service that runs on a headset."""
+    ACTION = 5
+    """A ROS action client: a headset gives goals to an action that runs on the robot (docs/actions.md)."""
 
 
-class Metadata(Struct, frozen=True, rename="camel"):
-    """The JSON in front of every message's data. A router leaves the sender null; request id 0 is a real id."""
+class Metadata(Struct, frozen=True, rename="camel", forbid_unknown_fields=True):
+    """The JSON in front of every message's data. A router leaves the sender null; request id 0 is a real id.
+
+    Unknown keys are forbidden to the fast decoder only: it would skip their values unread, and receivers go deaf on
+    what was not read (bytes that are no UTF-8, numbers and nesting without end).
+    """
 
     sender_agent_type: AgentType | None = None
     sender_agent_id: AgentId | None = None
@@ -63,8 +69,8 @@ class Metadata(Struct, frozen=True, rename="camel"):
         """Read metadata JSON. Raises BadJson or BadField."""
         try:
             return _metadata_decoder.decode(data)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            # the plain spelling failed: the tolerant way finds another spelling or tells what is wrong
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            # other keys than the seven plain ones: the tolerant way reads all of it, or tells what is wrong
             try:
                 return _convert("metadata", _json_object("metadata", bytes(data)), Metadata)
             except BadJson:
@@ -169,11 +175,20 @@ class RemoveNode(Management, frozen=True):
     node_name: str
 
 
+_TYPES = {str(number): number for number in range(1, 256)}
+
+
 class StreamData(Management, frozen=True):
     """Robot → router → headsets: topic data for these registrants: agent type as a string → ids, any number."""
 
     manager: ClassVar[str] = "RosAgentSubscriberDataForwarder"
     dest_agents: dict[str, list[AgentId]]
+
+    def targets(self) -> list[tuple[int, int]]:
+        """(type, id) of each registrant; types that are no agent types are left out."""
+        return [
+            (_TYPES[kind], agent_id) for kind, ids in self.dest_agents.items() if kind in _TYPES for agent_id in ids
+        ]
 
 
 class GoOffline(Management, frozen=True):
@@ -205,6 +220,19 @@ class NodeRefused(Management, frozen=True):
     node_type: Annotated[int, Meta(ge=0, le=255)]
     node_name: str
     tos_name: str
+    reason: str
+
+
+class CallFailure(Struct, frozen=True, rename="camel"):
+    """In place of a service's response, in the data part: why there is none. Metadata names it as the manager.
+
+    Sent only to who asked for it, by naming this manager in the metadata of the request: an existing program would
+    take it for the response. ``kind`` is ``absent``, ``timeout``, ``invalid``, ``refused`` or ``failed``; ``reason``
+    is for a person.
+    """
+
+    manager: ClassVar[str] = "InterfaceCallFailure"
+    kind: str
     reason: str
 
 
@@ -262,11 +290,13 @@ def encode_data(value: Struct) -> bytes:
 
 
 def correct_sender(metadata: bytes, agent_type: int, agent_id: int) -> bytes:
-    """The same metadata JSON with its true sender; unknown keys are kept. Raises BadJson."""
-    fields = _json_object("metadata", metadata)
+    """The same metadata JSON with its true sender and our keys in camelCase, itself when it is so already; unknown
+    keys are kept. Raises BadJson."""
+    fields = _json("metadata", metadata)
     names = _wire_names(Metadata)
-    spelled = {names.get(key, key): value for key, value in fields.items()}
-    return msgspec.json.encode({**spelled, "senderAgentType": agent_type, "senderAgentId": agent_id})
+    true = {names.get(_snake(key), key): value for key, value in fields.items()}
+    true |= {"senderAgentType": agent_type, "senderAgentId": agent_id}
+    return metadata if true == fields else msgspec.json.encode(true)
 
 
 @lru_cache(maxsize=1024)
@@ -277,13 +307,17 @@ def node_name(tos_name: str) -> str:
 
 def _json_object(what: str, data: bytes) -> dict[str, Any]:
     """The object in ``data`` with its top-level keys in snake_case. Raises BadJson."""
+    return {_snake(key): field for key, field in _json(what, data).items()}
+
+
+def _json(what: str, data: bytes) -> dict[str, Any]:
     try:
         value = msgspec.json.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BadJson(what, str(error)) from error
     if not isinstance(value, dict):
         raise BadJson(what, f"an object was expected, not {type(value).__name__}")
-    return {_snake(key): field for key, field in value.items()}
+    return value
 
 
 def _convert(what: str, fields: dict[str, Any], kind: type[StructT]) -> StructT:
@@ -307,9 +341,15 @@ def _fields(value: Struct) -> dict[str, Any]:
     return {key: field for key, field in fields.items() if field is not None}
 
 
-_HUMP: Callable[[str], str] = lambda key: re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", key)  # noqa: E731
+_HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
+_LONGEST_KEY = 64
+"""No key of ours is longer; longer ones are not remembered, because a peer chooses them."""
+
+
+def _snake(key: str) -> str:
+    return _short_snake(key) if len(key) <= _LONGEST_KEY else key
 
 
 @lru_cache(maxsize=1024)
-def _snake(key: str) -> str:
-    return _HUMP(key).lower()
+def _short_snake(key: str) -> str:
+    return _HUMP.sub("_", key).lower()

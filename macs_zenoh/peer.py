@@ -86,11 +86,11 @@ class Sent:
 
 
 class Streamed(NamedTuple):
-    """Topic data of a robot, for the registrants in ``targets``: agent type → ids."""
+    """Topic data of a robot, for the registrants in ``targets``: (type, id) each."""
 
     frame: Frame
     metadata: Metadata
-    targets: dict[int, list[int]]
+    targets: list[tuple[int, int]]
 
 
 class Registering(NamedTuple):
@@ -137,6 +137,8 @@ class Peer:
     """
 
     METADATA_CACHE = 512
+    CACHED_BYTES = 1024
+    """Longer metadata is judged each time: a peer chooses it, and no existing one needs half of that."""
 
     def __init__(
         self,
@@ -158,7 +160,7 @@ class Peer:
         self.corrected = 0
         self._limits = limits
         self._custom = custom
-        self._credit = limits.frames_per_s
+        self._credit = max(1.0, limits.frames_per_s)
         self._layout = layout
         self._decoder = FrameDecoder(limits.max_frame_bytes, layout, scratch)
         self._held: deque[Frame] = deque()
@@ -190,7 +192,7 @@ class Peer:
             return []
         if self._limits.frames_per_s:
             earned = (now - self._heard_at) * self._limits.frames_per_s
-            self._credit = min(self._limits.frames_per_s, self._credit + earned)
+            self._credit = min(max(1.0, self._limits.frames_per_s), self._credit + earned)
         self._heard_at = now
         events: list[Event] = []
         for frame in self._decoder.advance(size):
@@ -281,7 +283,6 @@ class Peer:
                 return
         self.state = State.ONLINE
         self.agent_type, self.group = kind, group
-        self._metadata.clear()
         events.append(Joined(kind, group, configuration.functionality))
         while self._held:
             frame = self._held.popleft()
@@ -325,9 +326,8 @@ class Peer:
     def _stream(self, stream: StreamData, frame: Frame) -> Streamed:
         if self.agent_type != ROS:
             raise NotAllowed("only a robot sends topic data")
-        targets = {int(kind): ids for kind, ids in stream.dest_agents.items() if kind.isascii() and kind.isdigit()}
         sent = self._sent(frame)
-        return Streamed(sent.frame, sent.metadata, targets)
+        return Streamed(sent.frame, sent.metadata, stream.targets())
 
     def _sent(self, frame: Frame) -> Sent:
         if self._limits.frames_per_s:
@@ -348,13 +348,14 @@ class Peer:
         if not raw:
             raise BadField("metadata", "a message for other agents needs metadata")
         metadata = Metadata.decode(raw)
-        corrected = None
-        if (metadata.sender_agent_type, metadata.sender_agent_id) != (self.agent_type, self.agent_id):
-            corrected = correct_sender(raw, self.agent_type, self.agent_id)
+        true = correct_sender(raw, self.agent_type, self.agent_id)
+        corrected = None if true is raw else true
+        if corrected is not None:
             metadata = Metadata.decode(corrected)
-        if len(self._metadata) >= self.METADATA_CACHE:
-            self._metadata.clear()
-        self._metadata[raw] = (metadata, corrected)
+        if len(raw) <= self.CACHED_BYTES:
+            if len(self._metadata) >= self.METADATA_CACHE:
+                self._metadata.clear()
+            self._metadata[raw] = (metadata, corrected)
         return metadata, corrected
 
     def _with_metadata(self, frame: Frame, metadata: bytes) -> Frame:

@@ -22,6 +22,7 @@ class Outbox:
         self.bytes = 0
         self.drops: Counter[str] = Counter()
         self._calls: deque[Chunk] = deque()
+        self._call_bytes = 0
         self._streams: OrderedDict[str, deque[Chunk]] = OrderedDict()
 
     def __len__(self) -> int:
@@ -38,25 +39,24 @@ class Outbox:
             self.drops["outbox_full"] += 1
             return False
         self._calls.append(message)
+        self._call_bytes += len(message)
         self.bytes += len(message)
         return True
 
     def put_stream(self, node: str, message: Chunk, *, depth: int, drop_new: bool) -> None:
         """Keep topic data of one node, as its registration says."""
-        waiting = self._streams.get(node)
-        if waiting is not None and len(waiting) >= max(1, depth):
-            if drop_new:
-                self.drops["node_full_newest"] += 1
-                return
-            self._drop_oldest(node, "node_full_oldest")
-        if drop_new and self._over(len(message)):
+        depth = max(1, depth)
+        if drop_new and len(self._streams.get(node, ())) >= depth:
+            self.drops["node_full_newest"] += 1
+            return
+        if self._over(len(message)) and (drop_new or not self._fits_beside_calls(len(message))):
             self.drops["outbox_full"] += 1
             return
-        self._make_room(len(message))
-        if self._over(len(message)):
-            self.drops["outbox_full"] += 1
-            return
-        self._streams.setdefault(node, deque()).append(message)
+        waiting = self._streams.setdefault(node, deque())
+        while len(waiting) >= depth:
+            self._drop_oldest(node, "node_full_oldest", keep=node)
+        self._make_room(len(message), keep=node)
+        waiting.append(message)
         self.bytes += len(message)
 
     def take(self, limit_bytes: int) -> list[Chunk]:
@@ -64,11 +64,16 @@ class Outbox:
         taken: list[Chunk] = []
         size = 0
         while self and size < limit_bytes:
-            chunk = self._calls.popleft() if self._calls else self._next_stream()
+            chunk = self._next_call() if self._calls else self._next_stream()
             taken.append(chunk)
             size += len(chunk)
         self.bytes -= size
         return taken
+
+    def _next_call(self) -> Chunk:
+        chunk = self._calls.popleft()
+        self._call_bytes -= len(chunk)
+        return chunk
 
     def _next_stream(self) -> Chunk:
         node, waiting = next(iter(self._streams.items()))
@@ -81,15 +86,20 @@ class Outbox:
     def _over(self, size: int) -> bool:
         return self.bytes > 0 and self.bytes + size > self.limit_bytes
 
-    def _make_room(self, size: int) -> None:
+    def _fits_beside_calls(self, size: int) -> bool:
+        return not self._calls or self._call_bytes + size <= self.limit_bytes
+
+    def _make_room(self, size: int, keep: str | None = None) -> None:
         """Let the node with the most bytes give up its oldest message until the new one fits."""
         while self._streams and self._over(size):
             heaviest = max(self._streams, key=lambda node: sum(map(len, self._streams[node])))
-            self._drop_oldest(heaviest, "outbox_full")
+            self._drop_oldest(heaviest, "outbox_full", keep)
 
-    def _drop_oldest(self, node: str, name: str) -> None:
+    def _drop_oldest(self, node: str, name: str, keep: str | None = None) -> None:
+        """Drop a node's oldest message, and the node with its last one. ``keep`` is the node whose next message is
+        about to be put: it keeps its turn."""
         waiting = self._streams[node]
         self.bytes -= len(waiting.popleft())
-        if not waiting:
+        if not waiting and node != keep:
             del self._streams[node]
         self.drops[name] += 1

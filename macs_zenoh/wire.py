@@ -200,6 +200,29 @@ def parse_frame(data: bytes | bytearray, layout: Layout = MACS) -> Frame:
     return frame
 
 
+def parse_frames(data: bytes, layout: Layout = MACS) -> list[Frame]:
+    """Take ``data`` as one or more whole frames back to back, check all of their sizes and return them.
+
+    That is what a sample on the mesh carries: frames that one sender sent the same way at once. Raises BadSizes.
+    """
+    frames = []
+    start, end = 0, len(data)
+    header_bytes, sizes_at = layout.header_bytes, layout.destination_bytes
+    while True:
+        if end - start < header_bytes:
+            raise BadSizes("header", header_bytes, end - start)
+        management_bytes, message_bytes = _SIZES.unpack_from(data, start + sizes_at)
+        stop = start + header_bytes + management_bytes + message_bytes
+        if stop > end:
+            raise BadSizes("frame", stop - start, end - start)
+        frame = Frame(data[start:stop], layout, header_bytes + management_bytes)
+        frame.check()
+        frames.append(frame)
+        if stop == end:
+            return frames
+        start = stop
+
+
 def encode_frame(
     agent_type: int = 0,
     ids: tuple[int, ...] | list[int] = (),

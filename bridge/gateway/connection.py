@@ -33,6 +33,9 @@ class Owner(Protocol):
     def handle(self, connection: Connection, event: Event) -> None:
         """The agent did something else."""
 
+    def received(self, connection: Connection) -> None:
+        """All events of one read were passed on."""
+
     def dirty(self, connection: Connection) -> None:
         """The connection has messages to flush."""
 
@@ -144,6 +147,7 @@ class Connection(asyncio.BufferedProtocol):
                 self.close(event.reason)
             else:
                 self.owner.handle(self, event)
+        self.owner.received(self)
 
     # -- out -----------------------------------------------------------------------------------------------------
 

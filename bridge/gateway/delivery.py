@@ -15,7 +15,7 @@ from macs_zenoh.keyexpr import BROADCAST, GROUP, UNICAST
 from macs_zenoh.mesh import Sample
 from macs_zenoh.messages import Metadata, StreamData, decode_management
 from macs_zenoh.routing import takes_group_copy
-from macs_zenoh.wire import Frame, Layout, parse_frame
+from macs_zenoh.wire import Frame, Layout, parse_frames
 
 from .agents import Agents
 from .connection import Connection
@@ -24,6 +24,9 @@ log = logging.getLogger("macs.gateway")
 
 KNOWN = 4096
 """How many keys, metadata and registrant lists are remembered as already read."""
+
+KNOWN_BYTES = 4096
+"""Longer ones are read each time: what others choose must not decide how much is kept here."""
 
 
 class Delivery:
@@ -48,51 +51,48 @@ class Delivery:
             connection = self._targets.get(key) or self._find(key)
             if connection is None:
                 continue
-            read = self._read(key, payload)
-            if read is not None:
-                self._send(connection, *read)
-                if connection.congested:
-                    self._hold_sender(key, connection)
+            for frame, metadata in self._read(key, payload):
+                self._send(connection, frame, metadata)
+            if connection.congested:
+                self._hold_sender(key, connection)
         self.flush()
 
     def group(self, batch: list[Sample]) -> None:
         """Frames sent to groups that one of ours is in."""
         for key, payload in batch:
             fields = GROUP.parse(key)
-            read = self._read(key, payload)
-            if fields is None or read is None:
+            if fields is None:
                 continue
             sender = (int(fields["from_type"]), int(fields["from_id"]))
-            header = read[0].header
-            for connection in self._agents.members(int(fields["type"]), int(fields["group"])):
-                if takes_group_copy(header, connection.agent_id, sender, connection.peer.agent_type):
-                    self._send(connection, *read)
+            members = self._agents.members(int(fields["type"]), int(fields["group"]))
+            for frame, metadata in self._read(key, payload):
+                header = frame.header
+                for connection in members:
+                    if takes_group_copy(header, connection.agent_id, sender, connection.peer.agent_type):
+                        self._send(connection, frame, metadata)
         self.flush()
 
     def broadcast(self, batch: list[Sample]) -> None:
         """Frames sent to everybody."""
         for key, payload in batch:
             fields = BROADCAST.parse(key)
-            read = self._read(key, payload)
-            if fields is None or read is None:
+            if fields is None:
                 continue
             sender = (fields["from_type"], fields["from_id"])
-            for connection in self._agents.online():
-                if connection.key != sender:
-                    self._send(connection, *read)
+            others = [connection for connection in self._agents.online() if connection.key != sender]
+            for frame, metadata in self._read(key, payload):
+                for connection in others:
+                    self._send(connection, frame, metadata)
         self.flush()
 
     def stream(self, batch: list[Sample]) -> None:
         """A robot's topic data, for those of its registrants that are ours."""
         for key, payload in batch:
-            read = self._read(key, payload)
-            if read is None:
-                continue
-            frame, metadata = read
-            for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
-                connection = self._agents.find(*registrant)
-                if connection is not None:
-                    connection.send_stream(metadata.node_name, frame.message)
+            for frame, metadata in self._read(key, payload):
+                for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
+                    connection = self._agents.find(*registrant)
+                    if connection is not None:
+                        connection.send_stream(metadata.node_name, frame.message)
         self.flush()
 
     def dirty(self, connection: Connection) -> None:
@@ -144,28 +144,40 @@ class Delivery:
         except WireError as error:
             self._bad(key, error)
             return []
-        found = management.dest_agents if isinstance(management, StreamData) else {}
-        registrants = [(int(kind), i) for kind, ids in found.items() if kind.isascii() and kind.isdigit() for i in ids]
-        if len(self._registrants) >= KNOWN:
-            self._registrants.clear()
-        self._registrants[frame.management] = registrants
+        registrants = management.targets() if isinstance(management, StreamData) else []
+        if len(frame.management) <= KNOWN_BYTES:
+            if len(self._registrants) >= KNOWN:
+                self._registrants.clear()
+            self._registrants[frame.management] = registrants
         return registrants
 
-    def _read(self, key: str, payload: bytes) -> tuple[Frame, Metadata] | None:
-        """The frame of a sample and its metadata, None when no agent must see it."""
+    def _read(self, key: str, payload: bytes) -> list[tuple[Frame, Metadata]]:
+        """The frames of a sample with their metadata; those that no agent must see are left out."""
         try:
-            frame = parse_frame(payload, self._layout)
+            frames = parse_frames(payload, self._layout)
+        except WireError as error:
+            self._bad(key, error)
+            return []
+        known = self._metadata
+        read = []
+        for frame in frames:
             raw = frame.metadata
-            metadata = self._metadata.get(raw)
-            if metadata is None:
-                metadata = Metadata.decode(raw)
-                if len(self._metadata) >= KNOWN:
-                    self._metadata.clear()
-                self._metadata[raw] = metadata
+            metadata = known.get(raw) or self._read_metadata(key, raw)
+            if metadata is not None:
+                read.append((frame, metadata))
+        return read
+
+    def _read_metadata(self, key: str, raw: bytes) -> Metadata | None:
+        try:
+            metadata = Metadata.decode(raw)
         except WireError as error:
             self._bad(key, error)
             return None
-        return frame, metadata
+        if len(raw) <= KNOWN_BYTES:
+            if len(self._metadata) >= KNOWN:
+                self._metadata.clear()
+            self._metadata[raw] = metadata
+        return metadata
 
     def _bad(self, key: str, error: WireError) -> None:
         self.drops["bad_frame"] += 1

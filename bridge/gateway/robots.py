@@ -22,6 +22,7 @@ log = logging.getLogger("macs.gateway")
 
 CALL_TIMEOUT_S = 2.0
 RETRY_S = 0.5
+ATTEMPTS = 120
 
 TaskKey = tuple[int, AgentKey, int, str]
 
@@ -105,7 +106,7 @@ class RobotCalls:
     async def _run(self, task: Task) -> None:
         node = task.node
         what = f"headset {node.registrant_agent_id}: {_describe(node)} on robot {task.robot_id}"
-        while True:
+        for _ in range(ATTEMPTS):
             try:
                 await self._ask(task)
                 log.info("%s: done", what)
@@ -117,11 +118,9 @@ class RobotCalls:
             except Unreachable as error:
                 log.debug("%s: %s", what, error)
             await asyncio.sleep(RETRY_S)
-            if isinstance(node, RemoveNode):
-                if task.robot_id not in self._robots():
-                    return
-            elif not self._registrations.holds(task, self._robots()):
-                return
+            if isinstance(node, AddNode) and not self._registrations.holds(task, self._robots()):
+                return  # taken back; or the robot is away, and is told everything when it returns
+        log.warning("%s: the robot does not answer", what)
 
     def _refused(self, task: Task, reason: str) -> None:
         node = task.node

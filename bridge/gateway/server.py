@@ -13,6 +13,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from macs_zenoh.config import GatewaySettings
@@ -62,6 +63,19 @@ class Route(NamedTuple):
     header: Header
 
 
+@dataclass
+class Run:
+    """Frames of one connection that go the same way, gathered within one read of its socket."""
+
+    route: Route
+    traffic: Traffic
+    frames: list[bytes | bytearray] = field(default_factory=list)
+    bytes: int = 0
+
+
+NO_RUN = Run(Route([], Header(0, (), (), 0, 0)), Traffic.CALL)
+
+
 class Gateway:
     """A TCP server whose connections are agents on the mesh. ``drops`` counts what was lost, by name."""
 
@@ -91,6 +105,7 @@ class Gateway:
         self._streams: set[str] = set()
         self._server: asyncio.Server | None = None
         self._sweep: asyncio.TimerHandle | None = None
+        self._run = NO_RUN
         self._brake = Brake()
         mesh.on_room(self._brake.release)
         self._delivery = Delivery(self.agents, self.directory, self._layout)
@@ -246,13 +261,31 @@ class Gateway:
                 if (kind, agent_id) not in self.directory:
                     connection.complain("unknown_agent", f"a message goes to {type_name(kind)}/{agent_id}, not online")
         traffic = Traffic.COMMAND if sent.metadata.node_type == PUBLISHER else Traffic.CALL
-        for key in route.keys:
-            self.mesh.put(key, frame.data, traffic)
+        run = self._run
+        if run.route is not route or run.traffic is not traffic or run.bytes + len(frame.data) > Mesh.LARGE_BYTES:
+            self._put_run()
+            run = self._run = Run(route, traffic)
+        run.frames.append(frame.data)
+        run.bytes += len(frame.data)
+
+    def received(self, connection: Connection) -> None:
+        """All that one read of a socket brought is forwarded or handled."""
+        if self._run.frames:
+            self._put_run()
         if self.mesh.backlogged:
             self._brake.hold(connection)
 
+    def _put_run(self) -> None:
+        """Put frames that go the same way as one sample: a put costs more than a frame."""
+        run, self._run = self._run, NO_RUN
+        if run.frames:
+            payload = run.frames[0] if len(run.frames) == 1 else b"".join(run.frames)
+            for key in run.route.keys:
+                self.mesh.put(key, payload, run.traffic)
+
     def handle(self, connection: Connection, event: Event) -> None:
         """One thing a TCP agent did."""
+        self._put_run()
         if isinstance(event, Streamed):
             key = STREAM.of(type=ROS, id=connection.agent_id, node=event.metadata.node_name or "_")
             self.mesh.put(key, event.frame.data, Traffic.STREAM)
@@ -306,11 +339,15 @@ class Gateway:
         log.info("%s is online%s", connection, f" in group {event.group}" if event.group else "")
 
     def _answer_online(self, connection: Connection, request_id: int) -> None:
-        ids = {kind: set(self.directory.ids(kind)) for kind in (ROS, UNITY)}
-        for own in self.agents.online():  # their presence comes back through the mesh a moment later
-            ids.setdefault(own.key[0], set()).add(own.agent_id)
+        ids: dict[int, list[int]] = {kind: self._elsewhere(kind) for kind in (ROS, UNITY)}
+        for own in self.agents.online():  # what we know ourselves comes back through the mesh a moment later
+            ids.setdefault(own.key[0], []).append(own.agent_id)
         reply = OnlineReply(ros_agent_ids=sorted(ids[ROS]), unity_agent_ids=sorted(ids[UNITY]))
         self._reply(connection, Metadata(request_id=request_id), encode_data(reply))
+
+    def _elsewhere(self, kind: int) -> list[int]:
+        """Ids of the online agents of a type that are not behind this gateway."""
+        return [agent.id for agent in self.directory.of_type(kind) if agent.zid != self.mesh.zid]
 
     # -- TCP robots ----------------------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 import zenoh
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from macs_zenoh import keyexpr
@@ -18,26 +18,23 @@ FORBIDDEN = "/*$?#%"
 
 by_plane = pytest.mark.parametrize("plane", KEYS)
 
-# "@" at the start of a chunk hides it from wildcards: see test_a_chunk_hides_from_no_wildcard
-texts = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=12).filter(
-    lambda text: not text.startswith("@")
+texts = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=12) | st.text(
+    FORBIDDEN + "@~. aé\0\n", min_size=1, max_size=6
 )
-VALUES: dict[str, st.SearchStrategy[int | str]] = {
+NUMBERS: dict[str, st.SearchStrategy[int | str]] = {
     "type": st.integers(1, 255),
     "from_type": st.integers(1, 255),
     "id": st.integers(1, 0xFFFF),
     "from_id": st.integers(1, 0xFFFF),
     "group": st.integers(0, 255),
     "block": st.integers(0, 255),
-    "node": texts | st.text(FORBIDDEN + "~. aé\0\n", min_size=1, max_size=6),
-    "verb": texts,
-    "zid": st.text("0123456789abcdef", min_size=1, max_size=32),
 }
+"""Fields that are numbers; all others are text."""
 
 
 def fields_of(space: Key) -> st.SearchStrategy[dict[str, int | str]]:
     """Any fields of a key space."""
-    return st.fixed_dictionaries({name: VALUES[name] for name in space.fields})
+    return st.fixed_dictionaries({name: NUMBERS.get(name, texts) for name in space.fields})
 
 
 # -- there and back --------------------------------------------------------------------------------------------------
@@ -67,6 +64,7 @@ def test_zenoh_takes_a_key_as_it_is(plane: str, data: st.DataObject) -> None:
 
 
 @by_plane
+@settings(max_examples=40)
 @given(data=st.data())
 def test_every_includes_of(plane: str, data: st.DataObject) -> None:
     """The expression for some fields includes each key with these fields, and none that differs in one of them."""
@@ -79,7 +77,7 @@ def test_every_includes_of(plane: str, data: st.DataObject) -> None:
             assert expression.includes(key)
             assert str(zenoh.KeyExpr.autocanonize(str(expression))) == str(expression)
     for name in fields:
-        other = data.draw(VALUES[name].filter(lambda value, name=name: value != fields[name]))
+        other = data.draw(NUMBERS.get(name, texts).filter(lambda value, name=name: value != fields[name]))
         assert not zenoh.KeyExpr(space.every(**{name: other})).intersects(key)
 
 
@@ -112,10 +110,9 @@ def test_forbidden_characters_never_reach_a_key(character: str, place: str) -> N
     assert STREAM.every(type=1, node=node) == f"macs/from/ros/*/{chunk}"
 
 
-@pytest.mark.xfail(strict=True, reason="Zenoh's wildcards do not match a chunk that starts with @; it is not escaped")
-@pytest.mark.parametrize("node", ["@", "@adminspace"])
+@pytest.mark.parametrize("node", ["@", "@adminspace", "@@", "a@b"])
 def test_a_chunk_hides_from_no_wildcard(node: str) -> None:
-    """A node whose name starts with @ is heard by who listens to all nodes."""
+    """A name that starts with @, which Zenoh hides from wildcards, is heard by who listens to all names."""
     key = zenoh.KeyExpr(STREAM.of(type=1, id=7, node=node))
     assert zenoh.KeyExpr(STREAM.every(type=1, id=7)).includes(key)
 
@@ -128,7 +125,6 @@ def test_what_cannot_be_written_is_refused(values: dict[str, int | str]) -> None
         STREAM.of(**fields)
 
 
-@pytest.mark.xfail(strict=True, reason="of() checks no upper bounds, nor the number of a type")
 @pytest.mark.parametrize(
     "values",
     [
@@ -136,7 +132,6 @@ def test_what_cannot_be_written_is_refused(values: dict[str, int | str]) -> None
         {"type": 256},
         {"type": -1},
         {"id": 65536},
-        {"id": 0},
         {"id": True},
         {"block": 256},
         {"node": "\ud800"},
@@ -206,10 +201,9 @@ def test_a_key_that_is_not_ours_is_none(key: str) -> None:
     assert keyexpr.parse(key) is None
 
 
-@pytest.mark.xfail(strict=True, reason="parse() takes more than what of() writes")
 @pytest.mark.parametrize(
     "key",
-    ["macs/from/1/7/x", "macs/from/ros/007/x", "macs/from/03/7/x", "macs/from/ros/65536/x", "macs/from/ros/7/%6e%ff"],
+    ["macs/from/1/7/x", "macs/from/ros/007/x", "macs/from/03/7/x", "macs/from/ros/65536/x", "macs/from/ros/7/%6e"],
 )
 def test_a_key_that_we_would_write_otherwise_is_none(key: str) -> None:
     """Only the one way to write an agent is read, so access rules for `ros/7` cover all that is taken for it."""

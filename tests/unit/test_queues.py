@@ -188,7 +188,6 @@ def test_nodes_take_turns() -> None:
     ]
 
 
-@pytest.mark.xfail(strict=True, reason="replacing a node's only message puts the node to the back")
 def test_a_node_of_depth_1_gets_its_turn() -> None:
     """A node whose only message is replaced before it could be sent keeps its place: fresh poses arrive although a
     camera always has something waiting."""
@@ -202,7 +201,6 @@ def test_a_node_of_depth_1_gets_its_turn() -> None:
     assert taken.count(b"pose") >= 4
 
 
-@pytest.mark.xfail(strict=True, reason="put_stream drops one message at a time")
 def test_a_smaller_depth_counts_at_once() -> None:
     """When a headset registers again with a smaller buffer, no more than that waits after the next message."""
     outbox = Outbox(1000)
@@ -212,7 +210,6 @@ def test_a_smaller_depth_counts_at_once() -> None:
     assert [Waiting.of(chunk).number for chunk in outbox.take(1000)] == [4, 5]
 
 
-@pytest.mark.xfail(strict=True, reason="room is made before it is known whether the message fits at all")
 @pytest.mark.parametrize("node", ["a", "b"])
 def test_topic_data_that_cannot_fit_costs_no_other(node: str) -> None:
     """A topic message that does not fit beside the waiting calls is dropped alone; what waits stays."""

@@ -91,6 +91,7 @@ LIES = [
     ("metadata longer than the message", struct.pack("<II", 1, 0), "metadata", 1, 0),
     ("metadata of 4 GiB", struct.pack("<II", 0xFFFFFFFF, 0), "metadata", 0xFFFFFFFF, 0),
     ("metadata that would be negative", struct.pack("<II", 0xFFFFFFFC, 0), "metadata", 0xFFFFFFFC, 0),
+    ("metadata with its highest bit set", struct.pack("<I2sI", 0x80000002, b"{}", 0), "metadata", 0x80000002, 2),
     ("data longer than the message", struct.pack("<I2sI", 2, b"{}", 1), "data", 1, 0),
     ("data shorter than the message", struct.pack("<I2sI3s", 2, b"{}", 1, b"abc"), "data", 1, 3),
     ("data of 4 GiB", struct.pack("<I2sI", 2, b"{}", 0xFFFFFFFF), "data", 0xFFFFFFFF, 0),
