@@ -69,9 +69,9 @@ class Directory:
         """Ids of all agents of a type, ascending."""
         return sorted(self._ids.get(agent_type, ()))
 
-    def all_ids(self) -> set[int]:
-        """Ids that an agent of any type has."""
-        return set().union(*self._ids.values())
+    def ids_elsewhere(self, zid: str) -> set[int]:
+        """Ids that an agent of any type has in another Zenoh session than this one."""
+        return {agent_id for (_, agent_id), claims in self._claims.items() if claims.keys() - {zid}}
 
     def of_type(self, agent_type: int) -> list[AgentInfo]:
         """All agents of a type, by id."""

@@ -190,7 +190,7 @@ class Gateway:
     def _greet_waiting(self) -> None:
         """Give waiting connections ids: the lowest of our blocks that no agent of any type has."""
         while self._waiting:
-            agent_id = self._leases.free_id(self.agents.ids | self.directory.all_ids())
+            agent_id = self._leases.free_id(self.agents.ids | self.directory.ids_elsewhere(self.mesh.zid))
             if agent_id is None:
                 return
             connection = self._waiting.popleft()

@@ -98,7 +98,7 @@ def test_what_is_told_adds_up(story_steps: list[tuple[str, AgentInfo | bool | fl
             of_type = [agent for agent in directory if agent.type == kind]
             assert directory.of_type(kind) == of_type
             assert directory.ids(kind) == [agent.id for agent in of_type]
-        assert directory.all_ids() == {agent.id for agent in directory}
+        assert directory.ids_elsewhere("nobody") == {agent.id for agent in directory}
         for agent in directory:
             assert agent.key in directory
             assert directory.get(*agent.key) == agent

@@ -1,0 +1,239 @@
+"""What agents may cost a gateway, each limit reached for real."""
+
+from __future__ import annotations
+
+import asyncio
+import resource
+import socket
+import struct
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+import macs_zenoh
+from bridge.headset.client import Headset
+from macs_zenoh.errors import Refused, Unreachable
+from macs_zenoh.messages import Metadata, NodeRefused, NodeType, StreamData, decode_data, encode_management
+from macs_zenoh.wire import encode_frame, encode_message
+from tests.integration.conftest import Connect, StartGateway, until
+from tests.programs import Program, free_port
+
+GREETING = Metadata(message_manager="Greeting").encode()
+
+
+def memory_bytes(pid: int) -> int:
+    """Resident memory of a process."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+@asynccontextmanager
+async def site(*options: str) -> AsyncIterator[tuple[str, Program]]:
+    """A router and a gateway as processes."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    async with (
+        Program("router", "-l", endpoint),
+        Program("gateway", "--port", "0", "-e", endpoint, *options) as gateway,
+    ):
+        yield endpoint, gateway
+
+
+async def answers(headset: Headset) -> None:
+    """The gateway still answers this headset."""
+    assert headset.id in (await headset.online()).unity_agent_ids
+
+
+async def test_declared_sizes_cost_nothing() -> None:
+    """Two hundred headers that declare 4 GiB or just below the limit are refused or wait, at no cost in memory."""
+    async with site() as (_, gateway), await Headset.connect("127.0.0.1", gateway.port) as neighbour:
+        before = memory_bytes(gateway.pid)
+        connections = [await asyncio.open_connection("127.0.0.1", gateway.port) for _ in range(200)]
+        for number, (_, writer) in enumerate(connections):
+            declared = 0xFFFFFFFF if number % 2 else (32 << 20) - 39
+            writer.write(struct.pack("<B30xII", 2, 0, declared) + bytes(10))
+        for reader, _ in connections[1::2]:
+            assert await asyncio.wait_for(reader.read(), 5)  # the greeting, then FIN
+        await answers(neighbour)
+        assert memory_bytes(gateway.pid) - before < 48 << 20
+        for _, writer in connections:
+            writer.close()
+
+
+async def test_a_stalled_headset_costs_its_limit() -> None:
+    """While 200 MB are sent towards a headset that does not read, memory grows by its limit; a neighbour hears all."""
+    async with AsyncExitStack() as stack:
+        endpoint, gateway = await stack.enter_async_context(site())
+        neighbour = await stack.enter_async_context(await Headset.connect("127.0.0.1", gateway.port))
+        stalled = socket.create_connection(("127.0.0.1", gateway.port))
+        stack.callback(stalled.close)
+        sender = await stack.enter_async_context(macs_zenoh.join("ros", id=1, connect=[endpoint]))
+
+        async def accept(call: macs_zenoh.Call) -> bytes:
+            return b""
+
+        sender.serve("add_node", accept)
+        images = await neighbour.subscribe("/image", "sensor_msgs/Image", agents=[1], buffer_size=1000)
+        configuration = (
+            b'{"agentType":2,"agentId":2,"groupId":0,"requestId":1,"messageManager":"AgentclientConfigurer"}'
+        )
+        registration = (
+            b'{"messageManager":"RosAgentNodeRegistrationForwarder","registrantAgentId":2,"registrarAgentIds":[1],'
+            b'"registrarGroupIds":[],"nodeType":1,"nodeName":"nd__image","tosName":"/image","dataExchangeType":"x/Y"}'
+        )
+        node = (
+            b'{"registrantAgentType":2,"registrantAgentId":2,"nodeType":1,"nodeName":"nd__image","tosName":"/image",'
+            b'"dataExchangeType":"x/Y","bufferSize":1000,"dropNew":false,"isLatched":false}'
+        )
+        adder = Metadata(2, 2, message_manager="InterfaceNodeAdder").encode()
+        stalled.sendall(encode_frame(management=configuration))
+        stalled.sendall(encode_frame(management=registration, message=encode_message(adder, node)))
+        metadata = Metadata(1, 1, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__image", "x/Y").encode()
+        management = encode_management(StreamData({"2": [1, 2]}))
+        image = encode_frame(1, management=management, message=encode_message(metadata, bytes(200_000)))
+        before = memory_bytes(gateway.pid)
+        arrived = 0
+        while arrived < 1000:
+            sender.publish_stream("nd__image", image)
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(images.__anext__(), 0.2)
+                arrived += 1
+        assert memory_bytes(gateway.pid) - before < (8 + 16) << 20
+
+
+async def test_silent_connections_are_closed(start_gateway: StartGateway) -> None:
+    """Five hundred connections that say nothing are closed by the handshake limit, and leave nothing behind."""
+    gateway = await start_gateway(handshake_s=1.0)
+    connections = [await asyncio.open_connection("127.0.0.1", gateway.port) for _ in range(500)]
+    for reader, writer in connections:
+        assert await asyncio.wait_for(reader.read(), 10)  # the greeting, then FIN
+        writer.close()
+    await until(lambda: len(gateway.agents) == 0)
+
+
+async def test_connections_are_limited(start_gateway: StartGateway, connect: Connect) -> None:
+    """Connections beyond the limits, and from addresses that are not allowed, are refused and counted."""
+    gateway = await start_gateway(max_connections_per_address=2)
+    first = await connect(gateway)
+    await connect(gateway)
+    with pytest.raises(Unreachable):
+        await connect(gateway)
+    assert gateway.drops["too_many_from_address"] == 1
+    await first.close()
+    await until(lambda: len(gateway.agents) == 1)
+    await connect(gateway)
+    closed = await start_gateway(allow=["192.168.7.0/24"])
+    with pytest.raises(Unreachable):
+        await connect(closed)
+    assert closed.drops["address_not_allowed"] == 1
+    assert (await start_gateway(allow=["127.0.0.0/8"])).drops == {}
+
+
+async def test_a_rate_is_kept(start_gateway: StartGateway, connect: Connect) -> None:
+    """Beyond its rate a connection's messages are dropped and counted; the connection stays."""
+    gateway = await start_gateway(max_frames_per_s=20)
+    sender, receiver = await connect(gateway), await connect(gateway)
+    for number in range(100):
+        await sender.send(str(number).encode(), to=2, ids=[receiver.id], manager="Greeting")
+    await answers(sender)
+    await sender.close()
+    await until(lambda: gateway.drops["TooFast"] >= 50)
+    assert bytes((await receiver.receive(5)).data) == b"0"
+
+
+async def test_descriptors_run_out() -> None:
+    """A gateway without a free file descriptor goes on for those who are connected, and accepts again later."""
+    async with AsyncExitStack() as stack:
+        _, gateway = await stack.enter_async_context(site())
+        headset = await stack.enter_async_context(await Headset.connect("127.0.0.1", gateway.port))
+        _, hard = resource.prlimit(gateway.pid, resource.RLIMIT_NOFILE)
+        resource.prlimit(gateway.pid, resource.RLIMIT_NOFILE, (64, hard))
+        crowd = [socket.create_connection(("127.0.0.1", gateway.port)) for _ in range(100)]
+        await answers(headset)
+        for connection in crowd:
+            connection.close()
+        await answers(headset)
+
+        async def accepted() -> Headset:
+            while True:
+                with suppress(Unreachable, OSError):
+                    return await Headset.connect("127.0.0.1", gateway.port)
+                await asyncio.sleep(0.05)
+
+        late = await stack.enter_async_context(await asyncio.wait_for(accepted(), 20))
+        await answers(late)
+
+
+async def test_a_refusal_is_told(router: str, start_gateway: StartGateway) -> None:
+    """A headset whose registration a robot refuses is told why, by a management message of its own."""
+    gateway = await start_gateway()
+
+    async def refuse(call: macs_zenoh.Call) -> bytes:
+        raise Refused("no such type here")
+
+    async with macs_zenoh.join("ros", id=1, connect=[router]) as robot:
+        robot.serve("add_node", refuse)
+        async with await Headset.connect("127.0.0.1", gateway.port) as headset:
+            await headset.subscribe("/secret", "my_msgs/Secret", agents=[1])
+            message = await headset.receive(5)
+            assert message.metadata.message_manager == NodeRefused.manager
+            refused = decode_data(NodeRefused, message.data)
+            assert (refused.robot_id, refused.tos_name, refused.reason) == (1, "/secret", "no such type here")
+
+
+async def test_a_name_with_another_type_is_kept_away(
+    router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """A message under the name of a headset's node with another node type, which would deafen it, is not sent."""
+    gateway = await start_gateway()
+    async with macs_zenoh.join("ros", id=1, connect=[router]) as robot:
+
+        async def accept(call: macs_zenoh.Call) -> bytes:
+            return b""
+
+        robot.serve("add_node", accept)
+        headset = await connect(gateway)
+        await headset.subscribe("/pose", "geometry_msgs/Pose", agents=[1])
+        await answers(headset)
+        for node_type, name in ((NodeType.SERVICE, "nd__pose"), (0, "")):
+            metadata = Metadata(node_type=int(node_type), node_name=name, message_manager="" if name else "Greeting")
+            robot.send(b"to you", to="unity", ids=[headset.id], metadata=metadata)
+        message = await headset.receive(5)
+        assert message.metadata.message_manager == "Greeting"
+        assert gateway.agents.find(2, headset.id).drops["wrong_node_type"] == 1  # type: ignore[union-attr]
+
+
+async def test_workers_share_a_port() -> None:
+    """Gateways behind one port give out different ids, and their headsets reach each other."""
+    async with AsyncExitStack() as stack:
+        _, gateway = await stack.enter_async_context(site("--workers", "2"))
+        headsets: dict[int, Headset] = {}
+        while len({headset_id // 256 for headset_id in headsets}) < 2:
+            headset = await stack.enter_async_context(await Headset.connect("127.0.0.1", gateway.port))
+            headsets[headset.id] = headset
+        first, last = headsets[min(headsets)], headsets[max(headsets)]
+        while last.id not in (await first.online()).unity_agent_ids:
+            await asyncio.sleep(0.02)
+        await first.send(b"over there", to=2, ids=[last.id], manager="Greeting")
+        assert bytes((await last.receive(5)).data) == b"over there"
+
+
+async def test_a_thousand_headsets() -> None:
+    """A thousand headsets join one gateway, each with an id of its own, and an idle one costs at most 100 KiB."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
+    try:
+        async with AsyncExitStack() as stack:
+            _, gateway = await stack.enter_async_context(site())
+            before = memory_bytes(gateway.pid)
+            ids = set()
+            for _ in range(20):
+                joining = [Headset.connect("127.0.0.1", gateway.port) for _ in range(50)]
+                for headset in await asyncio.gather(*joining):
+                    await stack.enter_async_context(headset)
+                    ids.add(headset.id)
+            assert len(ids) == 1000
+            assert set((await headset.online()).unity_agent_ids) == ids
+            assert (memory_bytes(gateway.pid) - before) / 1000 < 100 * 1024
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
