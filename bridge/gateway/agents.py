@@ -42,16 +42,17 @@ class Agents:
         self._by_id[agent_id] = connection
 
     def join(self, connection: Connection, token: Token) -> Group | None:
-        """An agent told its type and group; its presence is ``token``. Returns a group that has its first member."""
-        self._unjoin(connection)
+        """An agent told its type and group, maybe other ones than before; its presence is ``token``.
+
+        Returns a group that has lost its last member by that.
+        """
+        _, emptied = self._unjoin(connection)
         self._tokens[connection] = token
-        group = (connection.peer.agent_type, connection.peer.group)
-        if not connection.peer.group:
-            return None
-        self._group_of[connection] = group
-        members = self._groups.setdefault(group, set())
-        members.add(connection)
-        return group if len(members) == 1 else None
+        if connection.peer.group:
+            group = (connection.peer.agent_type, connection.peer.group)
+            self._group_of[connection] = group
+            self._groups.setdefault(group, set()).add(connection)
+        return emptied if emptied not in self._groups else None
 
     def leave(self, connection: Connection) -> tuple[bool, Group | None]:
         """A connection ended. Returns whether it was online, and a group that lost its last member."""

@@ -21,7 +21,8 @@ from macs_zenoh.wire import Layout, encode_frame, encode_message
 log = logging.getLogger("macs.gateway")
 
 CALL_TIMEOUT_S = 2.0
-RETRY_S = 0.5
+RETRY_S = (0.05, 0.05, 0.1, 0.2, 0.5)
+"""Pauses between attempts, the last one repeated: a robot that has just come is online a moment before it serves."""
 ATTEMPTS = 120
 
 TaskKey = tuple[int, AgentKey, int, str]
@@ -106,7 +107,7 @@ class RobotCalls:
     async def _run(self, task: Task) -> None:
         node = task.node
         what = f"headset {node.registrant_agent_id}: {_describe(node)} on robot {task.robot_id}"
-        for _ in range(ATTEMPTS):
+        for attempt in range(ATTEMPTS):
             try:
                 await self._ask(task)
                 log.info("%s: done", what)
@@ -117,7 +118,7 @@ class RobotCalls:
                 return
             except Unreachable as error:
                 log.debug("%s: %s", what, error)
-            await asyncio.sleep(RETRY_S)
+            await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
             if isinstance(node, AddNode) and not self._registrations.holds(task, self._robots()):
                 return  # taken back; or the robot is away, and is told everything when it returns
         log.warning("%s: the robot does not answer", what)

@@ -40,7 +40,7 @@ from macs_zenoh.registrations import AgentKey
 from macs_zenoh.routing import inbox, keys_of
 from macs_zenoh.wire import FrameDecoder, Header, Layout, encode_message, parse_frame
 
-from .agents import Agents
+from .agents import Agents, Group
 from .brake import Brake
 from .connection import Connection
 from .delivery import Delivery
@@ -221,8 +221,7 @@ class Gateway:
         self._drops += connection.all_drops()
         self._delivery.forget()
         was_online, empty_group = self.agents.leave(connection)
-        if empty_group is not None:
-            self._unsubscribe(GROUP.every(type=empty_group[0], group=empty_group[1]))
+        self._group_emptied(empty_group)
         if was_online:
             for key in self._own_keys(connection):
                 self._unsubscribe(key)
@@ -230,6 +229,11 @@ class Gateway:
             log.debug("%s is offline", connection)
         if not self.agents:
             self._all_closed.set()
+
+    def _group_emptied(self, group: Group | None) -> None:
+        """Nobody of ours is in this group any more."""
+        if group is not None:
+            self._unsubscribe(GROUP.every(type=group[0], group=group[1]))
 
     def stream_depth(self, connection: Connection, node: str) -> tuple[int, bool]:
         """What the headset asked for when it registered on this topic."""
@@ -334,7 +338,7 @@ class Gateway:
             self._subscribe(GROUP.every(type=kind, group=event.group), self._delivery.group)
         # the token last: whoever sees the agent can reach it
         presence = PRESENCE.of(type=kind, id=agent_id, group=event.group, zid=self.mesh.zid)
-        self.agents.join(connection, self.mesh.declare_token(presence))
+        self._group_emptied(self.agents.join(connection, self.mesh.declare_token(presence)))
         self._delivery.forget()
         log.info("%s is online%s", connection, f" in group {event.group}" if event.group else "")
 
