@@ -27,6 +27,8 @@ from tests.programs import Program, free_port
 VECTORS = Path(__file__).parents[1] / "vectors"
 CONNECTIONS = 8
 PER_CONNECTION = 2_000
+GONE_S = 15.0
+"""How long the last attackers' connections may take to be gone: a half-sent frame waits for the silence limit."""
 PACE_S = 0.005
 """Between a neighbour's messages."""
 
@@ -116,6 +118,7 @@ async def run(frames: int, seed: int) -> Report:
         before = _threads(gateway.pid), _descriptors(gateway.pid)
         begun = time.monotonic()
         talk = asyncio.create_task(_talk(left, right))
+        listen = asyncio.create_task(_count_in_order(right, left))
         sent = connections = 0
 
         def stream() -> Iterator[bytes]:
@@ -127,9 +130,13 @@ async def run(frames: int, seed: int) -> Report:
             sent += sum(shares)
             connections += len(shares)
         talk.cancel()
-        messages = await _count_in_order(right, left)
-        while len((await left.online()).unity_agent_ids) != 2:  # every attacker is gone
-            await asyncio.sleep(0.05)
+        await left.send(b"end", to=2, ids=[right.id], manager="Neighbour")
+        messages = await asyncio.wait_for(listen, 10)
+        deadline = time.monotonic() + GONE_S
+        while _descriptors(gateway.pid) > before[1] and time.monotonic() < deadline:
+            await left.online()
+            await asyncio.sleep(0.1)
+        assert (await left.online()).unity_agent_ids == [left.id, right.id], "an attacker is still online"
         after = _threads(gateway.pid), _descriptors(gateway.pid)
         # one more is the thread for large messages, which starts with the first of them
         assert after[0]["python"] <= before[0]["python"] + 1, f"threads: {before[0]} → {after[0]}"
@@ -151,10 +158,9 @@ async def _talk(left: Headset, right: Headset) -> None:
 
 async def _count_in_order(right: Headset, left: Headset) -> int:
     """All numbered messages that came, which must be 0, 1, 2, …: what attackers broadcast lies between them."""
-    await left.send(b"end", to=2, ids=[right.id], manager="Neighbour")
     expected = 0
     while True:
-        message = await right.receive(5)
+        message = await right.receive()
         if message.metadata.message_manager != "Neighbour" or message.sender_id != left.id:
             continue
         if bytes(message.data) == b"end":
