@@ -41,7 +41,7 @@ from .messages import (
     decode_management,
     encode_data,
 )
-from .wire import MACS, MAX_FRAME_BYTES, Frame, FrameDecoder, Layout, encode_frame, encode_message, parse_frame
+from .wire import MACS, MAX_FRAME_BYTES, Frame, FrameDecoder, Layout, encode_frame, encode_message, parse_frames
 
 
 class State(Enum):
@@ -76,7 +76,7 @@ class Joined(NamedTuple):
 
 
 class Sent:
-    """A frame for other agents. Its sizes add up and its sender is true."""
+    """A frame for other agents, or a run of them. Its sizes add up and its sender is true."""
 
     __slots__ = ("frame", "metadata")
 
@@ -203,7 +203,7 @@ class Peer:
                     continue
                 self._frame(frame, events)
             except WireError as error:
-                self.drops[type(error).__name__] += 1
+                self.drops[type(error).__name__] += frame.count
                 events.append(Rejected(error))
             if self._gone():
                 return events
@@ -266,7 +266,7 @@ class Peer:
 
     def _hold(self, frame: Frame) -> None:
         if len(self._held) >= self._limits.held_frames or self._held_bytes + len(frame.data) > self._limits.held_bytes:
-            self.drops["before_configuration"] += 1
+            self.drops["before_configuration"] += frame.count
             return
         self._held.append(frame)
         self._held_bytes += len(frame.data)
@@ -282,6 +282,7 @@ class Peer:
             if group == self.group:
                 return
         self.state = State.ONLINE
+        self._decoder.runs = not self._limits.frames_per_s  # a rate limit is for each frame
         self.agent_type, self.group = kind, group
         events.append(Joined(kind, group, configuration.functionality))
         while self._held:
@@ -340,7 +341,7 @@ class Peer:
             known = self._judge(raw)
         metadata, corrected = known
         if corrected is not None:
-            self.corrected += 1
+            self.corrected += frame.count
             frame = self._with_metadata(frame, corrected)
         return Sent(frame, metadata)
 
@@ -359,16 +360,19 @@ class Peer:
         return metadata, corrected
 
     def _with_metadata(self, frame: Frame, metadata: bytes) -> Frame:
-        header = frame.header
-        data = encode_frame(
-            header.agent_type,
-            header.ids,
-            header.groups,
-            management=frame.management,
-            message=encode_message(metadata, frame.body),
-            layout=self._layout,
+        header, management = frame.header, frame.management
+        data = b"".join(
+            encode_frame(
+                header.agent_type,
+                header.ids,
+                header.groups,
+                management=management,
+                message=encode_message(metadata, single.body),
+                layout=self._layout,
+            )
+            for single in frame.each()
         )
-        return parse_frame(data, self._layout)
+        return parse_frames(data, self._layout, runs=True)[0]
 
     def _decode(self, frame: Frame) -> Metadata:
         raw = frame.metadata

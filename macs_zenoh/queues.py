@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict, deque
 
-Chunk = bytes | memoryview
+Chunk = bytes | bytearray | memoryview
 
 
 class Outbox:

@@ -18,6 +18,7 @@ with T = 8 + S + D. All integers are unsigned, little-endian, unaligned.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -129,20 +130,28 @@ MACS = Layout()
 
 
 class Frame:
-    """One whole frame, decoded only as far as asked.
+    """One whole frame, decoded only as far as asked; or a *run* of frames that have everything but their data in
+    common, which is how a burst of one topic's messages looks, and which costs little more than one frame.
 
-    ``data`` is the frame's bytes as they came; nothing here copies them except `management`, `metadata` and
-    `destination`, which are short. What concerns the message is valid after `check`.
+    ``data`` is the bytes as they came; nothing here copies them except `management`, `metadata`, `destination` and
+    small messages. What concerns the message is valid after `check`.
     """
 
-    __slots__ = ("_body_at", "_message_at", "data", "layout")
+    __slots__ = ("_body_at", "_message_at", "_size", "data", "layout")
 
-    def __init__(self, data: bytes | bytearray, layout: Layout, message_at: int) -> None:
-        """``message_at`` is where the message starts: header and management data end there."""
+    def __init__(self, data: bytes | bytearray, layout: Layout, message_at: int, size: int) -> None:
+        """``message_at`` is where the message starts: header and management data end there. ``size`` is that of one
+        frame; ``data`` is as long, or a multiple of it for a run."""
         self.data = data
         self.layout = layout
         self._message_at = message_at
         self._body_at = 0
+        self._size = size
+
+    @property
+    def count(self) -> int:
+        """How many frames this is."""
+        return len(self.data) // self._size
 
     @property
     def header(self) -> Header:
@@ -166,11 +175,19 @@ class Frame:
 
     @property
     def message(self) -> bytes | memoryview:
-        """The message part: what a TCP agent receives. A copy when that is cheaper than a view."""
+        """The message part, of the first frame: what a TCP agent receives. A copy when that is cheaper than a view."""
         data = self.data
-        if len(data) <= COPY_BYTES and type(data) is bytes:
-            return data[self._message_at :]
-        return memoryview(data)[self._message_at :]
+        if self._size <= COPY_BYTES and type(data) is bytes:
+            return data[self._message_at : self._size]
+        return memoryview(data)[self._message_at : self._size]
+
+    @property
+    def messages(self) -> Sequence[Buffer]:
+        """The message of each frame, in order."""
+        data, size, at = self.data, self._size, self._message_at
+        if len(data) == size:
+            return [self.message]
+        return [data[start + at : start + size] for start in range(0, len(data), size)]
 
     @property
     def metadata(self) -> bytes:
@@ -179,12 +196,19 @@ class Frame:
 
     @property
     def body(self) -> memoryview:
-        """The data part of the message."""
-        return memoryview(self.data)[self._body_at :]
+        """The data part of the message, of the first frame."""
+        return memoryview(self.data)[self._body_at : self._size]
 
     def check(self) -> None:
         """Raise BadSizes unless the sizes inside the message add up. A frame that fails must never be forwarded."""
-        self._body_at = _body_at(self.data, self._message_at)
+        self._body_at = _body_at(self.data, self._message_at, self._size)
+
+    def each(self) -> Iterator[Frame]:
+        """The single frames of a run, checked like it."""
+        for start in range(0, len(self.data), self._size):
+            frame = Frame(self.data[start : start + self._size], self.layout, self._message_at, self._size)
+            frame._body_at = self._body_at
+            yield frame
 
 
 def parse_frame(data: bytes | bytearray, layout: Layout = MACS) -> Frame:
@@ -195,13 +219,14 @@ def parse_frame(data: bytes | bytearray, layout: Layout = MACS) -> Frame:
     declared = layout.header_bytes + management_bytes + message_bytes
     if declared != len(data):
         raise BadSizes("frame", declared, len(data))
-    frame = Frame(data, layout, layout.header_bytes + management_bytes)
+    frame = Frame(data, layout, layout.header_bytes + management_bytes, declared)
     frame.check()
     return frame
 
 
-def parse_frames(data: bytes, layout: Layout = MACS) -> list[Frame]:
-    """Take ``data`` as one or more whole frames back to back, check all of their sizes and return them.
+def parse_frames(data: bytes, layout: Layout = MACS, *, runs: bool = False) -> list[Frame]:
+    """Take ``data`` as one or more whole frames back to back, check all of their sizes and return them, with ``runs``
+    those that begin alike as one.
 
     That is what a sample on the mesh carries: frames that one sender sent the same way at once. Raises BadSizes.
     """
@@ -212,15 +237,34 @@ def parse_frames(data: bytes, layout: Layout = MACS) -> list[Frame]:
         if end - start < header_bytes:
             raise BadSizes("header", header_bytes, end - start)
         management_bytes, message_bytes = _SIZES.unpack_from(data, start + sizes_at)
-        stop = start + header_bytes + management_bytes + message_bytes
+        message_at = header_bytes + management_bytes
+        size = message_at + message_bytes
+        stop = start + size
         if stop > end:
-            raise BadSizes("frame", stop - start, end - start)
-        frame = Frame(data[start:stop], layout, header_bytes + management_bytes)
+            raise BadSizes("frame", size, end - start)
+        if runs and stop != end and not management_bytes:
+            stop = _run_end(data, start, message_at, size, end)
+        frame = Frame(data[start:stop], layout, message_at, size)
         frame.check()
         frames.append(frame)
         if stop == end:
             return frames
         start = stop
+
+
+def _run_end(data: bytes, start: int, message_at: int, size: int, end: int) -> int:
+    """Where the frames end that have header, metadata and all sizes of the frame at ``start`` in common."""
+    head_bytes = message_at + MESSAGE_OVERHEAD
+    if size < head_bytes:
+        return start + size
+    head_bytes += _U32.unpack_from(data, start + message_at)[0]
+    if head_bytes > size:
+        return start + size  # its sizes do not add up
+    head = data[start : start + head_bytes]
+    at = start + size
+    while at + size <= end and data.startswith(head, at):
+        at += size
+    return at
 
 
 def encode_frame(
@@ -244,14 +288,13 @@ def encode_message(metadata: bytes, data: Buffer = b"") -> bytes:
 
 def split_message(message: Buffer) -> tuple[bytes, memoryview]:
     """Take a message apart into metadata JSON and data (a view into ``message``). Raises BadSizes."""
-    at = _body_at(message, 0)
+    at = _body_at(message, 0, len(message))
     view = memoryview(message)
     return bytes(view[4 : at - 4]), view[at:]
 
 
-def _body_at(buffer: Buffer, at: int) -> int:
-    """Where the data of the message that starts at ``at`` and fills the rest of the buffer starts. Raises BadSizes."""
-    size = len(buffer)
+def _body_at(buffer: Buffer, at: int, size: int) -> int:
+    """Where the data starts of the message from ``at`` to ``size``. Raises BadSizes."""
     try:
         metadata_bytes = _U32.unpack_from(buffer, at)[0]
         body_at: int = at + MESSAGE_OVERHEAD + metadata_bytes
@@ -286,12 +329,16 @@ class FrameDecoder:
         max_frame_bytes: int = MAX_FRAME_BYTES,
         layout: Layout = MACS,
         scratch: bytearray | None = None,
+        *,
+        runs: bool = False,
     ) -> None:
-        """``scratch`` is where `space` receives small frames; decoders that are never filled at the same
-        time (connections of one event loop) may share one."""
+        """``scratch`` is where `space` receives small frames; decoders that are never filled at the same time
+        (connections of one event loop) may share one. ``runs`` gives frames that begin alike as one; it may be
+        changed at any time."""
         self.max_frame_bytes = max_frame_bytes
         self.layout = layout
         self.error: FrameTooLarge | None = None
+        self.runs = runs
         self._scratch = memoryview(scratch if scratch is not None else bytearray(self.SMALL_BYTES))
         self._partial = bytearray()  # a frame that has begun; its length is what is reserved, not what has come
         self._filled = 0
@@ -350,12 +397,16 @@ class FrameDecoder:
             if size > self.max_frame_bytes:
                 self.error = FrameTooLarge(size, self.max_frame_bytes)
                 return frames
+            message_at = header_bytes + management_bytes
             if size > end - start:
                 self._begin(data[start:], size)
-                self._message_at = header_bytes + management_bytes
+                self._message_at = message_at
                 return frames
-            frames.append(Frame(data[start : start + size], layout, header_bytes + management_bytes))
-            start += size
+            stop = start + size
+            if self.runs and stop != end and not management_bytes:
+                stop = _run_end(data, start, message_at, size, end)
+            frames.append(Frame(data[start:stop], layout, message_at, size))
+            start = stop
         self._partial = bytearray(data[start:])
         return frames
 
@@ -366,7 +417,7 @@ class FrameDecoder:
         self._wanted = wanted
 
     def _finish(self) -> Frame:
-        frame = Frame(self._partial, self.layout, self._message_at)
+        frame = Frame(self._partial, self.layout, self._message_at, self._wanted)
         self._partial = bytearray()
         self._filled = self._wanted = 0
         return frame

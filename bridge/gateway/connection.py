@@ -7,6 +7,7 @@ import logging
 import socket
 import time
 from collections import Counter
+from collections.abc import Sequence
 from typing import Protocol, cast
 
 from macs_zenoh.messages import Metadata
@@ -153,14 +154,20 @@ class Connection(asyncio.BufferedProtocol):
 
     def send_call(self, message: Chunk) -> None:
         """Send in order; kept while the agent does not read, disconnected when too much waits."""
+        self.send_calls([message])
+
+    def send_calls(self, messages: Sequence[Chunk]) -> None:
+        """The same for several."""
         if self._paused_at is None:
             if not self._ready:
                 self.owner.dirty(self)
-            self._ready.append(message)
-        elif not self._outbox.put_call(message):
-            self.close(f"it does not read: {self._outbox.bytes} bytes are waiting")
-        else:
-            self.congested = self._outbox.bytes > self._outbox.limit_bytes // 4
+            self._ready += messages
+            return
+        for message in messages:
+            if not self._outbox.put_call(message):
+                self.close(f"it does not read: {self._outbox.bytes} bytes are waiting")
+                return
+        self.congested = self._outbox.bytes > self._outbox.limit_bytes // 4
 
     def send_stream(self, node: str, message: Chunk) -> None:
         """Send topic data of a node; the registration's buffer size bounds what waits."""
@@ -206,9 +213,9 @@ class Connection(asyncio.BufferedProtocol):
 
     # -- life ----------------------------------------------------------------------------------------------------
 
-    def complain(self, name: str, problem: str) -> None:
-        """Count something that was dropped; the first of a kind is logged."""
-        self.drops[name] += 1
+    def complain(self, name: str, problem: str, count: int = 1) -> None:
+        """Count what was dropped; the first of a kind is logged."""
+        self.drops[name] += count
         self._warn_once(name, problem)
 
     def _warn_once(self, name: str, problem: str) -> None:

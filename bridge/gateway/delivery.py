@@ -92,7 +92,8 @@ class Delivery:
                 for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
                     connection = self._agents.find(*registrant)
                     if connection is not None:
-                        connection.send_stream(metadata.node_name, frame.message)
+                        for message in frame.messages:
+                            connection.send_stream(metadata.node_name, message)
         self.flush()
 
     def dirty(self, connection: Connection) -> None:
@@ -112,9 +113,10 @@ class Delivery:
     def _send(self, connection: Connection, frame: Frame, metadata: Metadata) -> None:
         if metadata.node_name and not connection.takes(metadata):
             name = f"{metadata.node_name[:80]} of type {metadata.node_type}"
-            connection.complain("wrong_node_type", f"a message for its node {name}, which has another type there")
+            problem = f"a message for its node {name}, which has another type there"
+            connection.complain("wrong_node_type", problem, frame.count)
             return
-        connection.send_call(frame.message)
+        connection.send_calls(frame.messages)
 
     def _find(self, key: str) -> Connection | None:
         fields = UNICAST.parse(key)
@@ -154,7 +156,7 @@ class Delivery:
     def _read(self, key: str, payload: bytes) -> list[tuple[Frame, Metadata]]:
         """The frames of a sample with their metadata; those that no agent must see are left out."""
         try:
-            frames = parse_frames(payload, self._layout)
+            frames = parse_frames(payload, self._layout, runs=True)
         except WireError as error:
             self._bad(key, error)
             return []

@@ -257,13 +257,15 @@ class Gateway:
                 routes.clear()
             header = frame.header
             route = routes[destination] = Route(keys_of(header, *connection.key), header)
-            if not route.keys:
-                connection.complain("no_destination", "a message names no agent and no group")
+        if not route.keys:
+            connection.complain("no_destination", "a message names no agent and no group", frame.count)
+            return
         kind = route.header.agent_type
         if kind:
             for agent_id in route.header.ids:
                 if (kind, agent_id) not in self.directory:
-                    connection.complain("unknown_agent", f"a message goes to {type_name(kind)}/{agent_id}, not online")
+                    problem = f"a message goes to {type_name(kind)}/{agent_id}, not online"
+                    connection.complain("unknown_agent", problem, frame.count)
         traffic = Traffic.COMMAND if sent.metadata.node_type == PUBLISHER else Traffic.CALL
         run = self._run
         if run.route is not route or run.traffic is not traffic or run.bytes + len(frame.data) > Mesh.LARGE_BYTES:

@@ -26,6 +26,7 @@ from macs_zenoh.wire import (
     encode_frame,
     encode_message,
     parse_frame,
+    parse_frames,
     split_message,
 )
 
@@ -464,3 +465,30 @@ def test_a_header_that_ends_early_is_told() -> None:
     assert (raised.value.declared, raised.value.available) == (39, 38)
     with pytest.raises(BadSizes):
         MACS.unpack(bytes(39), at=100)
+
+
+def test_a_run_is_its_frames() -> None:
+    """Frames that begin alike come as one run with everything in it; what differs in a size or a byte does not."""
+    alike = [encode_frame(2, (5,), message=encode_message(b'{"a":1}', bytes([number] * 9))) for number in range(5)]
+    other = encode_frame(2, (6,), message=encode_message(b'{"a":1}', bytes(9)))
+    longer = encode_frame(2, (5,), message=encode_message(b'{"a":1}', bytes(10)))
+    stream = b"".join([*alike, other, longer, *alike[:2]])
+    frames = FrameDecoder(runs=True).feed(stream)
+    for frame in frames:
+        frame.check()
+    assert [frame.count for frame in frames] == [5, 1, 1, 2]
+    assert [bytes(frame.data) for run in frames for frame in run.each()] == [*alike, other, longer, *alike[:2]]
+    assert [bytes(message) for message in frames[0].messages] == [frame[39:] for frame in alike]
+    assert [f.count for f in parse_frames(stream, runs=True)] == [5, 1, 1, 2]
+    assert b"".join(bytes(f.data) for f in parse_frames(stream)) == stream
+
+
+def test_a_run_never_swallows_a_bad_frame() -> None:
+    """A frame in which only the size of the data lies is not taken into a run, and is found out."""
+    good = encode_frame(2, (5,), message=encode_message(b'{"a":1}', bytes(9)))
+    at = 39 + 4 + 7
+    bad = good[:at] + (8).to_bytes(4, "little") + good[at + 4 :]
+    frames = FrameDecoder(runs=True).feed(good + bad + good)
+    assert [frame.count for frame in frames] == [1, 1, 1]
+    with pytest.raises(BadSizes):
+        frames[1].check()
