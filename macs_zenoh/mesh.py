@@ -36,7 +36,7 @@ class Traffic(Enum):
 
     COMMAND = (zenoh.Priority.REAL_TIME, zenoh.CongestionControl.DROP, True)
     """Commands to robots: first in line, never waits, the next one replaces a lost one."""
-    CALL = (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK, False)
+    CALL = (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK, True)
     """Services, management, messages between agents: kept, in order."""
     STREAM = (zenoh.Priority.DATA, zenoh.CongestionControl.DROP, False)
     """Topic data: dropped when a link is full."""
@@ -108,7 +108,7 @@ class Mesh:
 
     BATCH = 512
     PUBLISHERS = 4096
-    LARGE_BYTES = 64 << 10
+    LARGE_BYTES = 128 << 10
 
     def __init__(self, session: zenoh.Session, settings: MeshSettings, backlog_bytes: int = 64 << 20) -> None:
         self.settings = settings

@@ -377,11 +377,17 @@ class FrameDecoder:
             self._filled += size
             return [self._finish()] if self._filled == self._wanted else []
         received = self._scratch[:size]
-        if not self._partial:
-            return self._cut(bytes(received))
-        begun = bytes(self._partial) + received
-        self._partial = bytearray()
-        return self._cut(begun)
+        if self._partial:
+            begun = bytes(self._partial) + received
+            self._partial = bytearray()
+            return self._cut(begun)
+        if size >= self.layout.header_bytes:
+            management_bytes, message_bytes = _SIZES.unpack_from(received, self.layout.destination_bytes)
+            wanted = self.layout.header_bytes + management_bytes + message_bytes
+            if size < wanted <= self.max_frame_bytes:  # the beginning of one large frame: copied once
+                self._begin(received, wanted, self.layout.header_bytes + management_bytes)
+                return []
+        return self._cut(bytes(received))
 
     def _cut(self, data: bytes) -> list[Frame]:
         """Cut whole frames off ``data`` and keep the rest as the beginning of the next one."""
@@ -399,8 +405,7 @@ class FrameDecoder:
                 return frames
             message_at = header_bytes + management_bytes
             if size > end - start:
-                self._begin(data[start:], size)
-                self._message_at = message_at
+                self._begin(memoryview(data)[start:], size, message_at)
                 return frames
             stop = start + size
             if self.runs and stop != end and not management_bytes:
@@ -410,10 +415,11 @@ class FrameDecoder:
         self._partial = bytearray(data[start:])
         return frames
 
-    def _begin(self, data: bytes, wanted: int) -> None:
+    def _begin(self, data: memoryview, wanted: int, message_at: int) -> None:
         self._partial = bytearray(min(wanted, max(2 * len(data), self.SMALL_BYTES)))
         self._partial[: len(data)] = data
         self._filled = len(data)
+        self._message_at = message_at
         self._wanted = wanted
 
     def _finish(self) -> Frame:

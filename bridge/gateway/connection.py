@@ -7,11 +7,11 @@ import logging
 import socket
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Protocol, cast
 
-from macs_zenoh.messages import Metadata
-from macs_zenoh.peer import Event, Left, Peer, Rejected, Sent, State
+from macs_zenoh.messages import AddNode, GoneAgent, Metadata, RemoveNode
+from macs_zenoh.peer import Event, Joined, Left, Peer, Rejected, Sent, State
 from macs_zenoh.queues import Chunk, Outbox
 
 from .brake import Brake
@@ -64,6 +64,7 @@ class Connection(asyncio.BufferedProtocol):
         self._timer: asyncio.TimerHandle | None = None
         self._complained: set[str] = set()
         self._nodes: dict[str, set[int]] = {}
+        self._told: dict[tuple[int, int, int, str], AddNode] = {}
         self._refused = False
         self._pauses = 0
         self.congested = False
@@ -148,6 +149,8 @@ class Connection(asyncio.BufferedProtocol):
                 self.close(event.reason)
             else:
                 self.owner.handle(self, event)
+                if isinstance(event, Joined):
+                    self._schedule()  # from now on silence counts, which may be less than what the handshake has
         self.owner.received(self)
 
     # -- out -----------------------------------------------------------------------------------------------------
@@ -188,6 +191,23 @@ class Connection(asyncio.BufferedProtocol):
         of one of its nodes that has another type."""
         types = self._nodes.get(metadata.node_name)
         return types is None or metadata.node_type in types
+
+    def tell(self, node: AddNode | RemoveNode) -> bool:
+        """Whether this robot program has to be told: it makes a second ROS node of a registration heard twice."""
+        key = (node.registrant_agent_type, node.registrant_agent_id, node.node_type, node.node_name)
+        if isinstance(node, RemoveNode):
+            self._told.pop(key, None)
+        elif self._told.get(key) == node:
+            return False
+        else:
+            self._told[key] = node
+        return True
+
+    def untell(self, gone: Iterable[GoneAgent]) -> None:
+        """A robot program that hears of these takes them off its nodes."""
+        if self._told:
+            left = {(agent.agent_type, agent.agent_id) for agent in gone}
+            self._told = {key: node for key, node in self._told.items() if key[:2] not in left}
 
     def flush(self) -> None:
         """Write what was sent since the last flush, in one go."""

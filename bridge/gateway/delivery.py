@@ -91,7 +91,7 @@ class Delivery:
             for frame, metadata in self._read(key, payload):
                 for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
                     connection = self._agents.find(*registrant)
-                    if connection is not None:
+                    if connection is not None and self._may_have(connection, frame, metadata):
                         for message in frame.messages:
                             connection.send_stream(metadata.node_name, message)
         self.flush()
@@ -111,12 +111,16 @@ class Delivery:
         self._targets.clear()
 
     def _send(self, connection: Connection, frame: Frame, metadata: Metadata) -> None:
-        if metadata.node_name and not connection.takes(metadata):
-            name = f"{metadata.node_name[:80]} of type {metadata.node_type}"
-            problem = f"a message for its node {name}, which has another type there"
-            connection.complain("wrong_node_type", problem, frame.count)
-            return
-        connection.send_calls(frame.messages)
+        if self._may_have(connection, frame, metadata):
+            connection.send_calls(frame.messages)
+
+    def _may_have(self, connection: Connection, frame: Frame, metadata: Metadata) -> bool:
+        if not metadata.node_name or connection.takes(metadata):
+            return True
+        name = f"{metadata.node_name[:80]} of type {metadata.node_type}"
+        problem = f"a message for its node {name}, which has another type there"
+        connection.complain("wrong_node_type", problem, frame.count)
+        return False
 
     def _find(self, key: str) -> Connection | None:
         fields = UNICAST.parse(key)

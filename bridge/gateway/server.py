@@ -33,6 +33,7 @@ from macs_zenoh.messages import (
     NodeType,
     OnlineReply,
     RemoveNode,
+    decode_data,
     encode_data,
 )
 from macs_zenoh.peer import Asked, AskedOnline, Event, Joined, Limits, Peer, Registering, Sent, Streamed
@@ -311,6 +312,7 @@ class Gateway:
         asker = Asker(*connection.key, connection.peer.group)
         try:
             answer = self._managers[event.manager].manage(event.data, asker)
+            data = encode_data(answer) if answer is not None else None
         except Refused as refusal:
             connection.complain("refused_by_manager", f"{event.manager}: {refusal.reason}")
             return
@@ -318,8 +320,8 @@ class Gateway:
             log.exception("%s failed on a message of %s", event.manager, connection)
             connection.complain("manager_failed", f"{event.manager} failed, see above")
             return
-        if answer is not None:
-            self._reply(connection, Metadata(request_id=event.request_id), encode_data(answer))
+        if data is not None:
+            self._reply(connection, Metadata(request_id=event.request_id), data)
 
     def _tell_refusal(self, agent: AgentKey, refused: NodeRefused) -> None:
         connection = self.agents.find(*agent)
@@ -366,7 +368,10 @@ class Gateway:
                 if fields is None or self.agents.find(*connection.key) is not connection:
                     raise Refused("the robot is not connected")
                 sender = Metadata(int(fields["from_type"]), int(fields["from_id"]), message_manager=kind.manager)
-                connection.send_call(encode_message(sender.encode(), parse_frame(payload, self._layout).body))
+                body = parse_frame(payload, self._layout).body
+                if not connection.tell(decode_data(kind, body)):
+                    return b""  # it has that node already
+                connection.send_call(encode_message(sender.encode(), body))
                 self._delivery.flush()
                 return b""
 
@@ -422,6 +427,7 @@ class Gateway:
             metadata = Metadata(message_manager=AgentsGone.manager)
             message = encode_message(metadata.encode(), encode_data(AgentsGone(gone)))
             for connection in self.agents.online():
+                connection.untell(gone)
                 connection.send_call(message)
             self._delivery.flush()
         for change in changes:
