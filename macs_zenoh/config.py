@@ -1,6 +1,6 @@
 """The configuration, typed: what a settings file may say, its defaults, and the ranges that hold.
 
-A settings file is TOML with up to three sections, one per struct below::
+A settings file is TOML with up to four sections, one per struct below::
 
     [mesh]                                   # MeshSettings: every program on the mesh
     connect = ["tcp/192.168.1.10:7447"]
@@ -10,6 +10,9 @@ A settings file is TOML with up to three sections, one per struct below::
 
     [robot]                                  # RobotSettings: `macs agent`
     id = 7
+
+    [awareness]                              # AwarenessSettings: `macs awareness`
+    name = "drone0"
 
 It is loaded once, in ``main``, and passed down. A misspelled name or a value out of range is a
 `ConfigError` whose path names file and field. The ranges hold however a struct is made, because the
@@ -42,12 +45,18 @@ Mode = Literal["client", "peer", "router"]
 AgentId = Annotated[int, Meta(ge=1, le=0xFFFF)]
 GroupId = Annotated[int, Meta(ge=0, le=0xFF)]
 """0 means: in no group."""
+AgentName = Annotated[str, Meta(min_length=1, max_length=200)]
+"""Any text: it is escaped where Zenoh or ROS would not take it."""
 Port = Annotated[int, Meta(ge=0, le=0xFFFF)]
 """0 means: any free one."""
 Millis = Annotated[int, Meta(ge=0, le=3_600_000)]
 Seconds = Annotated[float, Meta(gt=0, le=86_400)]
 Bytes = Annotated[int, Meta(ge=39, le=0xFFFF_FFFF)]
 """At least one header, at most what the header's u32 can declare."""
+
+NamePattern = Annotated[str, Meta(pattern=r"^(/[A-Za-z0-9_*]+)+$", max_length=256)]
+"""A full ROS name in which ``*`` stands for anything within one level and ``**`` for any number of levels."""
+AgentPattern = Annotated[str, Meta(pattern=r"^(\*|[a-z0-9]+(/[0-9]+)?)$")]
 
 LOCAL_ROUTER = "tcp/127.0.0.1:7447"
 EVERY_INTERFACE = "tcp/[::]:7447"
@@ -188,6 +197,8 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             ("connect/retry", retry, ("retry_min_ms", "retry_max_ms")),
             ("listen/endpoints", listen, ("listen",)),
             ("scouting/multicast/enabled", self.multicast, ("multicast",)),
+            # A router waits half a second for what it might discover: without scouting there is nothing.
+            *([] if self.multicast else [("scouting/delay", 0, ())]),
             ("transport/shared_memory/enabled", self.shared_memory, ("shared_memory",)),
             ("transport/link/tx/lease", self.lease_ms, ("lease_ms",)),
             (f"{queues}/congestion_control/drop/wait_before_drop", self.drop_wait_ms * 1000, ("drop_wait_ms",)),
@@ -244,6 +255,61 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
                 raise self._wrong("allow", f"{network!r} is not a network, as in 192.168.1.0/24: {error}") from None
 
 
+class TopicRule(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What holds for topics, services and actions whose full name fits a pattern; one ``[[robot.rules]]`` table.
+
+    Of several rules that fit a name, each setting comes from the first one that gives it.
+    """
+
+    section: ClassVar[str] = "robot.rules"
+
+    match: NamePattern
+    """As ``/camera/*`` (one level) or ``/camera/**`` (any levels below)."""
+
+    reliability: Literal["best_effort", "reliable"] | None = None
+    durability: Literal["volatile", "transient_local"] | None = None
+    depth: Annotated[int, Meta(ge=1, le=1000)] | None = None
+    """These three replace what is taken from the topic's other endpoints and from the registration."""
+    max_hz: Annotated[float, Meta(gt=0, le=10_000)] | None = None
+    """Topic data to headsets: at most so many messages per second; of those in between, the latest is sent."""
+    read_only: bool | None = None
+    """Headsets may subscribe to the topic, not publish to it."""
+
+    call_s: Seconds | None = None
+    """How long a service may take, on either side; for actions, how long a goal may wait to be accepted."""
+    error_response: dict[str, Any] | None = None
+    """Fields of the response that a ROS caller gets when a headset does not answer."""
+    cancel_on_leave: bool | None = None
+    """Cancel an action's goals when the headset that gave them leaves."""
+
+    exclusive: bool | None = None
+    """One agent commands this topic at a time."""
+    hold_s: Seconds | None = None
+    """Control without a command for so long is free for others; 3 s unless set."""
+    deadman_s: Seconds | None = None
+    """Without a command for so long, `deadman_message` is published once."""
+    deadman_message: dict[str, Any] | None = None
+    """The fields that are not zero; published also when the commanding agent leaves, and at an emergency stop."""
+
+    def _check(self) -> None:
+        if self.deadman_s is not None and self.deadman_message is None:
+            raise self._wrong("deadman_s", "needs a deadman_message; {} is a message with every field zero")
+
+
+ROBOT_HIDES = (
+    "/rosout",
+    "/parameter_events",
+    "/**/describe_parameters",
+    "/**/get_parameter_types",
+    "/**/get_parameters",
+    "/**/list_parameters",
+    "/**/set_parameters",
+    "/**/set_parameters_atomically",
+    "/**/get_type_description",
+)
+"""What every ROS node brings along: a headset that could set the parameters of any node would own the robot."""
+
+
 class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The robot agent beside a ROS 2 graph."""
 
@@ -254,6 +320,54 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     group: GroupId = 0
     max_nodes: Annotated[int, Meta(ge=1, le=10_000)] = 256
     """Interface nodes that headsets may have registered here at one time."""
+    expose: list[NamePattern] = msgspec.field(default_factory=lambda: ["/**"])
+    """Topics, services and actions that headsets may use; existing programs name them freely, so all by default."""
+    hide: list[NamePattern] = msgspec.field(default_factory=lambda: list(ROBOT_HIDES))
+    """Except these."""
+    call_s: Seconds = 5.0
+    """How long a service may take unless a rule says otherwise; existing headsets wait 5 s."""
+    max_calls: Annotated[int, Meta(ge=1, le=100_000)] = 1024
+    """Calls that may be open on one service at one time."""
+    result_s: Annotated[float, Meta(gt=0, le=604_800)] = 900.0
+    """How long the result of an action is kept for a headset that has lost its connection."""
+    stop_topic: Annotated[str, Meta(pattern=r"^(/[A-Za-z_]\w*)*$")] = "/emergency_stop"
+    """The emergency stop: true on this topic (std_msgs/Bool) stops, false releases. Empty: there is none."""
+    stop_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
+    """Who may stop: ``*``, ``unity``, ``unity/5`` or ``group/3``."""
+    release_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
+    """Who may release a stop."""
+    rules: list[TopicRule] = []
+
+
+class AwarenessSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Collective awareness: what this robot is called among robots, and how its messages to them travel."""
+
+    section: ClassVar[str] = "awareness"
+
+    name: AgentName = "drone0"
+    """What others send to. It must be the only one of this name on the mesh."""
+    transport: Literal["mesh", "topic", "both"] = "mesh"
+    """``topic`` is the plain ROS topic that existing as2_ca gateways share within one domain."""
+    id: AgentId | None = None
+    """This robot's id on the mesh. Unset: lease a free one."""
+    beside: bool = False
+    """A robot agent with this ``id`` runs on this robot as well: the name becomes its name, and no id is taken."""
+    max_message_bytes: Bytes = 32 * 1024 * 1024
+    """A larger message is refused where it is sent."""
+    rates_hz: dict[str, Annotated[float, Meta(gt=0)]] = {}
+    """Per message type: what is sent more often is dropped and counted."""
+    deadlines_s: dict[str, Seconds] = {}
+    """Per message type: how long a message to one robot may wait for it, and is repeated until it is confirmed."""
+    last_values: list[str] = []
+    """Message types of which every other robot's last message to all is asked for when this one joins."""
+    only_addressed: bool = True
+    """Take only what is for this robot or for all. Off: also what the plain topic carries for others."""
+    drop_own: bool = True
+    """Off: what this robot sends to all on the plain topic is delivered to its own modules as well."""
+
+    def _check(self) -> None:
+        if self.beside and self.id is None:
+            raise self._wrong("beside", "needs the id of the robot agent")
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -262,6 +376,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     mesh: MeshSettings = MeshSettings()
     gateway: GatewaySettings = GatewaySettings()
     robot: RobotSettings = RobotSettings()
+    awareness: AwarenessSettings = AwarenessSettings()
 
 
 def load(path: str | os.PathLike[str]) -> Settings:
@@ -315,7 +430,10 @@ def _plain(text: str) -> tuple[str, str]:
 def _hint(where: str, problem: str) -> str:
     """``, did you mean `port`?`` after an unknown name that is nearly a known one."""
     unknown = re.fullmatch(r"unknown name `(.+)`", problem)
-    owner: Any = {"mesh": MeshSettings, "gateway": GatewaySettings, "robot": RobotSettings}.get(where, Settings)
+    sections: dict[str, Any] = {
+        kind.section: kind for kind in (MeshSettings, GatewaySettings, RobotSettings, AwarenessSettings, TopicRule)
+    }
+    owner = sections.get(re.sub(r"\[\d+\]$", "", where), Settings)
     if unknown is None:
         return ""
     near = difflib.get_close_matches(unknown[1], [field.name for field in msgspec.structs.fields(owner)], n=1)

@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 
 import macs_zenoh
+from macs_zenoh import awareness, named
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Unreachable
-from macs_zenoh.keyexpr import PRESENCE, STREAM
+from macs_zenoh.keyexpr import NAMED, PRESENCE, STREAM
 from macs_zenoh.mesh import Mesh
 
 RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
@@ -113,6 +114,36 @@ async def test_a_robot_cannot_speak_as_another(as_user: Callable[[str], MeshSett
         robot.send(b"I am robot 7", to="unity", ids=[9])
         assert (await asyncio.wait_for(headset.receive(), 5)).data == b"I am robot 7"
         assert {agent.id for agent in headset.online() if agent.type == 1} == {7}
+
+
+async def test_a_robot_has_its_own_name_only(as_user: Callable[[str], MeshSettings]) -> None:
+    """Robot 7 is known as drone7, sends to itself under that name, and under another one is not heard.
+
+    Neither is a gateway that sends as a robot, whatever the message type.
+    """
+    async with (
+        macs_zenoh.join("ros", id=7, settings=as_user("robot-7")) as robot,
+        awareness.join(robot, "drone7") as drone,
+        await Mesh.open(as_user("gateway-1")) as gateway,
+        await Mesh.open(as_user("robot-7")) as thief,
+    ):
+        received: asyncio.Queue[awareness.Received] = asyncio.Queue()
+        for message_type in ("t", "unity"):
+            drone.register(message_type, received.put_nowait)
+        key = NAMED.of(name="drone7", message_type="t", from_name="drone7")
+        payload = named.encode(named.Envelope("s", 1), b"as itself")
+        while True:  # until the rules' router has passed on who serves
+            try:
+                await thief.query(key, payload, timeout_s=1)
+                break
+            except Unreachable:
+                await asyncio.sleep(0.05)
+        assert (await asyncio.wait_for(received.get(), 5)).data == b"as itself"
+        for mesh, message_type, sender in ((thief, "t", "drone8"), (gateway, "t", "drone8"), (gateway, "unity", "9")):
+            key = NAMED.of(name="drone7", message_type=message_type, from_name=sender)
+            with pytest.raises(Unreachable):
+                await mesh.query(key, named.encode(named.Envelope("s", 2), b"forged"), timeout_s=0.5)
+        assert received.empty()
 
 
 async def test_an_observer_sees_who_is_online(as_user: Callable[[str], MeshSettings]) -> None:

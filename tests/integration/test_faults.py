@@ -78,6 +78,8 @@ async def test_programs_start_without_a_router() -> None:
         joining = macs_zenoh.join("unity", id=9, connect=[endpoint], on_waiting=lambda target: waiting.set())
         agent = asyncio.ensure_future(stack.enter_async_context(joining))
         await asyncio.wait_for(waiting.wait(), 5)
+        while not any("waiting" in line for line in gateway.log):
+            await asyncio.sleep(0.02)
         assert not starting.done()
         await stack.enter_async_context(Program("router", "-l", endpoint))
         await asyncio.wait_for(starting, 10)

@@ -299,3 +299,16 @@ async def test_encoding_of_the_first_message(start_gateway: StartGateway) -> Non
     }
     assert json.loads(bytes(body)) == {"agentId": 1}
     writer.close()
+
+
+async def test_the_order_is_kept_between_ids_groups_and_all(start_gateway: StartGateway, connect: Connect) -> None:
+    """What one headset sends by id, by group and to everybody arrives on another gateway in the order it was sent."""
+    sender = await connect(await start_gateway())
+    receiver = await connect(await start_gateway(), group=6)
+    while receiver.id not in (await sender.online()).unity_agent_ids:
+        await asyncio.sleep(0.01)
+    ways: list[dict[str, object]] = [{"to": 2, "ids": [receiver.id]}, {"to": 2, "groups": [6]}, {"to": 0}]
+    for number in range(300):
+        await sender.send(str(number).encode(), manager="Greeting", **ways[number % 3])  # type: ignore[arg-type]
+    received = [int(bytes((await receiver.receive(5)).data)) for _ in range(300)]
+    assert received == list(range(300))
