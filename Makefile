@@ -21,6 +21,9 @@ endif
 # What a ROS installation needs besides its own path (yaml, numpy) is among the system's packages.
 VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)
 
+# Our own ROS interfaces: built once where ROS comes from PyPI, by colcon where it is installed.
+INTERFACES := $(if $(findstring ros,$(EXTRAS)),$(VENV)/.interfaces)
+
 .DEFAULT_GOAL := help
 .PHONY: help run install test lint format bench clean
 
@@ -30,7 +33,7 @@ help:
 run: install
 	@exec $(BIN)/macs up --demo $(ARGS)
 
-install: $(STAMP)
+install: $(STAMP) $(INTERFACES)
 
 # Installed again only when the dependencies may have changed: the package itself is linked, not copied.
 $(STAMP): pyproject.toml
@@ -44,6 +47,12 @@ $(STAMP): pyproject.toml
 	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off -e ".[$(EXTRAS)]" | \
 	  sed -u -n -e 's/^Collecting \([^ ]*\).*/  \1/p' -e 's/^\(Downloading\|Installing\|Building\)/  &/p'
 	@touch $(STAMP)
+
+# Without a compiler everything but `macs awareness` works, so its absence is said and ends nothing.
+$(VENV)/.interfaces: $(STAMP) $(wildcard interfaces/*/package.xml interfaces/*/msg/* interfaces/*/srv/*)
+	@echo "building the ROS interfaces in interfaces/ (a few seconds, once)"
+	@if $(BIN)/macs interfaces build interfaces/as2_ca_msgs --into build/interfaces --install >/dev/null; \
+	  then touch $@; else echo "macs awareness will not run until this is done: make install"; fi
 
 # A whole run that ran no ROS test proves too little, so it fails (tests/conftest.py); a chosen part may.
 test: install

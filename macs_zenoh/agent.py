@@ -189,7 +189,7 @@ class Agent:
                 self._inbox.append(message)
         self._arrived.set()
 
-    def _read(self, key: str, payload: bytes, *, by_group: bool) -> list[Message]:
+    def _read(self, key: str, payload: bytes | bytearray, *, by_group: bool) -> list[Message]:
         parsed = keyexpr.parse(key)
         if parsed is None:
             return []

@@ -197,19 +197,19 @@ WANTED = Key(
     payload="none",
 )
 NAMED = Key(
-    "macs/ca/to/{name}/{message_type}/{from_name}",
+    "macs/ca/to/{name}/{message_type}/by/{from_name}",
     publisher="the sender; a query where it wants to know that the message has arrived",
     subscriber="the named agent (also queryable)",
     payload="one message: envelope and data",
 )
 NAMED_ALL = Key(
-    "macs/ca/all/{message_type}/{from_name}",
+    "macs/ca/all/{message_type}/by/{from_name}",
     publisher="the sender",
     subscriber="every named agent that has this message type registered",
     payload="one message: envelope and data",
 )
 LAST = Key(
-    "macs/ca/last/{name}/{message_type}/{from_name}",
+    "macs/ca/last/{name}/{message_type}/by/{from_name}",
     publisher="who wants the named agent's last message of a type to all (query)",
     subscriber="the named agent (queryable)",
     payload="none; the reply is one message: envelope and data",

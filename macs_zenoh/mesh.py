@@ -47,8 +47,8 @@ class Traffic(Enum):
     __hash__ = object.__hash__  # Enum's own is a Python call, and each put needs it
 
 
-Sample = tuple[str, bytes]
-"""What a subscription receives: key and payload."""
+Sample = tuple[str, Payload]
+"""What a subscription receives: key and payload. Not to be changed: others may have the same payload."""
 
 OnBatch = Callable[[list[Sample]], None]
 Handler = Callable[[str, bytes], Awaitable[bytes]]
@@ -95,16 +95,30 @@ class _Arrivals:
         self._wake = wake
         self._queue: deque[tuple[OnBatch, Sample]] = deque()
         self._waiting = False
+        self._own = threading.local()
+
+    def put(self, publisher: zenoh.Publisher, payload: Payload) -> None:
+        """Publish. Zenoh calls our own subscriptions back within this, and they take the payload as it is."""
+        self._own.payload = payload
+        try:
+            publisher.put(payload)
+        except zenoh.ZError as error:  # the session is closed
+            log.debug("put: %s", error)
+        finally:
+            self._own.payload = None
 
     def receiver(self, on_batch: OnBatch) -> Callable[[zenoh.Sample], None]:
         """What Zenoh calls, in whatever thread, for each sample of one subscription."""
-        queue, limit = self._queue, self.LIMIT
+        queue, limit, own = self._queue, self.LIMIT, self._own
 
         def receive(sample: zenoh.Sample) -> None:
             if len(queue) >= limit and not self._has_room():
                 self._drops["loop_behind"] += 1
                 return
-            queue.append((on_batch, (str(sample.key_expr), sample.payload.to_bytes())))
+            payload = getattr(own, "payload", None)
+            if payload is None:
+                payload = sample.payload.to_bytes()
+            queue.append((on_batch, (str(sample.key_expr), payload)))
             if not self._waiting:
                 self._waiting = True
                 if threading.get_ident() == self._loop_thread:  # our own sample, inside `put`
@@ -158,7 +172,7 @@ class Mesh:
         self._publishers: dict[Traffic, OrderedDict[str, zenoh.Publisher]] = {kind: OrderedDict() for kind in Traffic}
         self._publishers_lock = threading.Lock()
         self._on_room: list[Callable[[], None]] = []
-        self._sender = _Sender(backlog_bytes, lambda: self._from_thread(self._room))
+        self._sender = _Sender(backlog_bytes, self._arrivals.put, lambda: self._from_thread(self._room))
         self._routers: set[str] = set()
         self._needs_router = settings.mode == "client"
         self.linked = not self._needs_router
@@ -259,7 +273,7 @@ class Mesh:
             self.drops["no_route"] += 1
         publisher = self._publishers[traffic].get(key) or self._declare(key, traffic)
         if traffic is not Traffic.CALL or (self._sender.idle and len(payload) <= self.LARGE_BYTES):
-            _put(publisher, payload)
+            self._arrivals.put(publisher, payload)
         elif not self._sender.put(publisher, payload):
             self.drops["backlog"] += 1
 
@@ -411,7 +425,10 @@ class Mesh:
 class _Sender:
     """A thread that puts what may take long, in order. It starts with the first such payload."""
 
-    def __init__(self, limit_bytes: int, on_room: Callable[[], None]) -> None:
+    def __init__(
+        self, limit_bytes: int, put: Callable[[zenoh.Publisher, Payload], None], on_room: Callable[[], None]
+    ) -> None:
+        self._put = put
         self.backlogged = False
         self._limit_bytes = limit_bytes
         self._on_room = on_room
@@ -456,7 +473,7 @@ class _Sender:
                         return
                     self._wake.wait()
                 publisher, payload = self._queue.popleft()
-            _put(publisher, payload)
+            self._put(publisher, payload)
             with self._wake:
                 self._bytes -= len(payload)
                 relieved = self.backlogged and self._bytes < self._limit_bytes // 8
@@ -464,13 +481,6 @@ class _Sender:
                     self.backlogged = False
             if relieved:
                 self._on_room()
-
-
-def _put(publisher: zenoh.Publisher, payload: Payload) -> None:
-    try:
-        publisher.put(payload)
-    except zenoh.ZError as error:  # the session is closed
-        log.debug("put: %s", error)
 
 
 def _problem(key: str, payload: bytes, timeout_s: float) -> MacsError:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from enum import IntEnum
+from enum import Enum, IntEnum
 from functools import cache, lru_cache
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar
 
@@ -47,6 +47,17 @@ class NodeType(IntEnum):
     """A ROS service: a node on the robot calls a service that runs on a headset."""
     ACTION = 5
     """A ROS action client: a headset gives goals to an action that runs on the robot (docs/actions.md)."""
+
+
+class ActionVerb(str, Enum):
+    """What a message of an action's interface node says, in place of a manager (docs/actions.md)."""
+
+    GOAL = "ActionGoal"
+    ACCEPTED = "ActionAccepted"
+    FEEDBACK = "ActionFeedback"
+    RESULT = "ActionResult"
+    CANCEL = "ActionCancel"
+    LIST = "ActionList"
 
 
 class Metadata(Struct, frozen=True, rename="camel", forbid_unknown_fields=True):

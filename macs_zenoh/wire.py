@@ -224,7 +224,7 @@ def parse_frame(data: bytes | bytearray, layout: Layout = MACS) -> Frame:
     return frame
 
 
-def parse_frames(data: bytes, layout: Layout = MACS, *, runs: bool = False) -> list[Frame]:
+def parse_frames(data: bytes | bytearray, layout: Layout = MACS, *, runs: bool = False) -> list[Frame]:
     """Take ``data`` as one or more whole frames back to back, check all of their sizes and return them, with ``runs``
     those that begin alike as one.
 
@@ -244,7 +244,7 @@ def parse_frames(data: bytes, layout: Layout = MACS, *, runs: bool = False) -> l
             raise BadSizes("frame", size, end - start)
         if runs and stop != end and not management_bytes:
             stop = _run_end(data, start, message_at, size, end)
-        frame = Frame(data[start:stop], layout, message_at, size)
+        frame = Frame(data[start:stop] if start or stop != end else data, layout, message_at, size)
         frame.check()
         frames.append(frame)
         if stop == end:
@@ -252,7 +252,7 @@ def parse_frames(data: bytes, layout: Layout = MACS, *, runs: bool = False) -> l
         start = stop
 
 
-def _run_end(data: bytes, start: int, message_at: int, size: int, end: int) -> int:
+def _run_end(data: bytes | bytearray, start: int, message_at: int, size: int, end: int) -> int:
     """Where the frames end that have header, metadata and all sizes of the frame at ``start`` in common."""
     head_bytes = message_at + MESSAGE_OVERHEAD
     if size < head_bytes:

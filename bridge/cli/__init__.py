@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 
-from bridge.cli import agent, gateway, headset, keys, ls, options, router, up
+from bridge.cli import agent, awareness, gateway, headset, interfaces, keys, ls, options, router, up
 from macs_zenoh.errors import ConfigError, MacsError, UsageError
 
 VERBS = {
@@ -21,8 +21,10 @@ VERBS = {
     "gateway": gateway,
     "agent": agent,
     "headset": headset,
+    "awareness": awareness,
     "ls": ls,
     "keys": keys,
+    "interfaces": interfaces,
 }
 
 DESCRIPTION = """\
@@ -41,9 +43,17 @@ examples:
 `macs VERB --help` explains one verb."""
 
 
+class _VerbsInOneColumn(argparse.RawDescriptionHelpFormatter):
+    """argparse forgets that verbs are indented, and breaks the line after each of the longest."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog)
+        self._action_max_length = max(map(len, VERBS)) + 4
+
+
 def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="macs", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="macs", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=_VerbsInOneColumn
     )
     parser.add_argument("--version", action="version", version=f"macs-zenoh {_version()}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True, title="verbs")

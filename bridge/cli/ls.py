@@ -14,18 +14,20 @@ import argparse
 import asyncio
 import json
 import sys
+from typing import Any
 
 from bridge.cli import options, running
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.directory import AgentInfo, Directory
 from macs_zenoh.errors import Unreachable
-from macs_zenoh.keyexpr import PRESENCE
+from macs_zenoh.keyexpr import NAME, PRESENCE
+from macs_zenoh.named import Named, Names
 
 SUMMARY = "who is online"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="for programs: a list of {type, id, group, zid}")
+    parser.add_argument("--json", action="store_true", help="for programs: a list of {type, id, group, zid, name}")
     parser.add_argument(
         "--timeout", type=float, default=3.0, metavar="S", help="how long to wait for a router (default: 3)"
     )
@@ -36,15 +38,18 @@ def run(args: argparse.Namespace) -> int:
     settings = options.settings(args).mesh
 
     async def show() -> int:
-        agents = await online(settings, timeout_s=args.timeout)
-        sys.stdout.write((_json(agents) if args.json else _table(agents)) + "\n")
+        agents, names = await online(settings, timeout_s=args.timeout)
+        sys.stdout.write((_json(agents, names) if args.json else _table(agents, names)) + "\n")
         return 0
 
     return running.until_stopped(show)
 
 
-async def online(settings: MeshSettings, *, timeout_s: float) -> list[AgentInfo]:
-    """Everybody on the mesh, seen by a session that joins nothing. Raises Unreachable without a router."""
+async def online(settings: MeshSettings, *, timeout_s: float) -> tuple[list[AgentInfo], list[Named]]:
+    """Everybody on the mesh, and the names by which some are reached, seen by a session that joins nothing.
+
+    Raises Unreachable without a router.
+    """
     from macs_zenoh.mesh import Mesh
 
     try:
@@ -53,19 +58,42 @@ async def online(settings: MeshSettings, *, timeout_s: float) -> list[AgentInfo]
         target = ", ".join(settings.routers) or "a router"
         raise Unreachable(target, f"no Zenoh router answered within {timeout_s:g} s") from None
     async with mesh:
-        directory = Directory()
+        directory, names = Directory(), Names()
         for key in await mesh.tokens(PRESENCE.every(), timeout_s=timeout_s):
             directory.token(key, True, 0.0)
-        return list(directory)
+        for key in await mesh.tokens(NAME.every(), timeout_s=timeout_s):
+            names.token(key, True)
+        return list(directory), list(names)
 
 
-def _json(agents: list[AgentInfo]) -> str:
-    return json.dumps([{"type": a.type_name, "id": a.id, "group": a.group, "zid": a.zid} for a in agents])
+def _rows(agents: list[AgentInfo], names: list[Named]) -> list[dict[str, Any]]:
+    """One row per agent with its name if it has one; a name whose agent is not online has a row of its own."""
+    online = {agent.key for agent in agents}
+    name_of = {(named.type, named.id): named.name for named in names}
+    rows = [
+        {"type": a.type_name, "id": a.id, "group": a.group, "zid": a.zid, "name": name_of.get(a.key, "")}
+        for a in agents
+    ]
+    return rows + [
+        {"type": named.type_name, "id": named.id, "group": 0, "zid": named.zid, "name": named.name}
+        for named in names
+        if (named.type, named.id) not in online
+    ]
 
 
-def _table(agents: list[AgentInfo]) -> str:
-    if not agents:
+def _json(agents: list[AgentInfo], names: list[Named]) -> str:
+    return json.dumps(_rows(agents, names))
+
+
+def _table(agents: list[AgentInfo], names: list[Named]) -> str:
+    rows = _rows(agents, names)
+    if not rows:
         return "nobody is online"
-    rows = [("TYPE", "ID", "GROUP", "SESSION")]
-    rows += [(a.type_name, str(a.id), str(a.group) if a.group else "-", a.zid) for a in agents]
-    return "\n".join(f"{kind:<8}{number:>6}{group:>7}  {zid}" for kind, number, group, zid in rows)
+    width = max(len("SESSION"), *(len(row["zid"]) for row in rows))
+    lines = [("TYPE", "ID", "GROUP", "SESSION", "NAME")]
+    lines += [
+        (row["type"], str(row["id"] or "-"), str(row["group"] or "-"), row["zid"], row["name"] or "-") for row in rows
+    ]
+    return "\n".join(
+        f"{kind:<8}{number:>6}{group:>7}  {zid:<{width}}  {name}" for kind, number, group, zid, name in lines
+    )

@@ -157,7 +157,7 @@ class Delivery:
             self._registrants[frame.management] = registrants
         return registrants
 
-    def _read(self, key: str, payload: bytes) -> list[tuple[Frame, Metadata]]:
+    def _read(self, key: str, payload: bytes | bytearray) -> list[tuple[Frame, Metadata]]:
         """The frames of a sample with their metadata; those that no agent must see are left out."""
         try:
             frames = parse_frames(payload, self._layout, runs=True)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import os
+import sys
+import zipfile
 from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,11 +19,26 @@ os.environ.pop("ROS_STATIC_PEERS", None)
 
 from ros_peer import Peer
 
+from bridge.interfaces import build
 from bridge.ros.session import RosSession
 
 _domains = itertools.cycle(range(1, 101))
 for _ in range(os.getpid() % 100):  # test runs at the same time begin at different domains
     next(_domains)
+
+
+@pytest.fixture(scope="session")
+def count_action(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """An action, built from its definition; the processes of a test find it as well. No action comes from PyPI."""
+    into = tmp_path_factory.mktemp("interfaces")
+    package = "macs_test_msgs"
+    with zipfile.ZipFile(build(Path(__file__).parent / package, into).wheel) as wheel:
+        wheel.extractall(into)
+    prefix = next(into.glob("*.data")) / "data"
+    sys.path.insert(0, str(into))
+    for variable, value in (("AMENT_PREFIX_PATH", str(prefix)), ("PYTHONPATH", str(into))):
+        os.environ[variable] = os.pathsep.join([value, *filter(None, [os.environ.get(variable)])])
+    return importlib.import_module(f"{package}.action").Count
 
 
 @pytest.fixture

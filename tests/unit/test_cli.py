@@ -29,7 +29,7 @@ def test_help_names_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
     assert ended.value.code == 0
     shown = capsys.readouterr().out
     for verb, module in VERBS.items():
-        assert f"    {verb:10}{module.SUMMARY}" in shown
+        assert f"    {verb:12}{module.SUMMARY}" in shown
     assert shown.count("\n  macs ") == 3
 
 

@@ -58,7 +58,7 @@ def test_the_settings_file_explains_every_setting() -> None:
     """config/macs.toml has every field of every section, commented out, with its default if there is one."""
     text = page("config/macs.toml")
     shown = config.parse(re.sub(r"^#(?=\w+ = )", "", text, flags=re.MULTILINE))
-    for section in ("mesh", "gateway", "robot"):
+    for section in ("mesh", "gateway", "robot", "awareness"):
         part = text.partition(f"\n[{section}]")[2].partition("\n[")[0]
         defaults = getattr(Settings(), section)
         assert set(re.findall(r"^#(\w+) = ", part, re.MULTILINE)) == set(defaults.__struct_fields__)

@@ -14,7 +14,7 @@ CORE = sorted((ROOT / "macs_zenoh").rglob("*.py"))
 BRIDGE = sorted((ROOT / "bridge").rglob("*.py"))
 
 WITH_ZENOH = {"mesh.py"}
-WITH_ASYNCIO = {"mesh.py", "agent.py"}
+WITH_ASYNCIO = {"mesh.py", "agent.py", "awareness.py"}
 NEEDED_FROM_OUTSIDE = {"msgspec", "zenoh", "tomli"}
 INPUT_OUTPUT = {
     "socket",

@@ -1,0 +1,233 @@
+"""For modules: register with the robot's gateway and exchange typed messages with other robots by name.
+
+::
+
+    client = GatewayClient(node)
+    client.register_module(String, "planning", "my_module", lambda message, sender: print(sender, message.data))
+    client.send(String(data="hello"), "planning", to="drone1")
+
+Nothing here blocks: it works on the node's own executor, whichever that is, and may be called from its callbacks.
+"""
+
+from __future__ import annotations
+
+import array
+import json
+import logging
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from as2_ca_msgs.msg import LocalGenericMessage
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.duration import Duration
+from rclpy.serialization import deserialize_message, serialize_message
+from std_msgs.msg import String
+
+from bridge.awareness.node import AGENTS_TOPIC, LATCHED, QOS, UNDELIVERED_TOPIC
+from bridge.awareness.registrar import LOOK_S, Entry, Registrar
+
+log = logging.getLogger("macs.awareness")
+
+OnMessage = Callable[[Any, str], None]
+OnUndelivered = Callable[[str, str, str], None]
+
+
+class Module:
+    """A registration made by `GatewayClient.register_module`."""
+
+    def __init__(self, kind: type[Any], callback: OnMessage) -> None:
+        self.kind = kind
+        self.callback = callback
+        self.entry: Entry
+        self.subscription: Any = None
+        self._answered = threading.Event()
+
+    @property
+    def topic(self) -> str:
+        """Where its messages come; empty until the gateway has answered, and when it has refused."""
+        return self.entry.topic
+
+    @property
+    def refused(self) -> bool:
+        """The gateway does not take this type: its name is not valid."""
+        return self.entry.refused
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for the gateway's answer; whether it was yes. Not in a thread in which the node's executor spins."""
+        return self._answered.wait(timeout_s) and not self.refused
+
+    def answered(self) -> None:
+        """The gateway has answered."""
+        self._answered.set()
+
+
+class GatewayClient:
+    """A module's connection to its robot's gateway. Names are relative to the node's namespace, as the gateway's are.
+
+    ``counters`` counts ``received``, ``sent``, ``bad_message`` (does not deserialize as its type) and ``unsent`` (no
+    gateway was there for too long).
+    """
+
+    HELD = 100
+    """Messages that wait for a gateway that is not there yet; the oldest go."""
+
+    def __init__(
+        self, node: Any, *, service: str = "register_module", out_topic: str = "gateway_out", qos: Any = QOS
+    ) -> None:
+        self.counters: Counter[str] = Counter()
+        self._node = node
+        self._qos = qos
+        self._lock = threading.RLock()
+        self._modules: list[Module] = []
+        self._held: deque[Any] = deque()
+        self._agents: dict[str, list[str]] = {}
+        self._on_undelivered: list[OnUndelivered] = []
+        self._registrar = Registrar(node, service)
+        # typed callbacks of one client never run at the same time, and never wait for the registrations
+        self._group = MutuallyExclusiveCallbackGroup()
+        self._out = node.create_publisher(LocalGenericMessage, out_topic, qos)
+        self._timer = node.create_timer(LOOK_S, self._flush, callback_group=self._registrar.group)
+        self._watching = [
+            self._subscribe(String, AGENTS_TOPIC, self._take_agents, LATCHED),
+            self._subscribe(LocalGenericMessage, UNDELIVERED_TOPIC, self._take_undelivered, qos),
+        ]
+
+    # -- receive -------------------------------------------------------------------------------------------------
+
+    def register_module(self, kind: type[Any], message_type: str, module_name: str, callback: OnMessage) -> Module:
+        """Call ``callback(message, sender)`` for messages of a type, each an instance of ``kind``. Returns at once.
+
+        The module is registered as soon as there is a gateway, and again when the gateway was restarted.
+
+        Args:
+            kind: the ROS message class that the data is, as ``std_msgs.msg.String``.
+            message_type: the word by which robots know this kind of message.
+            module_name: for the gateway's log.
+            callback: runs in the node's executor.
+        """
+        module = Module(kind, callback)
+        module.entry = Entry(message_type, module_name, lambda topic: self._registered(module, topic))
+        with self._lock:
+            self._modules.append(module)
+        self._registrar.add(module.entry)
+        return module
+
+    def get_subscriber_count(self) -> int:
+        """How many registrations have a subscription now."""
+        with self._lock:
+            return sum(module.subscription is not None for module in self._modules)
+
+    def clear(self) -> None:
+        """Drop all registrations and their subscriptions."""
+        with self._lock:
+            modules, self._modules = self._modules, []
+        for module in modules:
+            self._registrar.forget(module.entry)
+            self._unsubscribe(module)
+
+    def close(self) -> None:
+        """Drop everything that this client made on the node."""
+        self.clear()
+        self._registrar.close()
+        self._node.destroy_timer(self._timer)
+        for subscription in self._watching:
+            self._node.destroy_subscription(subscription)
+        self._node.destroy_publisher(self._out)
+
+    def _registered(self, module: Module, topic: str) -> None:
+        with self._lock:
+            if module in self._modules and topic and topic != module.topic:
+                self._unsubscribe(module)
+                module.subscription = self._subscribe(
+                    LocalGenericMessage, topic, lambda message: self._take(module, message), self._qos
+                )
+        module.entry.topic = topic
+        module.answered()
+
+    def _take(self, module: Module, message: Any) -> None:
+        try:
+            typed = deserialize_message(bytes(message.data), module.kind)
+        except Exception as error:  # noqa: BLE001 - whatever the middleware raises: the data is not ours
+            self.counters["bad_message"] += 1
+            log.warning(
+                "%r from %s is no %s: %s",
+                message.type,
+                message.agent,
+                module.kind.__name__,
+                str(error).splitlines()[0],
+            )
+            return
+        self.counters["received"] += 1
+        module.callback(typed, message.agent)
+
+    def _subscribe(self, kind: type[Any], topic: str, callback: Any, qos: Any) -> Any:
+        return self._node.create_subscription(kind, topic, callback, qos, callback_group=self._group)
+
+    def _unsubscribe(self, module: Module) -> None:
+        if module.subscription is not None:
+            self._node.destroy_subscription(module.subscription)
+            module.subscription = None
+
+    # -- send ----------------------------------------------------------------------------------------------------
+
+    def send(self, message: Any, message_type: str, *, to: str | Iterable[str] = "") -> None:
+        """Send a ROS message to one robot, to several, or with ``to`` left out to all others. Returns at once.
+
+        While there is no gateway, the last messages wait for it.
+        """
+        self.send_data(bytes(serialize_message(message)), message_type, to=to)
+
+    def send_data(self, data: bytes, message_type: str, *, to: str | Iterable[str] = "") -> None:
+        """The same for data that is serialized already, or is none of ROS's."""
+        for agent in [to] if isinstance(to, str) else list(to):
+            wrapped = LocalGenericMessage(agent=agent, type=message_type, data=array.array("B", data))
+            with self._lock:
+                self._held.append(wrapped)
+                if len(self._held) > self.HELD:
+                    self._held.popleft()
+                    self.counters["unsent"] += 1
+        self._flush()
+
+    def flush(self, timeout_s: float = 5.0) -> bool:
+        """Wait until the gateway has everything that was sent: for programs that end then. Whether it has."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._flush()
+            if not self._held or time.monotonic() > deadline:
+                break
+            time.sleep(0.01)
+        left = Duration(seconds=max(0.0, deadline - time.monotonic()))
+        return not self._held and bool(self._out.wait_for_all_acked(left))
+
+    def _flush(self) -> None:
+        with self._lock:
+            while self._held and self._out.get_subscription_count():
+                self._out.publish(self._held.popleft())
+                self.counters["sent"] += 1
+
+    # -- who is there --------------------------------------------------------------------------------------------
+
+    def reachable(self, message_type: str | None = None) -> list[str]:
+        """The other robots on the mesh by name, or those of them that take a message type."""
+        with self._lock:
+            return sorted(n for n, types in self._agents.items() if message_type is None or message_type in types)
+
+    def on_undelivered(self, callback: OnUndelivered) -> None:
+        """Call ``callback(agent, message_type, why)`` for messages of this robot that were not delivered.
+
+        ``why`` is a text as ``no such agent`` or ``not registered``.
+        """
+        self._on_undelivered.append(callback)
+
+    def _take_agents(self, message: Any) -> None:
+        agents = {name: list(agent["takes"]) for name, agent in json.loads(message.data).items()}
+        with self._lock:
+            self._agents = agents
+
+    def _take_undelivered(self, message: Any) -> None:
+        why = bytes(message.data).decode(errors="replace")
+        for callback in self._on_undelivered:
+            callback(message.agent, message.type, why)

@@ -1,0 +1,55 @@
+"""Build a ROS interface package (.msg, .srv, .action) for a ROS that was installed with pip.
+
+PATH is an ordinary interface package: package.xml, and definitions in msg/, srv/ and action/. The
+result is a wheel for this Python. It needs g++ and Python's headers, and nothing from the network.
+With a ROS installation, build the same folder with colcon instead.
+
+examples:
+  macs interfaces build interfaces/as2_ca_msgs --install
+  macs interfaces build my_msgs --into dist && pip install --no-deps dist/my_msgs-*.whl
+  macs interfaces build my_msgs --json | jq .hashes"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from macs_zenoh.errors import Unreachable
+
+SUMMARY = "build ROS interface packages where ROS comes from pip"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("action", choices=["build"], help="what to do")
+    parser.add_argument("path", metavar="PATH", type=Path, help="the package's folder")
+    parser.add_argument("--into", metavar="DIR", type=Path, default=Path("dist"), help="for the wheel (default: dist)")
+    parser.add_argument("--install", action="store_true", help="install the wheel into this Python as well")
+    parser.add_argument("--json", action="store_true", help="for programs: wheel and type hashes")
+
+
+def run(args: argparse.Namespace) -> int:
+    from bridge.interfaces import build
+
+    built = build(args.path, args.into)
+    if args.install:
+        _install(built.wheel)
+    if args.json:
+        sys.stdout.write(json.dumps({"wheel": str(built.wheel), "hashes": built.hashes}) + "\n")
+        return 0
+    width = max(map(len, built.hashes))
+    lines = [f"{name:{width}}  {value}" for name, value in sorted(built.hashes.items())]
+    sys.stdout.write("\n".join([*lines, str(built.wheel)]) + "\n")
+    return 0
+
+
+def _install(wheel: Path) -> None:
+    """Put it into this environment, over an earlier build; dependencies are there, or it could not have been built."""
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index"]
+    result = subprocess.run(  # noqa: S603 - pip of this Python
+        [*command, "--no-deps", "--force-reinstall", str(wheel)], capture_output=True, text=True, check=False
+    )
+    if result.returncode:
+        raise Unreachable("this Python's packages", (result.stderr.strip().splitlines() or ["pip failed"])[-1])
