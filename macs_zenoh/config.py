@@ -124,11 +124,11 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Longest such pause; each is twice the one before."""
     block_limit_ms: Annotated[int, Meta(ge=1, le=60_000)] = 500
     """How long a blocking put may wait for a stuck link before that link is closed (Zenoh: 5 s for everyone)."""
-    drop_wait_ms: Millis = 1
+    drop_wait_ms: Millis = 20
     """How long a droppable message waits for room before it is dropped."""
     fragment_wait_ms: Millis = 50
     """The same for a message of several fragments, for all of them together: without it, big messages vanish."""
-    tx_queue_batches: Annotated[int, Meta(ge=1, le=16)] = 2
+    tx_queue_batches: Annotated[int, Meta(ge=1, le=16)] = 8
     """Batches queued per priority and link. Above 16 Zenoh panics at the first link."""
     shared_memory: bool = False
     """Implicit shared memory bypasses size limits and can drop silently, so it is off (Zenoh: on)."""

@@ -83,6 +83,9 @@ class _Arrivals:
     """
 
     LIMIT = 16_384
+    LARGE_BYTES = 16 << 10
+    LIMIT_BYTES = 128 << 20
+    """Of payloads that are large; the others are bounded by their number."""
     BATCH = 512
     PATIENCE_S = 0.1
 
@@ -95,6 +98,8 @@ class _Arrivals:
         self._wake = wake
         self._queue: deque[tuple[OnBatch, Sample]] = deque()
         self._waiting = False
+        self._large_bytes = 0
+        self._large_lock = threading.Lock()
         self._own = threading.local()
 
     def put(self, publisher: zenoh.Publisher, payload: Payload) -> None:
@@ -109,7 +114,7 @@ class _Arrivals:
 
     def receiver(self, on_batch: OnBatch) -> Callable[[zenoh.Sample], None]:
         """What Zenoh calls, in whatever thread, for each sample of one subscription."""
-        queue, limit, own = self._queue, self.LIMIT, self._own
+        queue, limit, large, own = self._queue, self.LIMIT, self.LARGE_BYTES, self._own
 
         def receive(sample: zenoh.Sample) -> None:
             if len(queue) >= limit and not self._has_room():
@@ -118,6 +123,9 @@ class _Arrivals:
             payload = getattr(own, "payload", None)
             if payload is None:
                 payload = sample.payload.to_bytes()
+            if len(payload) > large and not self._has_room_for(len(payload)):
+                self._drops["loop_behind"] += 1
+                return
             queue.append((on_batch, (str(sample.key_expr), payload)))
             if not self._waiting:
                 self._waiting = True
@@ -135,6 +143,10 @@ class _Arrivals:
         if queue and not self._waiting:
             self._waiting = True
             self._loop.call_soon(self._deliver)
+        freed = sum(len(payload) for _, (_, payload) in arrived if len(payload) > self.LARGE_BYTES)
+        if freed:
+            with self._large_lock:
+                self._large_bytes -= freed
         for on_batch, group in itertools.groupby(arrived, key=operator.itemgetter(0)):
             try:
                 on_batch([sample for _, sample in group])
@@ -142,11 +154,21 @@ class _Arrivals:
                 log.exception("handling samples failed")  # ours to mend; other subscriptions get theirs
 
     def _has_room(self) -> bool:
-        if threading.get_ident() == self._loop_thread:
-            return False  # nobody would make room meanwhile
+        return self._patiently(lambda: len(self._queue) < self.LIMIT)
+
+    def _has_room_for(self, size: int) -> bool:
+        """Take room for a large payload."""
+        if not self._patiently(lambda: self._large_bytes == 0 or self._large_bytes + size <= self.LIMIT_BYTES):
+            return False
+        with self._large_lock:
+            self._large_bytes += size
+        return True
+
+    def _patiently(self, there_is_room: Callable[[], bool]) -> bool:
+        """Wait a moment for room, unless this is the loop's own thread, which would have to make it."""
         deadline = time.monotonic() + self.PATIENCE_S
-        while len(self._queue) >= self.LIMIT:
-            if time.monotonic() > deadline:
+        while not there_is_room():
+            if threading.get_ident() == self._loop_thread or time.monotonic() > deadline:
                 return False
             time.sleep(0.001)
         return True

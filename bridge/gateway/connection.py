@@ -60,6 +60,7 @@ class Connection(asyncio.BufferedProtocol):
         self._stall_s = stall_s
         self._transport: asyncio.Transport
         self._ready: list[Chunk] = []
+        self._ready_bytes = 0
         self._paused_at: float | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._complained: set[str] = set()
@@ -156,31 +157,37 @@ class Connection(asyncio.BufferedProtocol):
     # -- out -----------------------------------------------------------------------------------------------------
 
     def send_call(self, message: Chunk) -> None:
-        """Send in order; kept while the agent does not read, disconnected when too much waits."""
+        """Send in order. What waits is bounded: beyond that the newest is dropped and counted, because an existing
+        headset that is disconnected never comes back; one that does not read at all is disconnected in its time."""
         self.send_calls([message])
 
     def send_calls(self, messages: Sequence[Chunk]) -> None:
-        """The same for several."""
+        """The same for several, of one size."""
         if self._paused_at is None:
-            if not self._ready:
-                self.owner.dirty(self)
-            self._ready += messages
+            self._gather(messages)
             return
         for message in messages:
             if not self._outbox.put_call(message):
-                self.close(f"it does not read: {self._outbox.bytes} bytes are waiting")
-                return
+                self._warn_once("outbox_full", f"it reads too slowly: {self._outbox.bytes} bytes are waiting")
         self.congested = self._outbox.bytes > self._outbox.limit_bytes // 4
 
-    def send_stream(self, node: str, message: Chunk) -> None:
+    def send_stream(self, node: str, messages: Sequence[Chunk]) -> None:
         """Send topic data of a node; the registration's buffer size bounds what waits."""
         if self._paused_at is None:
-            if not self._ready:
-                self.owner.dirty(self)
-            self._ready.append(message)
+            self._gather(messages)
             return
         depth, drop_new = self.owner.stream_depth(self, node)
-        self._outbox.put_stream(node, message, depth=depth, drop_new=drop_new)
+        for message in messages:
+            self._outbox.put_stream(node, message, depth=depth, drop_new=drop_new)
+
+    def _gather(self, messages: Sequence[Chunk]) -> None:
+        """Keep for the flush at the end of the batch, but no more than the transport may hold."""
+        if not self._ready:
+            self.owner.dirty(self)
+        self._ready += messages
+        self._ready_bytes += len(messages) * len(messages[0])
+        if self._ready_bytes > WRITE_BUFFER_BYTES:
+            self.flush()
 
     def registered(self, node_name: str, node_type: int) -> None:
         """The agent has an interface node of this name and type."""
@@ -212,7 +219,7 @@ class Connection(asyncio.BufferedProtocol):
     def flush(self) -> None:
         """Write what was sent since the last flush, in one go."""
         if self._ready:
-            ready, self._ready = self._ready, []
+            ready, self._ready, self._ready_bytes = self._ready, [], 0
             self._write(ready)
 
     def _write(self, chunks: list[Chunk]) -> None:

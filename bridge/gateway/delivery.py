@@ -53,8 +53,8 @@ class Delivery:
                 continue
             for frame, metadata in self._read(key, payload):
                 self._send(connection, frame, metadata)
-            if connection.congested:
-                self._hold_sender(key, connection)
+            if connection.congested and (fields := UNICAST.parse(key)) is not None:
+                self._hold_sender((fields["from_type"], fields["from_id"]), [connection])
         self.flush()
 
     def group(self, batch: list[Sample]) -> None:
@@ -70,6 +70,7 @@ class Delivery:
                 for connection in members:
                     if takes_group_copy(header, connection.agent_id, sender, connection.peer.agent_type):
                         self._send(connection, frame, metadata)
+            self._hold_sender(sender, members)
         self.flush()
 
     def broadcast(self, batch: list[Sample]) -> None:
@@ -83,6 +84,7 @@ class Delivery:
             for frame, metadata in self._read(key, payload):
                 for connection in others:
                     self._send(connection, frame, metadata)
+            self._hold_sender(sender, others)
         self.flush()
 
     def stream(self, batch: list[Sample]) -> None:
@@ -92,8 +94,7 @@ class Delivery:
                 for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
                     connection = self._agents.find(*registrant)
                     if connection is not None and self._may_have(connection, frame, metadata):
-                        for message in frame.messages:
-                            connection.send_stream(metadata.node_name, message)
+                        connection.send_stream(metadata.node_name, frame.messages)
         self.flush()
 
     def dirty(self, connection: Connection) -> None:
@@ -136,12 +137,11 @@ class Delivery:
         self._targets[key] = connection
         return connection
 
-    def _hold_sender(self, key: str, receiver: Connection) -> None:
+    def _hold_sender(self, sender: tuple[object, object], receivers: list[Connection]) -> None:
         """Slow down a sender on this gateway. Those elsewhere are slowed by nobody: the outbox's limit decides."""
-        fields = UNICAST.parse(key)
-        sender = self._agents.find(fields["from_type"], fields["from_id"]) if fields else None
-        if sender is not None:
-            receiver.brake.hold(sender)
+        for receiver in receivers:
+            if receiver.congested and (connection := self._agents.find(*sender)) is not None:
+                receiver.brake.hold(connection)
 
     def _read_registrants(self, key: str, frame: Frame) -> list[tuple[int, int]]:
         """(type, id) of each registrant. The list changes only with registrations, so each is read once."""

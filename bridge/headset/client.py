@@ -32,6 +32,7 @@ from macs_zenoh.messages import BROADCAST, ROS, Metadata, NodeType, OnlineReply,
 from macs_zenoh.wire import MAX_FRAME_BYTES, split_message
 
 from . import frames
+from .actions import ActionClient
 from .connection import Connection
 from .frames import DEFAULT_BUFFER_SIZE, NodeSpec
 from .mailbox import Mailbox
@@ -101,6 +102,7 @@ class Headset:
         self._welcome_request = 0
         self._next_request = 0
         self._open: dict[int, asyncio.Future[bytes]] = {}
+        self._asked: dict[tuple[int, int], asyncio.Future[bytes]] = {}
         self._reading = asyncio.Event()
         self._reading.set()
         self._ended = asyncio.Event()
@@ -254,15 +256,28 @@ class Headset:
         node = await self.advertise(topic, data_type, agents=agents, groups=groups)
         await node.publish(cdr, agents=agents, groups=groups)
 
-    async def call(self, service: str, data_type: str, agent: int, request: bytes, *, timeout_s: float = 5.0) -> bytes:
-        """Call a service that runs on a robot; the response is CDR. Raises CallTimeout or Unreachable."""
+    async def call(
+        self,
+        service: str,
+        data_type: str,
+        agent: int,
+        request: bytes,
+        *,
+        timeout_s: float = 5.0,
+        failures: bool = False,
+    ) -> bytes:
+        """Call a service that runs on a robot; the response is CDR.
+
+        With ``failures`` the robot is asked to tell why a call failed, which the C# program does not do. Raises
+        CallTimeout; Unreachable also when the robot has no such service, or it does not answer; Refused.
+        """
         node = self._nodes.get((NodeType.CLIENT, node_name(service)))
         if not isinstance(node, ServiceClient):
             # the C# program asks for dropNew with both kinds of services
             node = ServiceClient(self, NodeSpec(NodeType.CLIENT, service, data_type, drop_new=True))
             self._add(node)
         await node.register(agents=(agent,))
-        return await node.call(agent, request, timeout_s)
+        return await node.call(agent, request, timeout_s, failures=failures)
 
     async def serve(
         self,
@@ -276,6 +291,23 @@ class Headset:
         """Run a service for ROS nodes on these robots. ``handler`` takes a request and gives the response's CDR."""
         node = Service(self, NodeSpec(NodeType.SERVICE, service, data_type, drop_new=True), handler)
         self._add(node)
+        await node.register(agents=agents, groups=groups)
+        return node
+
+    async def action(
+        self,
+        action: str,
+        data_type: str,
+        *,
+        agents: Collection[int] = (),
+        groups: Collection[int] = (),
+        buffer_size: int = DEFAULT_BUFFER_SIZE,
+    ) -> ActionClient:
+        """Be able to give goals to an action that runs on these robots; ``buffer_size`` is for feedback."""
+        node = self._nodes.get((NodeType.ACTION, node_name(action)))
+        if not isinstance(node, ActionClient):
+            node = ActionClient(self, NodeSpec(NodeType.ACTION, action, data_type, buffer_size))
+            self._add(node)
         await node.register(agents=agents, groups=groups)
         return node
 
@@ -298,6 +330,24 @@ class Headset:
                 self.id, data, to_type=to, ids=ids, groups=groups, manager=manager, request_id=request_id
             )
         )
+
+    async def ask(self, robot: int, manager: str, data: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        """Ask a robot something that is no interface node, and return its answer's data (see docs/robot.md).
+
+        ``manager`` says what: ``FunctionalityGetter``, ``RobotStatus``, ``RobotControl``. Raises CallTimeout, also
+        when the robot is an existing program, or Unreachable.
+        """
+        request_id = self._next_request
+        self._next_request = (request_id + 1) % REQUEST_IDS
+        answer = asyncio.get_running_loop().create_future()
+        self._asked[robot, request_id] = answer
+        try:
+            await self.send(data, to=ROS, ids=(robot,), manager=manager, request_id=request_id)
+            return await asyncio.wait_for(answer, timeout_s)
+        except asyncio.TimeoutError as error:
+            raise CallTimeout(f"{manager} of robot {robot}", timeout_s) from error
+        finally:
+            del self._asked[robot, request_id]
 
     async def send_frame(self, frame: bytes) -> None:
         """Send bytes as they are, also what no headset would say. Raises Unreachable without a connection."""
@@ -446,6 +496,8 @@ class Headset:
             if node.agents or node.groups:
                 agents, groups = sorted(node.agents), sorted(node.groups)
                 await self.send_frame(frames.registration(self.id, node.spec, agents, groups))
+            if isinstance(node, ActionClient):
+                await node.ask_again()
 
     async def _read_to_end(self) -> str:
         connection = self._connection
@@ -491,9 +543,13 @@ class Headset:
         return node.receive(message)
 
     def _take_answer(self, message: Incoming) -> bool:
-        """Whether this answers an open request to the router."""
-        answer = self._open.get(message.metadata.request_id)
-        if answer is None or answer.done() or message.sender_type is not None:
+        """Whether this answers an open request to the router, or to a robot."""
+        request_id = message.metadata.request_id
+        if message.sender_type is None:
+            answer = self._open.get(request_id)
+        else:
+            answer = self._asked.get((message.sender_id or 0, request_id)) if message.sender_type == ROS else None
+        if answer is None or answer.done():
             return False
         answer.set_result(message.data)
         return True
@@ -531,7 +587,7 @@ class Headset:
         node.end()
 
     def _fail_open(self, error: Unreachable) -> None:
-        fail_all(self._open.values(), error)
+        fail_all([*self._open.values(), *self._asked.values()], error)
         for node in self.nodes:
             if isinstance(node, ServiceClient):
                 node.fail(error)

@@ -114,13 +114,20 @@ def node_data(
     groups: Collection[int] = (),
     *,
     request_id: int = 0,
+    manager: str = "",
 ) -> bytes:
     """Data of an interface node to robots: a topic's message (type 2), a request (3) or a response (4), as CDR.
 
+    ``manager`` is empty in what the C# program sends; see `macs_zenoh.messages.CallFailure` and docs/actions.md.
     Raises TooManyDestinations above 10 agents or 10 groups.
     """
     metadata = _metadata(
-        agent_id, request_id=request_id, node_type=node.kind, name=node.name, data_type=node.data_type
+        agent_id,
+        manager=manager,
+        request_id=request_id,
+        node_type=node.kind,
+        name=node.name,
+        data_type=node.data_type,
     )
     return encode_frame(ROS, tuple(agents), tuple(groups), message=encode_message(metadata, cdr))
 

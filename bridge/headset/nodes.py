@@ -10,8 +10,8 @@ from collections.abc import Awaitable, Callable, Collection
 from dataclasses import dataclass
 from typing import Protocol
 
-from macs_zenoh.errors import CallTimeout, Unreachable, UsageError
-from macs_zenoh.messages import Metadata
+from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError
+from macs_zenoh.messages import CallFailure, Metadata, decode_data, encode_data
 
 from . import frames
 from .frames import NodeSpec
@@ -50,6 +50,8 @@ class ServiceRequest:
     robot: int
     request_id: int
     data: bytes
+    takes_failures: bool = False
+    """Whether the robot understands a `CallFailure`: raise Refused in the handler to send one."""
 
 
 ServiceHandler = Callable[[ServiceRequest], "bytes | Awaitable[bytes]"]
@@ -164,18 +166,24 @@ class Publisher(Node):
 
 
 class ServiceClient(Node):
-    """A service that runs on robots and that this headset calls."""
+    """A service that runs on robots and that this headset calls.
+
+    With ``failures`` each request names `CallFailure` as its manager, so a robot that knows it tells why a call
+    failed; other robots stay silent, and the time runs out.
+    """
 
     def __init__(self, owner: Owner, spec: NodeSpec) -> None:
         super().__init__(owner, spec)
         self._next_request = 0  # 0 is a real request id
         self._open: dict[tuple[int, int], asyncio.Future[bytes]] = {}
 
-    async def call(self, agent: int, request: bytes, timeout_s: float) -> bytes:
-        """Raises CallTimeout, or Unreachable when the connection ends first."""
+    async def call(self, agent: int, request: bytes, timeout_s: float, *, failures: bool = False) -> bytes:
+        """Raises Refused when the robot has a reason, CallTimeout, Unreachable when the connection ends first or the
+        robot has no such service."""
         request_id = self._next_request
         self._next_request = (request_id + 1) % REQUEST_IDS
-        frame = frames.node_data(self._owner.id, self.spec, request, (agent,), request_id=request_id)
+        manager = CallFailure.manager if failures else ""
+        frame = frames.node_data(self._owner.id, self.spec, request, (agent,), request_id=request_id, manager=manager)
         answer = asyncio.get_running_loop().create_future()
         self._open[agent, request_id] = answer
         try:
@@ -194,8 +202,17 @@ class ServiceClient(Node):
         answer = self._open.get((message.sender_id or 0, message.metadata.request_id))
         if answer is None or answer.done():
             log.info("an answer of %s came too late", self.spec.tos_name)
+        elif message.metadata.message_manager == CallFailure.manager and message.data[:1] == b"{":
+            # a robot that knows no failures may copy the manager of the request; CDR never begins with a brace
+            answer.set_exception(self._problem(message))
         else:
             answer.set_result(message.data)
+
+    def _problem(self, message: Incoming) -> MacsError:
+        failure = decode_data(CallFailure, message.data)
+        if failure.kind in ("absent", "timeout"):
+            return Unreachable(f"service {self.spec.tos_name} of robot {message.sender_id}", failure.reason)
+        return Refused(failure.reason)
 
 
 class Service(Node):
@@ -212,7 +229,9 @@ class Service(Node):
             self.dropped += 1
             log.warning("%s: %d requests open, one more dropped", self.spec.tos_name, len(self._open))
             return
-        request = ServiceRequest(message.sender_id or 0, message.metadata.request_id, message.data)
+        metadata = message.metadata
+        takes_failures = metadata.message_manager == CallFailure.manager
+        request = ServiceRequest(message.sender_id or 0, metadata.request_id, message.data, takes_failures)
         task = asyncio.get_running_loop().create_task(self._answer(request))
         self._open.add(task)
         task.add_done_callback(self._open.discard)
@@ -221,13 +240,25 @@ class Service(Node):
         try:
             answer = self._handler(request)
             response = await answer if inspect.isawaitable(answer) else answer
-        except Exception:  # the wire has no word for a failed service: the caller times out
+        except Refused as refusal:
+            await self._fail(request, refusal.reason)
+        except Exception:
             log.exception("the handler of %s failed", self.spec.tos_name)
-            return
+            await self._fail(request, "internal error")
+        else:
+            await self._send(request, response)
+
+    async def _fail(self, request: ServiceRequest, reason: str) -> None:
+        """Tell why there is no answer; a robot that does not know failures waits for its own deadline."""
+        if request.takes_failures:
+            await self._send(request, encode_data(CallFailure("failed", reason)), CallFailure.manager)
+
+    async def _send(self, request: ServiceRequest, data: bytes, manager: str = "") -> None:
+        frame = frames.node_data(
+            self._owner.id, self.spec, data, (request.robot,), request_id=request.request_id, manager=manager
+        )
         with contextlib.suppress(Unreachable):
-            await self._owner.send_frame(
-                frames.node_data(self._owner.id, self.spec, response, (request.robot,), request_id=request.request_id)
-            )
+            await self._owner.send_frame(frame)
 
     def end(self) -> None:
         for task in self._open:

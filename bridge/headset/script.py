@@ -200,7 +200,7 @@ class Session:
 
         async def work() -> int:
             began = time.monotonic()
-            cdr = await self.headset.call(args.topic, args.type, agent, request, timeout_s=args.timeout)
+            cdr = await self.headset.call(args.topic, args.type, agent, request, timeout_s=args.timeout, failures=True)
             took_ms = round((time.monotonic() - began) * 1000, 2)
             response = self.types.deserialize(response_of(args.type), cdr, max_bytes=MAX_BYTES)
             self._emit({"service": args.topic, "from": agent, "response": response, "ms": took_ms})

@@ -1,7 +1,8 @@
 """The robot agent: an agent of type ``ros`` on the mesh that serves registrations of interface nodes.
 
 Verbs: ``add_node`` (data: AddNode) and ``remove_node`` (RemoveNode), answered with nothing or a refusal that says why;
-``offers`` (no data), answered with Functionality.
+``offers`` (no data), answered with `graph.Offered`; ``status`` (no data), ``control`` (`requests.ControlRequest`) and
+``stop`` (``true`` or ``false``), answered with JSON. See docs/robot.md.
 """
 
 from __future__ import annotations
@@ -12,18 +13,29 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 
 import macs_zenoh
-from bridge.ros import graph
-from bridge.ros.nodes import InterfaceNodes, Registrant, Robot
+from bridge.ros import parameters
+from bridge.ros.graph import Offers
+from bridge.ros.interface import Registrant, Robot
+from bridge.ros.nodes import InterfaceNodes
+from bridge.ros.requests import STATUS, ControlReply, ControlRequest, control, status
+from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from macs_zenoh.agent import Agent, Call, Message
 from macs_zenoh.config import RobotSettings, Settings
 from macs_zenoh.directory import AgentInfo
-from macs_zenoh.messages import AddNode, RemoveNode, decode_data, encode_data
+from macs_zenoh.errors import MacsError, Refused, WireError
+from macs_zenoh.keyexpr import type_name, type_number
+from macs_zenoh.messages import AddNode, FunctionalityRequest, Metadata, RemoveNode, decode_data, encode_data
 from macs_zenoh.wire import Layout
 
 log = logging.getLogger("macs.ros")
 
 NODE_NAME = "rosagent"
+
+REQUESTS = frozenset({FunctionalityRequest.manager, STATUS, ControlRequest.manager})
+"""Managers of plain messages that a robot answers."""
+STOP_MESSAGES_S = 0.1
+"""How long ROS nodes get, at the end, to take the last messages: what a writer that ends has sent is lost unread."""
 
 
 class RobotAgent:
@@ -32,29 +44,85 @@ class RobotAgent:
     def __init__(self, agent: Agent, session: RosSession, settings: RobotSettings) -> None:
         self.agent = agent
         self.session = session
-        layout = Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots)
-        self.nodes = InterfaceNodes(
-            Robot(session, agent.id, agent.publish_stream, layout), max_nodes=settings.max_nodes
+        robot = Robot(
+            session,
+            agent.id,
+            agent.publish_stream,
+            Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots),
+            send=self._send,
+            rules=Rules(settings),
+            group_of=self._group_of,
         )
-        agent.serve("add_node", self._add_node)
-        agent.serve("remove_node", self._remove_node)
-        agent.serve("offers", self._offers)
-        agent.on_presence(self._presence)
+        self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
+        self.offers = Offers(robot, agent.publish_stream)
+        self._answering: set[asyncio.Task[None]] = set()
+
+    async def start(self) -> None:
+        """Serve from now on."""
+        settings = self.nodes.robot.rules.settings
+        if settings.stop_topic:
+            try:
+                await self.nodes.open_stop(settings.stop_topic)
+            except Refused as refusal:
+                log.error("there is no emergency stop: %s", refusal.reason)
+        self.agent.on_presence(self._presence)
+        self.agent.mesh.on_link(self._link)
+        for verb, handler in (
+            ("add_node", self._add_node),
+            ("remove_node", self._remove_node),
+            ("offers", self._offers),
+            ("status", self._status),
+            ("control", self._control),
+            ("stop", self._stop),
+        ):
+            self.agent.serve(verb, handler)
 
     async def work(self) -> None:
         """Pass messages to their nodes until the agent leaves the mesh."""
         async for message in self.agent:
             try:
-                self._take(message)
+                if message.metadata.node_name:
+                    self.nodes.deliver(message)
+                elif message.metadata.message_manager in REQUESTS:
+                    # an answer may take a while; an emergency stop behind it must not wait
+                    self._answering.add(answer := asyncio.create_task(self._answer(message)))
+                    answer.add_done_callback(self._answering.discard)
             except Exception:
                 # a message that hits a fault of ours must not make the robot deaf for all that follow
                 log.exception("a message from %s/%d failed", message.sender_type, message.sender_id)
 
-    def _take(self, message: Message) -> None:
-        if message.metadata.node_name:
-            self.nodes.deliver(message)
+    def close(self) -> None:
+        """End everything that is open."""
+        self.offers.close()
+        for answer in self._answering:
+            answer.cancel()
+        self.nodes.close()
+
+    # -- plain requests ------------------------------------------------------------------------------------------
+
+    async def _answer(self, message: Message) -> None:
+        """Answer a message that names no interface node."""
+        sender, manager = Registrant.of(message), message.metadata.message_manager
+        if manager == FunctionalityRequest.manager:
+            data = encode_data(await self.offers.now())
+            self.offers.follow(sender, message)
+        elif manager == STATUS:
+            data = self._state()
         else:
-            log.debug("a message for %r, which is not for robots", message.metadata.message_manager[:80])
+            data = encode_data(self._controlled(sender, message.data))
+        self._send(sender, Metadata(request_id=message.metadata.request_id), data)
+
+    def _state(self) -> bytes:
+        return status(self.nodes, self.session.full_name, self.agent.drops + self.agent.mesh.drops)
+
+    def _controlled(self, sender: Registrant, data: bytes) -> ControlReply:
+        try:
+            request = decode_data(ControlRequest, data)
+            return control(self.nodes, sender, request, asyncio.get_running_loop().time())
+        except (Refused, WireError) as error:
+            return ControlReply(False, reason=str(error))
+
+    # -- verbs ---------------------------------------------------------------------------------------------------
 
     async def _add_node(self, call: Call) -> bytes:
         await self.nodes.add(decode_data(AddNode, call.data))
@@ -65,11 +133,52 @@ class RobotAgent:
         return b""
 
     async def _offers(self, _call: Call) -> bytes:
-        return encode_data(await self.session.run(lambda: graph.offers(self.session.node)))
+        return encode_data(await self.offers.now())
+
+    async def _status(self, _call: Call) -> bytes:
+        return self._state()
+
+    async def _control(self, call: Call) -> bytes:
+        return encode_data(self._controlled(Registrant(type_number(call.sender_type), call.sender_id), call.data))
+
+    async def _stop(self, call: Call) -> bytes:
+        """The emergency stop with an answer: data ``true`` or ``false``, as on its topic."""
+        if self.nodes.stop is None:
+            raise Refused("this robot has no emergency stop")
+        self.nodes.stop.set(Registrant(type_number(call.sender_type), call.sender_id), call.data != b"false")
+        return self._state()
+
+    # -- the mesh ------------------------------------------------------------------------------------------------
+
+    def _send(self, to: Registrant, metadata: Metadata, data: bytes) -> None:
+        try:
+            self.agent.send(data, to=type_name(to.agent_type), ids=[to.agent_id], metadata=metadata)
+        except MacsError as error:
+            self.nodes.drops.note("failed", str(to), str(error))
+
+    def _group_of(self, agent: Registrant) -> int:
+        found = self.agent.directory.get(*agent)
+        return found.group if found else 0
+
+    def _link(self, up: bool) -> None:
+        """Without a router nobody is seen to leave, and no command comes: after a lease all commanders count as gone.
+
+        A change to another router is shorter.
+        """
+        if not up and not self.agent.mesh.linked:
+            lease_s = self.agent.mesh.settings.lease_ms / 1000
+            asyncio.get_running_loop().call_later(lease_s, self._still_cut_off)
+
+    def _still_cut_off(self) -> None:
+        if not self.agent.mesh.linked:
+            for node in self.nodes:
+                node.cut_off()
 
     def _presence(self, agent: AgentInfo, online: bool) -> None:
         if not online:
-            self.nodes.forget(Registrant(agent.type, agent.id))
+            gone = Registrant(agent.type, agent.id)
+            self.nodes.forget(gone)
+            self.offers.forget(gone)
 
 
 @asynccontextmanager
@@ -88,22 +197,27 @@ async def open_robot(
         ros_args: ROS arguments, as ``["--ros-args", "-r", "__ns:=/robot7"]``.
         on_waiting: called once while no router answers.
 
-    Raises Unreachable when ROS cannot start; what `macs_zenoh.join` raises.
+    ROS parameters win over ``settings`` (see `parameters`).
+
+    Raises Unreachable when ROS cannot start; ConfigError; what `macs_zenoh.join` raises.
     """
-    robot = settings.robot
     session = await asyncio.to_thread(RosSession, NODE_NAME, domain_id=domain_id, ros_args=ros_args)
     try:
+        settings = await session.run(lambda: parameters.apply(session.node, settings))
+        robot = settings.robot
         async with macs_zenoh.join(
             "ros", id=robot.id, group=robot.group, settings=settings.mesh, on_waiting=on_waiting
         ) as agent:
             ros_agent = RobotAgent(agent, session, robot)
+            await ros_agent.start()
             work = asyncio.create_task(ros_agent.work())
             log.info("robot %d serves %s", agent.id, session.full_name)
             try:
                 yield ros_agent
             finally:
                 work.cancel()
-                ros_agent.nodes.close()
+                ros_agent.close()
+                await asyncio.sleep(STOP_MESSAGES_S)
     finally:
         await asyncio.to_thread(session.close)
 

@@ -53,13 +53,14 @@ class EarlyMessages:
         self._bytes -= sum(len(message.data) for message in taken)
         return taken
 
-    def expire(self, now: float) -> dict[NodeKey, int]:
-        """Give up those that waited too long: how many per node."""
-        expired: dict[NodeKey, int] = {}
+    def expire(self, now: float) -> dict[NodeKey, list[Message]]:
+        """Give up those that waited too long, and return them by node."""
+        expired: dict[NodeKey, list[Message]] = {}
         for key, waiting in list(self._waiting.items()):
             while waiting and waiting[0].deadline <= now:
-                self._bytes -= len(waiting.popleft().message.data)
-                expired[key] = expired.get(key, 0) + 1
+                message = waiting.popleft().message
+                self._bytes -= len(message.data)
+                expired.setdefault(key, []).append(message)
             if not waiting:
                 del self._waiting[key]
         return expired

@@ -1,34 +1,100 @@
-"""What a robot offers: its topics and services, without our own and without ROS's plumbing."""
+"""What a robot offers: its topics, services and actions, without our own, without ROS's plumbing and what is hidden.
+
+ROS tells nobody in Python when its graph changes, so `Offers` looks once a second; a look costs well under a
+millisecond as long as nothing has changed.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import logging
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Any
 
+import msgspec
+from msgspec import Struct
 from rclpy.node import NodeNameNonExistentError
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
-from macs_zenoh.messages import Functionality
+from bridge.ros import qos
+from bridge.ros.interface import PublishStream, Registrant, Robot
+from bridge.ros.rules import Rules
+from bridge.ros.stream import StreamFraming
+from macs_zenoh.agent import Message
+from macs_zenoh.errors import MacsError
+from macs_zenoh.messages import ROS, Functionality, FunctionalityRequest, Metadata, encode_data
+
+log = logging.getLogger("macs.ros")
 
 PLUMBING_TOPICS = frozenset({"/rosout", "/parameter_events"})
 PLUMBING_PACKAGES = ("rcl_interfaces/", "type_description_interfaces/", "lifecycle_msgs/")
 """Every ROS node brings services of these types; they are its parameters and states, not what the robot does."""
 
+OFFERS_STREAM = "_offers"
+"""Node of the robot's stream that carries `Offered` as JSON whenever it changes."""
+LOOK_S = 1.0
+SETTLE_LOOKS = 3
+"""So many looks after a change read everything: ROS knows a topic before it knows whose it is."""
+
 NamesAndTypes = list[tuple[str, list[str]]]
 
+SEND_GOAL = "/_action/send_goal"
+"""What the goal service of an action is called, after the action; its type is the action's with ``_SendGoal``."""
 
-def offers(node: Any) -> Functionality:
-    """The graph around ``node`` now: topics that others subscribe and publish, services that they serve.
+
+class TopicQos(Struct, frozen=True):
+    """What a subscription to a topic has to ask for, or a publisher to offer, to match everybody there."""
+
+    reliability: str
+    durability: str
+
+
+class Offered(Functionality, frozen=True, rename="camel"):
+    """What a robot offers, with what the existing program does not tell: actions, and QoS by topic."""
+
+    actions: dict[str, str] = msgspec.field(default_factory=dict)
+    qos: dict[str, TopicQos] = msgspec.field(default_factory=dict)
+
+
+class FollowRequest(Struct, frozen=True):
+    """The data of a FunctionalityGetter request, if it has any: ``follow`` asks for every change as well."""
+
+    follow: bool = False
+
+
+def offers(node: Any, rules: Rules | None = None) -> Offered:
+    """The graph around ``node`` now: what others subscribe, publish and serve, as far as ``rules`` expose it.
 
     Each name with its type (``geometry_msgs/msg/Twist``); the first by alphabet where a topic has several. To be
     called in the ROS thread.
     """
+    rules = rules or Rules()
     own = (node.get_name(), node.get_namespace())
     others = [other for other in set(node.get_node_names_and_namespaces()) if other != own]
-    return Functionality(
-        subscribers=_gather(node.get_subscriber_names_and_types_by_node, others),
-        publishers=_gather(node.get_publisher_names_and_types_by_node, others),
-        services=_gather(node.get_service_names_and_types_by_node, others),
+    subscribers = _gather(node.get_subscriber_names_and_types_by_node, others)
+    publishers = _gather(node.get_publisher_names_and_types_by_node, others)
+    services = _gather(node.get_service_names_and_types_by_node, others)
+    actions = {
+        name.removesuffix(SEND_GOAL): of_type.removesuffix("_SendGoal")
+        for name, of_type in services.items()
+        if name.endswith(SEND_GOAL)
+    }
+
+    def visible(found: dict[str, str]) -> dict[str, str]:
+        return {
+            name: of_type
+            for name, of_type in sorted(found.items())
+            if rules.exposes(name) and not _is_plumbing(name, of_type)
+        }
+
+    subscribers, publishers = visible(subscribers), visible(publishers)
+    return Offered(
+        subscribers,
+        publishers,
+        visible(services),
+        visible(actions),
+        {topic: _qos_of(node, topic) for topic in sorted({*subscribers, *publishers})},
     )
 
 
@@ -40,14 +106,84 @@ def _gather(ask: Callable[[str, str], NamesAndTypes], nodes: Iterable[tuple[str,
         except NodeNameNonExistentError:  # it left between the two questions
             continue
         for topic, types in entries:
-            if types and not _is_plumbing(topic, types):
+            if types:
                 found[topic] = min(types)
-    return dict(sorted(found.items()))
+    return found
 
 
-def _is_plumbing(name: str, types: list[str]) -> bool:
-    return (
-        name in PLUMBING_TOPICS
-        or bool(topic_or_service_is_hidden(name))
-        or all(of_type.startswith(PLUMBING_PACKAGES) for of_type in types)
-    )
+def _is_plumbing(name: str, of_type: str) -> bool:
+    return name in PLUMBING_TOPICS or bool(topic_or_service_is_hidden(name)) or of_type.startswith(PLUMBING_PACKAGES)
+
+
+def _qos_of(node: Any, topic: str) -> TopicQos:
+    publishers = [endpoint.qos_profile for endpoint in node.get_publishers_info_by_topic(topic)]
+    if publishers:
+        profile = qos.for_subscription(publishers, 1)
+    else:
+        subscriptions = [endpoint.qos_profile for endpoint in node.get_subscriptions_info_by_topic(topic)]
+        profile = qos.for_publisher(subscriptions, 1, latched=False)
+    return TopicQos(profile.reliability.name.lower(), profile.durability.name.lower())
+
+
+class Offers:
+    """What the robot offers, for those who ask and for those who follow its changes. Belongs to the loop."""
+
+    def __init__(self, robot: Robot, publish_stream: PublishStream) -> None:
+        self._robot = robot
+        self._publish_stream = publish_stream
+        self._followers: dict[Registrant, int] = {}
+        self._graph: object = None
+        self._last = Offered()
+        self._frame = StreamFraming(
+            Metadata(ROS, robot.agent_id, node_name=OFFERS_STREAM, message_manager=FunctionalityRequest.manager),
+            [],
+            robot.layout,
+        )
+        self._looking = asyncio.get_running_loop().create_task(self._look())
+
+    async def now(self) -> Offered:
+        """What it offers now."""
+        session = self._robot.session
+        return await session.run(lambda: offers(session.node, self._robot.rules))
+
+    def follow(self, agent: Registrant, request: Message) -> None:
+        """Tell this agent of every change from now on, if its request asks for that."""
+        with suppress(msgspec.DecodeError):
+            if request.data and msgspec.json.decode(request.data, type=FollowRequest).follow:
+                self._followers[agent] = request.metadata.request_id
+
+    def forget(self, agent: Registrant) -> None:
+        """An agent left."""
+        self._followers.pop(agent, None)
+
+    def close(self) -> None:
+        """Stop looking."""
+        self._looking.cancel()
+
+    async def _look(self) -> None:
+        node = self._robot.session.node
+        looks = 0
+        while True:
+            try:
+                graph = await self._robot.session.run(
+                    lambda: (node.get_topic_names_and_types(), node.get_service_names_and_types())
+                )
+                if graph != self._graph:
+                    self._graph, looks = graph, SETTLE_LOOKS
+                if looks:
+                    looks -= 1
+                    await self._tell(await self.now())
+            except MacsError as error:
+                log.debug("the graph cannot be read: %s", error)
+                return
+            await asyncio.sleep(LOOK_S)
+
+    async def _tell(self, offered: Offered) -> None:
+        if offered == self._last:
+            return
+        self._last = offered
+        data = encode_data(offered)
+        self._publish_stream(OFFERS_STREAM, self._frame(data))
+        for agent, request_id in self._followers.items():
+            metadata = Metadata(request_id=request_id, message_manager=FunctionalityRequest.manager)
+            self._robot.send(agent, metadata, data)

@@ -12,6 +12,8 @@ from typing import Any
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
+from macs_zenoh.config import TopicRule
+
 DEFAULT_DEPTH = 10
 MAX_DEPTH = 1000
 """A headset chooses the depth; memory for it is the robot's."""
@@ -57,6 +59,17 @@ def for_publisher(subscriptions: Iterable[Any], depth: int, *, latched: bool) ->
         profile.deadline = deadline
     if lease := _shortest(qos.liveliness_lease_duration for qos in requested):
         profile.liveliness_lease_duration = lease
+    return profile
+
+
+def overridden(profile: QoSProfile, rule: TopicRule) -> QoSProfile:
+    """The profile with what a robot's settings ask for."""
+    if rule.reliability is not None:
+        profile.reliability = ReliabilityPolicy[rule.reliability.upper()]
+    if rule.durability is not None:
+        profile.durability = DurabilityPolicy[rule.durability.upper()]
+    if rule.depth is not None:
+        profile.depth = rule.depth
     return profile
 
 

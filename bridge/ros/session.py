@@ -17,8 +17,10 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
@@ -36,11 +38,19 @@ class RosSession:
         name: of the node; remapping (``-r __node:=...``, ``-r __ns:=...``) in ``ros_args`` wins.
         domain_id: None takes ``ROS_DOMAIN_ID``.
         ros_args: ROS arguments, as ``["--ros-args", "-r", "__ns:=/robot7"]``.
+        make_node: makes the node of the name and the options given here.
 
     Raises Unreachable when ROS cannot start (a wrong argument, no middleware).
     """
 
-    def __init__(self, name: str = "rosagent", *, domain_id: int | None = None, ros_args: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        name: str = "rosagent",
+        *,
+        domain_id: int | None = None,
+        ros_args: Sequence[str] = (),
+        make_node: Callable[..., Node] = rclpy.create_node,
+    ) -> None:
         self.context = Context()
         try:
             rclpy.init(
@@ -52,7 +62,7 @@ class RosSession:
             )
             # Every service of a node costs time in each turn of the executor, so this one has none of its own:
             # without them a turn takes three quarters of the time.
-            self.node = rclpy.create_node(
+            self.node = make_node(
                 name,
                 context=self.context,
                 start_parameter_services=False,
@@ -65,6 +75,7 @@ class RosSession:
         self._jobs: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._lock = threading.Lock()
         self._spinning = True
+        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._jobs_waiting = self.node.create_guard_condition(self._work)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
@@ -97,6 +108,16 @@ class RosSession:
                 return future
         future.set_exception(Unreachable("ROS 2", "the session is closed"))
         return future
+
+    def later(self, delay_s: float, job: Callable[[], object]) -> None:
+        """Run ``job`` in the ROS thread after a time, unless the session ends before. In the ROS thread."""
+
+        def fire() -> None:
+            self.node.destroy_timer(timer)
+            job()
+
+        # a clock of its own: with use_sim_time the node's may stand still
+        timer = self.node.create_timer(delay_s, fire, clock=self._clock)
 
     async def run(self, job: Callable[[], T]) -> T:
         """Run ``job`` in the ROS thread and return its result or raise its error."""

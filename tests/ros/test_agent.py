@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import socket
 from collections.abc import AsyncIterator, Callable
 
@@ -11,16 +12,26 @@ from geometry_msgs.msg import Twist
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from ros_peer import Peer, adding, command, get, removing, until
-from std_msgs.msg import String
+from std_msgs.msg import Bool, String
 
 import macs_zenoh
 from bridge.ros.agent import RobotAgent, open_robot
+from bridge.ros.graph import Offered, TopicQos
+from bridge.ros.requests import STATUS
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings
 from macs_zenoh.errors import Refused
 from macs_zenoh.keyexpr import STREAM
 from macs_zenoh.mesh import Mesh, Sample
-from macs_zenoh.messages import Functionality, Metadata, NodeType, StreamData, decode_data, decode_management
+from macs_zenoh.messages import (
+    Functionality,
+    FunctionalityRequest,
+    Metadata,
+    NodeType,
+    StreamData,
+    decode_data,
+    decode_management,
+)
 from macs_zenoh.messages import encode_data as encode
 from macs_zenoh.wire import parse_frame
 
@@ -119,7 +130,7 @@ async def test_a_best_effort_topic_is_streamed(robot: RobotAgent, headset: Agent
 
 BAD_REGISTRATIONS = [
     (encode(adding("/t", "std_msgs/NoSuch")), "not installed on this robot"),
-    (encode(adding("/t", node_type=4)), "not supported yet"),
+    (encode(adding("/t", node_type=99)), "unknown on this robot"),
     (encode(removing("/t")), "missing required field"),
     (b"{}", "missing required field"),
     (b"\xff", "not valid JSON"),
@@ -196,3 +207,61 @@ async def test_messages_that_mean_nothing_harm_nothing(robot: RobotAgent, headse
     headset.send(good.data, to="ros", ids=[ROBOT], metadata=good.metadata)
     assert (await get(received)).data == "good"
     assert received.empty()
+
+
+async def test_the_robot_tells_actions_qos_and_changes(
+    router: str, robot: RobotAgent, headset: Agent, peer: Peer
+) -> None:
+    """An asker over the wire gets names, types and QoS with its request id, and every change when it follows."""
+    sensor = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    await peer.publisher(String, "/scan", sensor)
+    while "/scan" not in decode_data(Offered, await headset.call("ros", ROBOT, "offers")).publishers:
+        await asyncio.sleep(0.02)
+    asking = Metadata(request_id=9, message_manager=FunctionalityRequest.manager)
+    headset.send(b'{"follow": true}', to="ros", ids=[ROBOT], metadata=asking)
+    answer = await asyncio.wait_for(headset.receive(), 5)
+    assert (answer.metadata.request_id, answer.metadata.message_manager, answer.metadata.node_name) == (9, "", "")
+    offered = decode_data(Offered, answer.data)
+    assert offered.publishers == {"/scan": "std_msgs/msg/String"}
+    assert offered.qos == {"/scan": TopicQos("best_effort", "volatile")}
+    await peer.subscription(Twist, "/cmd_vel")
+    while True:
+        change = await asyncio.wait_for(headset.receive(), 5)
+        assert change.metadata.message_manager == FunctionalityRequest.manager
+        if "/cmd_vel" in decode_data(Offered, change.data).subscribers:
+            break
+
+
+async def test_the_robot_shows_its_state(robot: RobotAgent, headset: Agent) -> None:
+    """The verb and the message tell nodes, registrants, the stop and losses."""
+    await headset.call("ros", ROBOT, "add_node", encode(adding("/chatter")))
+    state = json.loads(await headset.call("ros", ROBOT, "status"))
+    assert state["stopped"] is False
+    assert {"role": "subscriber", "name": "/chatter", "type": "std_msgs/msg/String", "registrants": ["unity/5"]} in (
+        state["nodes"]
+    )
+    headset.send(b"", to="ros", ids=[ROBOT], metadata=Metadata(request_id=0, message_manager=STATUS))
+    answer = await asyncio.wait_for(headset.receive(), 5)
+    assert json.loads(answer.data)["ros_node"] == state["ros_node"]
+
+
+async def test_the_stop_is_a_verb_and_a_command(robot: RobotAgent, headset: Agent) -> None:
+    """With the verb the caller knows that the robot has stopped; a command needs no registration."""
+    assert json.loads(await headset.call("ros", ROBOT, "stop", b"true"))["stop"]["by"] == "unity/5"
+    release = command("/emergency_stop", Bool(data=False), "std_msgs/Bool")
+    headset.send(release.data, to="ros", ids=[ROBOT], metadata=release.metadata)
+    await until(lambda: not robot.nodes.robot.stop.stopped)
+
+
+async def test_control_is_asked_for_over_the_wire(robot: RobotAgent, headset: Agent) -> None:
+    """A request for control that cannot be met is answered with the reason; nonsense too."""
+    for number, data, reason in (
+        (0, b'{"action": "take", "topic": "/cmd_vel"}', "nobody registered a publisher of /cmd_vel"),
+        (1, b'{"action": "jump", "topic": "/cmd_vel"}', "Invalid enum value"),
+        (2, b"\xff", "not valid JSON"),
+    ):
+        asking = Metadata(request_id=number, message_manager="RobotControl")
+        headset.send(data, to="ros", ids=[ROBOT], metadata=asking)
+        answer = await asyncio.wait_for(headset.receive(), 5)
+        assert answer.metadata.request_id == number
+        assert reason in json.loads(answer.data)["reason"]

@@ -14,7 +14,8 @@ from ros_peer import Peer, adding, command, get, removing, until
 from std_msgs.msg import String, UInt8MultiArray
 
 from bridge.ros.early import EarlyMessages, NodeKey
-from bridge.ros.nodes import InterfaceNodes, Registrant, Robot
+from bridge.ros.interface import Registrant, Robot
+from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.session import RosSession
 from macs_zenoh.errors import Refused
 from macs_zenoh.messages import Metadata, NodeType, StreamData, decode_management
@@ -317,8 +318,9 @@ async def test_data_for_a_subscriber_node_harms_nothing(nodes: InterfaceNodes) -
         ("", "std_msgs/String", {"name": "nd_"}, "must not be empty"),
         ("/" + "x" * 400, "std_msgs/String", {"name": "nd_x"}, "should not exceed"),
         ("/t", "std_msgs/String", {"name": "nd_/../*"}, "not a valid node name"),
-        ("/t", "std_srvs/SetBool", {"node_type": 3}, "type 3 is not supported yet"),
-        ("/t", "std_srvs/SetBool", {"node_type": 4}, "type 4 is not supported yet"),
+        ("/t", "std_msgs/String", {"node_type": 3}, "not installed on this robot: std_msgs is, but has no such type"),
+        ("/t", "std_srvs/NoSuch", {"node_type": 4}, "not installed on this robot: std_srvs is, but has no such type"),
+        ("/t/set_parameters", "rcl_interfaces/SetParameters", {"node_type": 3}, "is not open to headsets"),
         ("/t", "std_msgs/String", {"node_type": 99}, "type 99 is unknown"),
     ],
 )
@@ -418,7 +420,7 @@ def test_waiting_messages_are_bounded_in_names_and_bytes() -> None:
     big = message._replace(data=bytes(EarlyMessages.BYTES))
     assert early.hold(NodeKey(2, "0"), big, now=0.0)
     assert early.next_deadline() == EarlyMessages.HOLD_S
-    assert sum(early.expire(EarlyMessages.HOLD_S).values()) == EarlyMessages.NODES
+    assert sum(len(messages) for messages in early.expire(EarlyMessages.HOLD_S).values()) == EarlyMessages.NODES
     assert early.next_deadline() is None
     assert not early.hold(NodeKey(2, "0"), big, now=0.0)
     assert early.take(NodeKey(2, "0")) == [big]
@@ -427,7 +429,7 @@ def test_waiting_messages_are_bounded_in_names_and_bytes() -> None:
 
 async def _knows(nodes: InterfaceNodes, topic: str, *, publishers: int = 0, subscriptions: int = 0) -> None:
     """Wait until the robot's node knows of so many endpoints of a topic."""
-    node = nodes._robot.session.node
+    node = nodes.robot.session.node
     await until(lambda: node.count_publishers(topic) == publishers and node.count_subscribers(topic) == subscriptions)
 
 

@@ -1,0 +1,336 @@
+"""Interface node of type 5: a headset gives goals to an action that runs on the robot (docs/actions.md).
+
+A goal outlives the connection of its headset: its result is kept for a while, and goes to whoever asks for it with
+the goal's id, which only the headset that chose it knows, and those of its group that it lets see it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import struct
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+from rclpy.serialization import deserialize_message, serialize_message
+
+from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
+from bridge.ros.services import ABSENT_S, Search, first_line
+from bridge.ros.stream import cdr_problem
+from bridge.ros.types import resolve
+from macs_zenoh.agent import Message
+from macs_zenoh.messages import ROS, ActionVerb, AddNode, Metadata, NodeType
+
+log = logging.getLogger("macs.ros")
+
+ID_BYTES = 16
+UNKNOWN, ACCEPTED, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = range(7)
+"""action_msgs/GoalStatus."""
+WATCH_S = 1.0
+GONE_S = 5.0
+"""An action server that cannot be seen for so long has taken its goals with it."""
+
+
+@dataclass
+class Goal:
+    """One goal: who gets its feedback and result, and what became of it."""
+
+    id: bytes
+    owner: Registrant
+    group: int
+    request_id: int
+    status: int = UNKNOWN
+    """As in action_msgs/GoalStatus."""
+    result: bytes = b""
+    """CDR, or the reason in UTF-8 when there is no result."""
+    finished_at: float | None = None
+    cancel_wanted: bool = False
+    handle: Any = None
+
+
+class ActionNode(InterfaceNode):
+    """Type 5: goals of headsets to one action, their feedback, results and cancellation."""
+
+    NODE_TYPE = NodeType.ACTION
+    ROLE = "action client"
+    INTERFACE = "action"
+
+    MATCH_S = 0.5
+
+    def __init__(self, robot: Robot, request: AddNode) -> None:
+        super().__init__(robot, request)
+        self._client: Any = None
+        self._types: Any = None
+        self._goals: dict[bytes, Goal] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._watching: asyncio.TimerHandle | None = None
+        self._search = Search(lambda: self._client is not None and self._client.server_is_ready())
+        self._seen_at = 0.0
+        self._accept_s = robot.rules.call_s(self.topic)
+        self._loop = asyncio.get_running_loop()
+
+    @property
+    def in_use(self) -> bool:
+        return bool(self.registrants) or bool(self._goals)
+
+    def open(self) -> None:
+        self._types = resolve(str(self.interface), "action")
+        # 12 MB, of which robots without actions need nothing
+        from rclpy.action import ActionClient
+
+        node = self.robot.session.node
+        with ros_errors(self.request.tos_name):
+            self._client = ActionClient(node, self._types, self.request.tos_name)
+
+    async def settle(self) -> None:
+        await self._found(self.MATCH_S)
+
+    def retire(self) -> None:
+        for task in self._tasks:
+            task.cancel()
+        if self._watching is not None:
+            self._watching.cancel()
+
+    def close(self) -> None:
+        client, self._client = self._client, None
+        if client is not None:
+            client.destroy()
+
+    def left(self, agent: Registrant) -> None:
+        if self.rule.cancel_on_leave:
+            for goal in list(self._goals.values()):
+                if goal.owner == agent:
+                    self._cancel(goal)
+
+    def emergency_stop(self, by: str) -> None:
+        for goal in self._goals.values():
+            self._cancel(goal)
+
+    def status(self) -> dict[str, Any]:
+        return {**super().status(), "goals": [_shown(goal) for goal in self._goals.values()]}
+
+    # -- what headsets say ---------------------------------------------------------------------------------------
+
+    def receive(self, message: Message) -> None:
+        verb, goal_id = message.metadata.message_manager, message.data[:ID_BYTES]
+        if verb == ActionVerb.LIST:
+            self._list(message)
+        elif len(goal_id) < ID_BYTES:
+            self.robot.drops.note("bad_request", self.topic, f"{verb[:40]!r} without the 16 bytes of a goal id")
+        elif verb == ActionVerb.GOAL:
+            self._give(message, goal_id)
+        elif verb in (ActionVerb.RESULT, ActionVerb.CANCEL):
+            goal = self._goals.get(goal_id)
+            if goal is None:
+                asked = Goal(goal_id, Registrant.of(message), 0, message.metadata.request_id)
+                self._tell(asked, ActionVerb(verb), UNKNOWN, b"there is no such goal, or its result was not kept")
+            elif verb == ActionVerb.CANCEL:
+                self._cancel(goal)
+            else:
+                self._ask_result(goal, message)
+        else:
+            self.robot.drops.note("bad_request", self.topic, f"{verb[:40]!r} is nothing that an action knows")
+
+    def _give(self, message: Message, goal_id: bytes) -> None:
+        sender = Registrant.of(message)
+        goal = self._goals.get(goal_id)
+        if goal is not None:  # asked again, for want of an answer
+            self._tell(goal, ActionVerb.ACCEPTED, int(goal.handle is not None))
+            return
+        goal = Goal(goal_id, sender, self.robot.group_of(sender), message.metadata.request_id)
+        body = message.data[ID_BYTES:]
+        problem = cdr_problem(body)
+        if problem is not None:
+            self._reject(goal, f"the goal is no {self.interface}: {problem}")
+        elif self.robot.stop.stopped:
+            self._reject(goal, f"the emergency stop by {self.robot.stop.by} holds")
+        elif not self._room():
+            self._reject(goal, f"{len(self._goals)} goals of {self.topic} are open")
+        else:
+            self._goals[goal_id] = goal
+            self._spawn(goal, body)
+
+    def _ask_result(self, goal: Goal, message: Message) -> None:
+        """Whoever asks gets the result, now or later, and the feedback from now on."""
+        goal.owner, goal.request_id = Registrant.of(message), message.metadata.request_id
+        if goal.finished_at is not None:
+            self._tell(goal, ActionVerb.RESULT, goal.status, goal.result)
+
+    def _list(self, message: Message) -> None:
+        sender = Registrant.of(message)
+        group = self.robot.group_of(sender)
+        goals = [
+            _shown(goal) for goal in self._goals.values() if goal.owner == sender or (group and goal.group == group)
+        ]
+        asked = Goal(bytes(ID_BYTES), sender, 0, message.metadata.request_id)
+        self._tell(asked, ActionVerb.LIST, 0, msgspec.json.encode(goals))
+
+    def _room(self) -> bool:
+        limit = self.robot.rules.settings.max_calls
+        finished = [goal for goal in self._goals.values() if goal.finished_at is not None]
+        if len(self._goals) >= limit and finished:
+            self._goals.pop(finished[0].id)
+        return len(self._goals) < limit
+
+    # -- the life of a goal, on the loop -------------------------------------------------------------------------
+
+    def _spawn(self, goal: Goal, body: bytes) -> None:
+        task = self._loop.create_task(self._send(goal, body))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _send(self, goal: Goal, body: bytes) -> None:
+        if not await self._found(min(ABSENT_S, self._accept_s / 2)):
+            self._drop(goal, f"there is no action {self.topic} on this robot")
+            return
+        try:
+            await self.robot.session.run(lambda: self._send_goal(goal, body))
+        except RuntimeError as error:
+            self._drop(goal, f"the goal is no {self.interface}: {first_line(error)}")
+            return
+        self._watch()
+        await asyncio.sleep(self._accept_s)
+        if goal.handle is None and goal.finished_at is None and goal.id in self._goals:
+            self._drop(goal, f"{self.topic} did not accept the goal within {self._accept_s:g} s")
+
+    async def _found(self, within_s: float) -> bool:
+        self._seen_at = self._loop.time()
+        return await self._search.found(within_s)
+
+    def _accepted(self, goal: Goal, handle: Any) -> None:
+        if goal.id not in self._goals:  # it came too late
+            self.robot.session.submit(handle.cancel_goal_async)
+            return
+        if not handle.accepted:
+            self._drop(goal, f"{self.topic} rejected the goal")
+            return
+        goal.handle, goal.status = handle, ACCEPTED
+        self._tell(goal, ActionVerb.ACCEPTED, 1)
+        if goal.cancel_wanted:
+            self._cancel(goal)
+
+    def _fed_back(self, goal: Goal, feedback: bytes) -> None:
+        if goal.finished_at is None:
+            goal.status = EXECUTING
+            self._tell(goal, ActionVerb.FEEDBACK, goal.status, feedback)
+
+    def _finished(self, goal: Goal, status: int, result: bytes) -> None:
+        if goal.finished_at is not None:
+            return
+        goal.status, goal.result, goal.finished_at, goal.handle = status, result, time.monotonic(), None
+        self._tell(goal, ActionVerb.RESULT, status, result)
+        self._watch()
+
+    def _cancel(self, goal: Goal) -> None:
+        if goal.finished_at is not None:
+            self._tell(goal, ActionVerb.CANCEL, 0, b"the goal has finished")
+        elif goal.handle is None:
+            goal.cancel_wanted = True
+        else:
+            self.robot.session.submit(lambda: self._send_cancel(goal))
+
+    def _reject(self, goal: Goal, reason: str) -> None:
+        self._tell(goal, ActionVerb.ACCEPTED, 0, reason.encode())
+
+    def _drop(self, goal: Goal, reason: str) -> None:
+        self._goals.pop(goal.id, None)
+        self._reject(goal, reason)
+        self._check_use()
+
+    def _tell(self, goal: Goal, verb: ActionVerb, code: int, rest: bytes = b"") -> None:
+        metadata = Metadata(
+            sender_agent_type=ROS,
+            sender_agent_id=self.robot.agent_id,
+            request_id=goal.request_id,
+            message_manager=verb.value,
+            node_type=self.NODE_TYPE,
+            node_name=self.key.node_name,
+            data_exchange_type=self.interface.short,
+        )
+        self.robot.send(goal.owner, metadata, goal.id + struct.pack("B", code) + rest)
+
+    def _watch(self) -> None:
+        """Look now and then for results that are too old, and for a server that died with its goals."""
+        if self._watching is None and self._goals:
+            self._watching = self._loop.call_later(WATCH_S, self._look)
+
+    def _look(self) -> None:
+        self._watching = None
+        if self._client is None:
+            return
+        kept_s = self.robot.rules.settings.result_s
+        now = self._loop.time()
+        if self._client.server_is_ready():
+            self._seen_at = now
+        gone = now - self._seen_at > GONE_S
+        for goal in list(self._goals.values()):
+            if goal.finished_at is not None:
+                if time.monotonic() - goal.finished_at > kept_s:
+                    del self._goals[goal.id]
+            elif gone:
+                self._finished(goal, ABORTED, b"the action server is gone")
+        self._check_use()
+        self._watch()
+
+    def _check_use(self) -> None:
+        if not self.in_use:
+            self.unused()
+
+    # -- in the ROS thread ---------------------------------------------------------------------------------------
+
+    def _send_goal(self, goal: Goal, body: bytes) -> None:
+        if self._client is None:
+            return
+        message = deserialize_message(body, self._types.Goal)
+        tell = self._loop.call_soon_threadsafe
+
+        def fed_back(feedback: Any) -> None:
+            tell(self._fed_back, goal, bytes(serialize_message(feedback.feedback)))
+
+        def accepted(future: Any) -> None:
+            handle = self._outcome(goal, future)
+            if handle is not None:
+                tell(self._accepted, goal, handle)
+                if handle.accepted:
+                    handle.get_result_async().add_done_callback(finished)
+
+        def finished(future: Any) -> None:
+            response = self._outcome(goal, future)
+            if response is not None:
+                tell(self._finished, goal, int(response.status), bytes(serialize_message(response.result)))
+
+        uuid = self._types.Impl.SendGoalService.Request().goal_id
+        uuid.uuid = list(goal.id)
+        self._client.send_goal_async(message, fed_back, uuid).add_done_callback(accepted)
+
+    def _outcome(self, goal: Goal, future: Any) -> Any:
+        """What a future of rclpy gave, None when it failed, which is told."""
+        try:
+            return future.result()
+        except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is
+            reason = first_line(error).encode()
+            self._loop.call_soon_threadsafe(self._finished, goal, ABORTED, reason)
+            return None
+
+    def _send_cancel(self, goal: Goal) -> None:
+        if goal.handle is None or self._client is None:
+            return
+
+        def cancelling(future: Any) -> None:
+            response = self._outcome(goal, future)
+            done = response is not None and bool(response.goals_canceling)
+            reason = b"" if done else b"the action does not cancel it"
+            self._loop.call_soon_threadsafe(self._tell, goal, ActionVerb.CANCEL, int(done), reason)
+
+        goal.handle.cancel_goal_async().add_done_callback(cancelling)
+
+
+def _shown(goal: Goal) -> dict[str, Any]:
+    return {
+        "goal": goal.id.hex(),
+        "status": goal.status,
+        "owner": str(goal.owner),
+        "finished": goal.finished_at is not None,
+    }

@@ -1,0 +1,219 @@
+"""What all interface nodes have in common: names, registrants, and the robot they work for."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
+
+from rclpy.exceptions import NameValidationException
+from rclpy.type_support import NoTypeSupportImportedException
+
+from bridge.ros.early import NodeKey
+from bridge.ros.rules import Rules
+from bridge.ros.safety import EmergencyStop
+from bridge.ros.session import RosSession
+from bridge.ros.types import InterfaceName
+from macs_zenoh.agent import Message
+from macs_zenoh.errors import Refused
+from macs_zenoh.keyexpr import type_name, type_number
+from macs_zenoh.messages import AddNode, Metadata, NodeType, RemoveNode
+from macs_zenoh.wire import MACS, Layout
+
+log = logging.getLogger("macs.ros")
+
+PublishStream = Callable[[str, bytes], None]
+"""Node name and whole frame; called in the ROS thread."""
+SendTo = Callable[["Registrant", Metadata, bytes], None]
+"""To one agent, on the loop."""
+
+
+class Registrant(NamedTuple):
+    """An agent that registered an interface node."""
+
+    agent_type: int
+    agent_id: int
+
+    def __str__(self) -> str:
+        return f"{type_name(self.agent_type)}/{self.agent_id}"
+
+    @classmethod
+    def of(cls, message: Message) -> Registrant:
+        """The sender of a message."""
+        return cls(int(type_number(message.sender_type)), message.sender_id)
+
+
+class Drops(Counter[str]):
+    """What was lost, by name.
+
+    ``no_node`` data for a node that is not registered; ``held_full`` data before its registration, more than is kept;
+    ``bad_cdr`` data that cannot be a ROS message; ``lost_in_ros`` messages that ROS lost before we could take them;
+    ``failed`` messages that ROS or the mesh did not take; ``late_answer`` answers after their deadline, or to nothing;
+    ``not_in_control`` and ``stopped`` commands that safety did not let pass; ``bad_request`` what asks for nothing
+    that there is.
+    """
+
+    LOGGED = 1000
+    """Names come from the network, so what is remembered of them is bounded."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._logged: set[tuple[str, str]] = set()
+
+    def note(self, name: str, about: str, text: str, count: int = 1) -> None:
+        """Count a loss; log it the first time it concerns ``about``."""
+        self[name] += count
+        if (name, about) not in self._logged and len(self._logged) < self.LOGGED:
+            self._logged.add((name, about))
+            log.warning("%s: %s (logged once, counted as %s)", about, text, name)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What interface nodes work with.
+
+    Attributes:
+        session: the ROS node and its thread.
+        agent_id: the robot's id on the mesh.
+        publish_stream: puts a frame on the mesh.
+        layout: of the mesh's frames.
+        send: a message to one agent.
+        rules: what the settings say by name.
+        group_of: an agent's group now, 0 for none.
+        stop: the emergency stop.
+    """
+
+    session: RosSession
+    agent_id: int
+    publish_stream: PublishStream
+    layout: Layout = MACS
+    drops: Drops = field(default_factory=Drops)
+    send: SendTo = lambda to, metadata, data: None
+    rules: Rules = field(default_factory=Rules)
+    group_of: Callable[[Registrant], int] = lambda agent: 0
+    stop: EmergencyStop = field(default_factory=EmergencyStop)
+
+
+class InterfaceNode(ABC):
+    """One interface node: its registrants, and its rclpy entity between `open` and `close`."""
+
+    NODE_TYPE: ClassVar[NodeType]
+    ROLE: ClassVar[str]
+    INTERFACE: ClassVar[str] = "msg"
+    """Kind of its ROS interface."""
+    MAX_REGISTRANTS: ClassVar[int | None] = None
+
+    def __init__(self, robot: Robot, request: AddNode) -> None:
+        """Check the names. Raises Refused."""
+        self.robot = robot
+        self.key = key_of(request)
+        self.request = request
+        self.topic = self.full_name(request.tos_name)
+        self.interface = InterfaceName.parse(request.data_exchange_type, self.INTERFACE)
+        self.registrants: set[Registrant] = set()
+        self.is_open = False
+        self.opening: asyncio.Task[None] | None = None
+        self.unused: Callable[[], None] = lambda: None
+        """Called when a node that was in use without registrants is not any more."""
+        if not _NODE_NAME.fullmatch(request.node_name):
+            raise Refused(f"{request.node_name[:80]!r} is not a valid node name")
+        robot.rules.check_exposed(self.topic)
+        self.rule = robot.rules.of(self.topic)
+
+    def full_name(self, name: str) -> str:
+        """A topic's or service's name, expanded and remapped for our node. Raises Refused when it is invalid."""
+        node = self.robot.session.node
+        with ros_errors(name[:80]):
+            return str(node.resolve_service_name(name) if self.INTERFACE == "srv" else node.resolve_topic_name(name))
+
+    @property
+    def in_use(self) -> bool:
+        """Whether the node must stay: somebody is registered, or waits for something."""
+        return bool(self.registrants)
+
+    def check_same(self, request: AddNode) -> None:
+        """Raise Refused when another topic or type is wanted under this node's name."""
+        topic = self.full_name(request.tos_name)
+        if topic != self.topic:
+            raise Refused(f"{topic} and {self.topic} have the same node name {self.key.node_name}; use one of them")
+        interface = InterfaceName.parse(request.data_exchange_type, self.INTERFACE)
+        if interface != self.interface:
+            raise Refused(f"{topic} is registered with type {self.interface}, not {interface}")
+
+    def register(self, registrant: Registrant) -> None:
+        """Add a registrant; twice changes nothing. Raises Refused when the node takes no more."""
+        if registrant in self.registrants:
+            return
+        if self.MAX_REGISTRANTS is not None and len(self.registrants) >= self.MAX_REGISTRANTS:
+            raise Refused(f"{self.topic} is already registered by another agent, and {self.ROLE} has only one")
+        self.registrants.add(registrant)
+        self.registrants_changed()
+
+    def deregister(self, registrant: Registrant) -> None:
+        """Take a registrant off, if it is there."""
+        if registrant in self.registrants:
+            self.registrants.remove(registrant)
+            self.registrants_changed()
+
+    def registrants_changed(self) -> None:  # noqa: B027 - only some nodes care
+        """Somebody registered or left."""
+
+    @abstractmethod
+    def open(self) -> None:
+        """Create the rclpy entity. In the ROS thread. Raises Refused."""
+
+    async def settle(self) -> None:  # noqa: B027 - only some nodes have to wait
+        """Wait, on the loop and not for long, until the entity can do its work."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Destroy the rclpy entity, if there is one. In the ROS thread."""
+
+    @abstractmethod
+    def receive(self, message: Message) -> None:
+        """Take a message that names this node. On the loop."""
+
+    def left(self, agent: Registrant) -> None:  # noqa: B027 - only some nodes care
+        """An agent left the mesh, registered here or not. On the loop."""
+
+    def cut_off(self) -> None:  # noqa: B027 - only some nodes care
+        """The robot has lost the mesh. On the loop."""
+
+    def emergency_stop(self, by: str) -> None:  # noqa: B027 - only some nodes move the robot
+        """Somebody stopped the robot. On the loop."""
+
+    def retire(self) -> None:  # noqa: B027 - only some nodes have something open
+        """The node will be closed: end what is open. On the loop, before `close`."""
+
+    def status(self) -> dict[str, Any]:
+        """What there is to see from outside, as JSON."""
+        registrants = [str(registrant) for registrant in sorted(self.registrants)]
+        return {"role": self.ROLE, "name": self.topic, "type": str(self.interface), "registrants": registrants}
+
+
+_NODE_NAME = re.compile(r"[A-Za-z0-9_]{1,260}")
+
+
+def key_of(request: AddNode | RemoveNode) -> NodeKey:
+    """The interface node that a registration is about."""
+    return NodeKey(request.node_type, request.node_name)
+
+
+class ros_errors:  # noqa: N801 - reads like the context manager that it is
+    """Turns rclpy's errors about a topic into a refusal that a person understands."""
+
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, RuntimeError | NameValidationException | NoTypeSupportImportedException):
+            # rcl adds "at /path/in/its/sources" and a second line that points at the letter
+            problem = str(error).splitlines()[0].split(", at ")[0]
+            raise Refused(f"{self._topic!r} cannot be used on this robot: {problem}") from error

@@ -1,0 +1,81 @@
+"""What can be asked of a robot besides interface nodes: what it offers, its state, and control over a topic.
+
+Over the wire these are plain messages to the robot whose manager is the name here; the answer has the same request id,
+and empty manager and node name, as answers to plain requests have. On the mesh they are verbs. See docs/robot.md.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+import msgspec
+from msgspec import Struct
+
+from bridge.ros.interface import Registrant
+from bridge.ros.nodes import InterfaceNodes
+from bridge.ros.topics import PublisherNode
+from macs_zenoh.errors import Refused
+from macs_zenoh.messages import NodeType, node_name
+
+
+class ControlRequest(Struct, frozen=True, rename="camel"):
+    """Take control over a topic, release it, or give it to another agent (``to``, a headset unless ``toType``)."""
+
+    manager: ClassVar[str] = "RobotControl"
+    action: Literal["take", "release", "give"]
+    topic: str
+    to: int = 0
+    to_type: int = 2
+
+
+class ControlReply(Struct, frozen=True, rename="camel", omit_defaults=True):
+    """Whether it was done, who holds control now, and why not."""
+
+    done: bool
+    holder: str = ""
+    reason: str = ""
+
+
+STATUS = "RobotStatus"
+"""Manager of a request for the robot's state; its data is ignored."""
+
+
+def control(nodes: InterfaceNodes, sender: Registrant, request: ControlRequest, now: float) -> ControlReply:
+    """Do what a request for control asks. Raises Refused when the topic has no such control."""
+    node = nodes.get(NodeType.PUBLISHER, node_name(request.topic))
+    if not isinstance(node, PublisherNode):
+        raise Refused(f"nobody registered a publisher of {request.topic[:80]}")
+    if node.control is None:
+        raise Refused(f"{node.topic} is not under exclusive control on this robot")
+    if request.action == "take":
+        done = node.control.take(sender, now)
+    elif request.action == "release":
+        done = node.control.release(sender)
+    else:
+        done = node.control.give(sender, Registrant(request.to_type, request.to), now)
+    holder = node.control.holder(now)
+    reason = "" if done else f"{holder or 'nobody'} has control"
+    return ControlReply(done, str(holder) if holder else "", reason)
+
+
+def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int]) -> bytes:
+    """The robot's state as JSON: interface nodes with who registered, control and dead-man, the stop, drops.
+
+    ``lost_before`` counts what was lost between the mesh and the nodes.
+    """
+    stop = nodes.robot.stop
+    state: dict[str, Any] = {
+        "ros_node": ros_name,
+        "stopped": stop.stopped,
+        "stop": {
+            "by": stop.by,
+            "seconds": round(time.time() - stop.since, 1) if stop.stopped else 0,
+            "times": stop.times,
+            "history": stop.history,
+        },
+        "nodes": [node.status() for node in nodes],
+        "drops": {**lost_before, **nodes.drops},
+    }
+    return msgspec.json.encode(state)

@@ -1,0 +1,90 @@
+"""What a robot's settings say about a topic, service or action, by its full name. Pure.
+
+As in a shell, wildcards do not reach what is hidden: a level that begins with ``_``, as ROS hides its own, is matched
+only by a pattern that spells the ``_``.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Iterable
+from functools import lru_cache
+
+from msgspec import structs
+
+from macs_zenoh.config import RobotSettings, TopicRule
+from macs_zenoh.errors import Refused
+
+DEFAULT_HOLD_S = 3.0
+
+
+@lru_cache(maxsize=4096)
+def matches(pattern: str, name: str) -> bool:
+    """Whether a full name fits a pattern: ``*`` within one level, ``**`` any number of levels, also none."""
+    return _matches(pattern.split("/"), name.split("/"))
+
+
+def _matches(pattern: list[str], name: list[str]) -> bool:
+    if not pattern:
+        return not name
+    head, rest = pattern[0], pattern[1:]
+    if head == "**":
+        return _matches(rest, name) or (bool(name) and not name[0].startswith("_") and _matches(pattern, name[1:]))
+    if not name or (name[0].startswith("_") and not head.startswith("_")):
+        return False
+    return fnmatch.fnmatchcase(name[0], head) and _matches(rest, name[1:])
+
+
+class Rules:
+    """The settings of one robot, asked by name."""
+
+    KNOWN = 4096
+
+    def __init__(self, settings: RobotSettings | None = None) -> None:
+        self.settings = settings or RobotSettings()
+        self._merged: dict[str, TopicRule] = {}
+
+    def exposes(self, name: str) -> bool:
+        """Whether agents may use, and see, what has this name."""
+        if name == self.settings.stop_topic:
+            return True
+        allowed = any(matches(pattern, name) for pattern in self.settings.expose)
+        return allowed and not any(matches(pattern, name) for pattern in self.settings.hide)
+
+    def check_exposed(self, name: str) -> None:
+        """Raise Refused when it is not exposed."""
+        if not self.exposes(name):
+            raise Refused(f"{name} is not open to headsets on this robot")
+
+    def of(self, name: str) -> TopicRule:
+        """Every setting from the first rule that fits and gives it."""
+        rule = self._merged.get(name)
+        if rule is None:
+            if len(self._merged) >= self.KNOWN:  # names come from the network
+                self._merged.clear()
+            rule = self._merged[name] = _merged(rule for rule in self.settings.rules if matches(rule.match, name))
+        return rule
+
+    def call_s(self, name: str) -> float:
+        """How long a service may take."""
+        return self.of(name).call_s or self.settings.call_s
+
+
+def _merged(rules: Iterable[TopicRule]) -> TopicRule:
+    merged = TopicRule(match="/**")
+    for rule in rules:
+        missing = {
+            field: value
+            for field in rule.__struct_fields__
+            if (value := getattr(rule, field)) is not None and getattr(merged, field) is None
+        }
+        merged = structs.replace(merged, **missing)
+    return merged
+
+
+def names_agent(patterns: Iterable[str], agent_type: str, agent_id: int, group: int) -> bool:
+    """Whether one of ``*``, ``unity``, ``unity/5`` or ``group/3`` means this agent."""
+    own = {"*", agent_type, f"{agent_type}/{agent_id}"}
+    if group:
+        own.add(f"group/{group}")
+    return not own.isdisjoint(patterns)

@@ -1,0 +1,363 @@
+"""Interface nodes for topics: a robot's topic to headsets (type 1), and headsets to a robot's topic (type 2).
+
+Topic data crosses as bytes, never decoded: from the ROS thread straight into the mesh, from the loop straight into a
+publisher.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import time
+from collections.abc import Iterable
+from typing import Any
+
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
+from rclpy.serialization import serialize_message
+
+from bridge.ros import fields, qos
+from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
+from bridge.ros.rules import DEFAULT_HOLD_S
+from bridge.ros.safety import Control, DeadMan
+from bridge.ros.stream import StreamFraming, cdr_problem
+from bridge.ros.types import InterfaceName, least_cdr_bytes, resolve
+from macs_zenoh.agent import Message
+from macs_zenoh.errors import MacsError, Refused
+from macs_zenoh.messages import ROS, AddNode, Metadata, NodeType, StreamData
+
+log = logging.getLogger("macs.ros")
+
+
+class SubscriberNode(InterfaceNode):
+    """Type 1: a robot's topic to its registrants, one frame per message whoever receives it."""
+
+    NODE_TYPE = NodeType.SUBSCRIBER
+    ROLE = "subscriber"
+
+    BURST = 64
+    """Messages taken in one turn of the executor: a turn costs more than a message."""
+
+    def __init__(self, robot: Robot, request: AddNode) -> None:
+        super().__init__(robot, request)
+        self._subscription: Any = None
+        self._profile: Any = None
+        self._message: type[Any] | None = None
+        self._rate = RateLimit(self.rule.max_hz) if self.rule.max_hz else None
+        self._loop = asyncio.get_running_loop()
+        self._frame = self._framing()
+
+    def registrants_changed(self) -> None:
+        self._frame = self._framing()
+
+    def open(self) -> None:
+        self._message = resolve(str(self.interface))
+        check_topic_type(self.robot.session.node, self.request.tos_name, self.interface)
+        self._subscribe(self._profile_of(self._publishers()))
+
+    def close(self) -> None:
+        subscription, self._subscription = self._subscription, None
+        if subscription is not None:
+            self.robot.session.node.destroy_subscription(subscription)
+
+    def receive(self, message: Message) -> None:
+        self.robot.drops.note("no_node", self.key.node_name, "data for a node that only sends")
+
+    def _framing(self) -> StreamFraming:
+        metadata = Metadata(
+            sender_agent_type=ROS,
+            sender_agent_id=self.robot.agent_id,
+            message_manager=StreamData.manager,
+            node_type=self.NODE_TYPE,
+            node_name=self.key.node_name,
+            data_exchange_type=self.interface.short,
+        )
+        return StreamFraming(metadata, self.registrants, self.robot.layout)
+
+    # -- in the ROS thread ---------------------------------------------------------------------------------------
+
+    def _publishers(self) -> list[Any]:
+        found = self.robot.session.node.get_publishers_info_by_topic(self.request.tos_name)
+        return [endpoint.qos_profile for endpoint in found]
+
+    def _profile_of(self, publishers: Iterable[Any]) -> Any:
+        profile = qos.for_subscription(publishers, qos.depth_of(self.request.buffer_size))
+        return qos.overridden(profile, self.rule)
+
+    def _subscribe(self, profile: Any) -> None:
+        node, topic = self.robot.session.node, self.request.tos_name
+        events = SubscriptionEventCallbacks(
+            matched=self._publisher_matched,
+            incompatible_qos=self._publisher_incompatible,
+            message_lost=self._lost,
+            use_default_callbacks=False,
+        )
+        with ros_errors(topic):
+            try:
+                self._subscription = node.create_subscription(
+                    self._message, topic, self._forward, profile, raw=True, event_callbacks=events
+                )
+            except UnsupportedEventTypeError:  # of some middlewares; then the QoS stays as it is
+                self._subscription = node.create_subscription(self._message, topic, self._forward, profile, raw=True)
+        self._profile = profile
+
+    def _forward(self, cdr: bytes) -> None:
+        self._publish(cdr)
+        handle, message = self._subscription.handle, self._message
+        with handle:
+            for _ in range(self.BURST):
+                taken = handle.take_message(message, True)
+                if taken is None:
+                    return
+                self._publish(taken[0])
+
+    def _publish(self, cdr: bytes) -> None:
+        if self._rate is None:
+            self._put(cdr)
+            return
+        now = time.monotonic()
+        waits = self._rate.waiting
+        due = self._rate.offer(cdr, now)
+        if due is None:
+            self._put(cdr)
+        elif not waits:
+            self._loop.call_soon_threadsafe(self._loop.call_later, due - now, self._put_latest_soon)
+
+    def _put_latest_soon(self) -> None:
+        self.robot.session.submit(self._put_latest)
+
+    def _put_latest(self) -> None:
+        if self._rate is not None and self._subscription is not None:
+            latest = self._rate.take(time.monotonic())
+            if latest is not None:
+                self._put(latest)
+
+    def _put(self, cdr: bytes) -> None:
+        try:
+            self.robot.publish_stream(self.key.node_name, self._frame(cdr))
+        except MacsError as error:
+            self.robot.drops.note("failed", self.topic, str(error))
+
+    def _publisher_matched(self, change: Any) -> None:
+        if change.current_count_change > 0:
+            self.robot.session.submit(self._follow)
+
+    def _publisher_incompatible(self, _change: Any) -> None:
+        self.robot.session.submit(self._follow)
+
+    def _follow(self) -> None:
+        """Adopt the QoS of publishers that came after us."""
+        publishers = self._publishers()
+        if self._subscription is None or not publishers:
+            return
+        profile = self._profile_of(publishers)
+        if not qos.same(profile, self._profile):
+            log.info("%s: its publishers changed, subscribing again with %s", self.topic, _describe(profile))
+            self.close()
+            self._subscribe(profile)
+
+    def _lost(self, status: Any) -> None:
+        text = "ROS lost messages before they were taken; a larger buffer size may help"
+        self.robot.drops.note("lost_in_ros", self.topic, text, int(status.total_count_change))
+
+
+class RateLimit:
+    """At most ``max_hz`` messages per second; of those that come too soon only the latest waits. Pure."""
+
+    def __init__(self, max_hz: float) -> None:
+        self._period_s = 1 / max_hz
+        self._next = -math.inf
+        self._latest: bytes | None = None
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a message waits for its time."""
+        return self._latest is not None
+
+    def offer(self, message: bytes, now: float) -> float | None:
+        """None: send it now. Otherwise it waits in place of an older one, until the time that is returned."""
+        if self._latest is None and now >= self._next:
+            self._sent(now)
+            return None
+        self._latest = message
+        return self._next
+
+    def take(self, now: float) -> bytes | None:
+        """The message that waits, to be sent now."""
+        latest, self._latest = self._latest, None
+        if latest is not None:
+            self._sent(now)
+        return latest
+
+    def _sent(self, now: float) -> None:
+        """Keep the pace: a message that was a little late does not delay all that follow."""
+        late_s = now - self._next
+        self._next = (self._next if late_s < self._period_s else now) + self._period_s
+
+
+class PublisherNode(InterfaceNode):
+    """Type 2: what agents send to a robot's topic, as far as safety lets it pass."""
+
+    NODE_TYPE = NodeType.PUBLISHER
+    ROLE = "publisher"
+
+    MATCH_S = 0.5
+    """How long a new publisher waits for the subscriptions that exist to find it."""
+    LINGER_S = 1.0
+    """How long a publisher stays after its stop message: destroyed at once, it takes unread messages with it."""
+
+    def __init__(self, robot: Robot, request: AddNode) -> None:
+        super().__init__(robot, request)
+        if self.rule.read_only:
+            raise Refused(f"headsets may only read {self.topic} on this robot")
+        self.control = Control(self.rule.hold_s or DEFAULT_HOLD_S) if self.rule.exclusive else None
+        self.deadman = DeadMan(self.rule.deadman_s) if self.rule.deadman_message is not None else None
+        self._stop_cdr = b""
+        self._stopped_at = -math.inf
+        self._watch: asyncio.TimerHandle | None = None
+        self._publisher: Any = None
+        self._least_bytes = 4
+        self._expected = 0
+        self._matched = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+
+    def open(self) -> None:
+        message = resolve(str(self.interface))
+        self._least_bytes = least_cdr_bytes(message)
+        if self.rule.deadman_message is not None:
+            stop = fields.filled(message, self.rule.deadman_message, "deadman_message")
+            self._stop_cdr = bytes(serialize_message(stop))
+        node, topic = self.robot.session.node, self.request.tos_name
+        check_topic_type(node, topic, self.interface)
+        subscriptions = [endpoint.qos_profile for endpoint in node.get_subscriptions_info_by_topic(topic)]
+        profile = qos.for_publisher(
+            subscriptions, qos.depth_of(self.request.buffer_size), latched=self.request.is_latched
+        )
+        profile = qos.overridden(profile, self.rule)
+        self._expected = len(subscriptions)
+        events = PublisherEventCallbacks(matched=self._subscription_matched, use_default_callbacks=False)
+        with ros_errors(topic):
+            try:
+                self._publisher = node.create_publisher(message, topic, profile, event_callbacks=events)
+            except UnsupportedEventTypeError:  # of some middlewares; then the time decides
+                self._publisher = node.create_publisher(message, topic, profile)
+
+    async def settle(self) -> None:
+        """Let the subscriptions that exist find the new publisher: what is published before that, ROS loses."""
+        if self._expected:
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._matched.wait(), self.MATCH_S)
+
+    def _subscription_matched(self, status: Any) -> None:
+        if status.current_count >= self._expected:
+            self._loop.call_soon_threadsafe(self._matched.set)
+
+    def retire(self) -> None:
+        if self._watch is not None:
+            self._watch.cancel()
+        if self.deadman is not None and self.deadman.disarm("the node was removed"):
+            self._publish_stop(self.deadman.why)
+
+    def close(self) -> None:
+        publisher, self._publisher = self._publisher, None
+        if publisher is None:
+            return
+        node = self.robot.session.node
+        if self._stopped_at + self.LINGER_S > time.monotonic():
+            self.robot.session.later(self.LINGER_S, lambda: node.destroy_publisher(publisher))
+        else:
+            node.destroy_publisher(publisher)
+
+    def receive(self, message: Message) -> None:
+        sender = Registrant.of(message)
+        problem = cdr_problem(message.data, self._least_bytes)
+        if problem is not None:
+            text = f"refused {len(message.data)} bytes for {self.interface}: {problem}"
+            self.robot.drops.note("bad_cdr", f"{self.topic} from {sender}", text)
+        elif self.robot.stop.stopped:
+            self.robot.drops.note("stopped", f"{self.topic} from {sender}", "the emergency stop holds")
+        elif self.control is not None and not self.control.take(sender, self._loop.time()):
+            holder = self.control.holder(self._loop.time())
+            self.robot.drops.note("not_in_control", f"{self.topic} from {sender}", f"{holder} has control")
+        elif self._publish(message.data) and self.deadman is not None:
+            self.deadman.command(sender, self._loop.time())
+            if self._watch is None:
+                self._watch_silence()
+
+    def _publish(self, cdr: bytes) -> bool:
+        try:
+            self._publisher.publish(cdr)
+        except RuntimeError as error:
+            self.robot.drops.note("failed", self.topic, f"ROS did not publish: {error}")
+            return False
+        return True
+
+    # -- safety, on the loop -------------------------------------------------------------------------------------
+
+    def left(self, agent: Registrant) -> None:
+        if self.control is not None:
+            self.control.release(agent)
+        if self.deadman is not None and self.deadman.left(agent):
+            self._publish_stop(self.deadman.why)
+
+    def cut_off(self) -> None:
+        if self.deadman is not None and self.deadman.disarm("the mesh is lost"):
+            self._publish_stop(self.deadman.why)
+
+    def deregister(self, registrant: Registrant) -> None:
+        super().deregister(registrant)
+        self.left(registrant)
+
+    def emergency_stop(self, by: str) -> None:
+        # whether commands were under way or not
+        if self.deadman is not None:
+            self.deadman.disarm(f"emergency stop by {by}")
+            self._publish_stop(f"emergency stop by {by}")
+
+    def _watch_silence(self) -> None:
+        """Look when the dead-man may be due; a command in between costs nothing."""
+        self._watch = None
+        if self.deadman is None:
+            return
+        now = self._loop.time()
+        if self.deadman.tick(now):
+            self._publish_stop(self.deadman.why)
+        elif (deadline := self.deadman.deadline()) is not None:
+            self._watch = self._loop.call_at(deadline, self._watch_silence)
+
+    def _publish_stop(self, why: str) -> None:
+        if self._publisher is not None and self._publish(self._stop_cdr):
+            self._stopped_at = time.monotonic()
+            log.warning("%s: %s; published the stop message", self.topic, why)
+
+    def status(self) -> dict[str, Any]:
+        status = super().status()
+        if self.control is not None:
+            now = self._loop.time()
+            holder = self.control.holder(now)
+            status["control"] = {
+                "holder": str(holder) if holder else None,
+                "seconds_left": round(self.control.seconds_left(now), 1) if holder else 0,
+            }
+        if self.deadman is not None:
+            commander = self.deadman.commander
+            status["deadman"] = {
+                "silence_s": self.deadman.silence_s,
+                "commander": str(commander) if commander else None,
+                "trips": self.deadman.trips,
+                "last": self.deadman.why,
+            }
+        return status
+
+
+def check_topic_type(node: Any, topic: str, interface: InterfaceName) -> None:
+    """Raise Refused when the topic exists and carries another type. In the ROS thread."""
+    endpoints = [*node.get_publishers_info_by_topic(topic), *node.get_subscriptions_info_by_topic(topic)]
+    types = {endpoint.topic_type for endpoint in endpoints}
+    if types and str(interface) not in types:
+        raise Refused(f"{topic} carries {' and '.join(sorted(types))} on this robot, not {interface}")
+
+
+def _describe(profile: Any) -> str:
+    return f"{profile.reliability.name.lower()}, {profile.durability.name.lower()}".replace("_", " ")

@@ -1,0 +1,84 @@
+"""Parameters, launch file and unit: how a robot is started by ROS people."""
+
+from __future__ import annotations
+
+import ast
+import configparser
+import shlex
+from pathlib import Path
+
+import pytest
+
+from bridge.cli import main
+from bridge.ros import parameters
+from bridge.ros.agent import open_robot
+from bridge.ros.session import RosSession
+from macs_zenoh.config import MeshSettings, RobotSettings, Settings
+from macs_zenoh.errors import ConfigError
+
+CONFIG = Path(__file__).parents[2] / "config"
+BASE = Settings(mesh=MeshSettings(connect=["tcp/10.0.0.9:1"]), robot=RobotSettings(id=4, group=2))
+
+
+@pytest.mark.parametrize(
+    ("given", "connect", "robot"),
+    [
+        ({}, "tcp/10.0.0.9:1", (4, 2)),
+        ({"router_ip_address": "10.0.0.1"}, "tcp/10.0.0.1:7447", (4, 2)),
+        ({"router_port": "7000"}, "tcp/127.0.0.1:7000", (4, 2)),
+        ({"router_ip_address": "fe80::1", "router_port": "7000"}, "tcp/[fe80::1]:7000", (4, 2)),
+        ({"group_id": "3", "agent_id": "7"}, "tcp/10.0.0.9:1", (7, 3)),
+        ({"group_id": "0"}, "tcp/10.0.0.9:1", (4, 0)),
+    ],
+)
+async def test_parameters_win_over_settings(
+    domain: int, given: dict[str, str], connect: str, robot: tuple[int, int]
+) -> None:
+    """Each parameter that is set has its effect, the others have none."""
+    with RosSession(domain_id=domain, ros_args=_ros_args(given)) as session:
+        settings = await session.run(lambda: parameters.apply(session.node, BASE))
+    assert settings.mesh.connect == [connect]
+    assert (settings.robot.id, settings.robot.group) == robot
+
+
+@pytest.mark.parametrize("given", [{"router_port": "seven"}, {"router_port": "70000"}, {"group_id": "256"}])
+async def test_a_wrong_parameter_is_an_error(domain: int, given: dict[str, str]) -> None:
+    """The robot does not start, and says which parameter."""
+    with pytest.raises(ConfigError, match=r"router_port|robot\.group"):
+        async with open_robot(BASE, domain_id=domain, ros_args=_ros_args(given)):
+            raise AssertionError("it started")
+
+
+async def test_namespace_and_remapping_hold(domain: int) -> None:
+    """The node has the name and namespace that ROS arguments give, and relative names follow."""
+    ros_args = ["--ros-args", "-r", "__ns:=/robot7", "-r", "__node:=eyes", "-r", "cmd_vel:=/drive"]
+    with RosSession(domain_id=domain, ros_args=ros_args) as session:
+        assert session.full_name == "/robot7/eyes"
+        assert session.node.resolve_topic_name("camera") == "/robot7/camera"
+        assert session.node.resolve_topic_name("cmd_vel") == "/drive"
+
+
+def test_the_launch_file_starts_what_exists() -> None:
+    """It is valid Python, and every option and parameter in it is one that the agent has."""
+    text = (CONFIG / "robot.launch.py").read_text()
+    words = {node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Constant)}
+    assigned = {str(word).removesuffix(":=") for word in words if str(word).endswith(":=")}
+    assert assigned == {*parameters.TYPES, "__ns"}
+    assert {"macs", "agent", "--settings", "--ros-args"} <= words
+
+
+def test_the_unit_starts_what_exists(capsys: pytest.CaptureFixture[str]) -> None:
+    """Its command is a verb with options that there are."""
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment, method-assign]
+    unit.read(CONFIG / "macs-robot.service")
+    shell = shlex.split(unit["Service"]["ExecStart"])[2].replace("$$", "$")
+    command = shlex.split(shell.rpartition("exec ")[2])[1:]
+    with pytest.raises(SystemExit):
+        main([*command, "--help"])
+    assert "--settings" in capsys.readouterr().out
+
+
+def _ros_args(given: dict[str, str]) -> list[str]:
+    pairs = [["-p", f"{name}:={value}"] for name, value in given.items()]
+    return ["--ros-args", *(word for pair in pairs for word in pair)] if pairs else []

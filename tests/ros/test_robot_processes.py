@@ -1,0 +1,212 @@
+"""Every kind of interface node on real processes: router, gateway, robot agent; headsets over TCP; ROS nodes here."""
+
+from __future__ import annotations
+
+import array
+import asyncio
+import signal
+import time
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+from rclpy.action import ActionServer
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
+
+from bridge.headset.actions import SUCCEEDED
+from bridge.headset.client import Headset
+from macs_zenoh.errors import Refused, Unreachable
+from tests.programs import Program, free_port
+from tests.ros.ros_peer import Peer, until
+
+SET = "std_srvs/SetBool"
+
+
+@dataclass
+class Site:
+    """Everything that runs: three headsets of group 4, robot 1 of group 3."""
+
+    robot: Program
+    headsets: list[Headset]
+
+    @property
+    def headset(self) -> Headset:
+        return self.headsets[0]
+
+
+@pytest.fixture
+async def site(domain: int, count_action: Any) -> AsyncIterator[Site]:
+    async with AsyncExitStack() as stack:
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        await stack.enter_async_context(Program("router", "-l", endpoint))
+        gateway = await stack.enter_async_context(Program("gateway", "--port", "0", "-e", endpoint))
+        robot = Program("agent", "--id", "1", "--group", "3", "-e", endpoint, env={"ROS_DOMAIN_ID": str(domain)})
+        await robot.start()
+        stack.push_async_callback(robot.stop)
+        headsets = [
+            await stack.enter_async_context(await Headset.connect("127.0.0.1", gateway.port, group=4, reconnect=True))
+            for _ in range(3)
+        ]
+        for headset in headsets:
+            while (await headset.online()).ros_agent_ids != [1]:
+                await asyncio.sleep(0.02)
+        yield Site(robot, headsets)
+
+
+async def serve_set(peer: Peer, name: str) -> None:
+    def answer(request: Any, response: Any) -> Any:
+        response.success, response.message = request.data, "robot"
+        return response
+
+    await peer.session.run(lambda: peer.session.node.create_service(SetBool, name, answer))
+
+
+@pytest.mark.parametrize("how", ["agents", "groups"])
+async def test_three_headsets_get_a_camera(site: Site, peer: Peer, how: str) -> None:
+    """A best-effort image of 1 MB reaches three headsets whole, registered by id or by group; a late one too."""
+    where = {"agents": [1]} if how == "agents" else {"groups": [3]}
+    early = [await h.subscribe("/camera", "sensor_msgs/Image", **where) for h in site.headsets[:2]]
+    publisher = await peer.publisher(Image, "/camera", qos_profile_sensor_data, matched=1)
+    image = Image(width=1000, height=1000, encoding="mono8", step=1000, data=array.array("B", bytes(1_000_000)))
+    image.data[999_999] = 7
+
+    async def publish() -> None:
+        while True:
+            publisher.publish(image)
+            await asyncio.sleep(0.1)
+
+    task = asyncio.create_task(publish())
+    late = await site.headsets[2].subscribe("/camera", "sensor_msgs/Image", **where)
+    for subscription in (*early, late):
+        message = await asyncio.wait_for(subscription.__anext__(), 10)
+        assert deserialize_message(message.data, Image) == image
+    task.cancel()
+
+
+async def test_services_both_ways(site: Site, peer: Peer) -> None:
+    """Headsets call a robot's service and run one for the robot's nodes, and hear why when a call fails."""
+    await serve_set(peer, "/set")
+    on = bytes(serialize_message(SetBool.Request(data=True)))
+    answers = await asyncio.gather(*(h.call("/set", SET, 1, on, failures=True) for h in site.headsets))
+    assert [deserialize_message(answer, SetBool.Response).success for answer in answers] == [True] * 3
+    with pytest.raises(Unreachable, match="there is no service /none on this robot"):
+        await site.headset.call("/none", SET, 1, on, failures=True)
+    with pytest.raises(Refused, match="the request is no std_srvs/srv/SetBool"):
+        await site.headset.call("/set", SET, 1, b"\x00\x01", failures=True)
+
+    async def handler(request: Any) -> bytes:
+        if not deserialize_message(request.data, SetBool.Request).data:
+            raise Refused("not now")
+        return bytes(serialize_message(SetBool.Response(success=True, message="headset")))
+
+    await site.headset.serve("/ask", SET, handler, agents=[1])
+    client = await peer.session.run(lambda: peer.session.node.create_client(SetBool, "/ask"))
+    await until(client.service_is_ready)
+    for data, success, text in ((True, True, "headset"), (False, False, "not now")):
+        request = SetBool.Request(data=data)
+        call = await peer.session.run(lambda request=request: client.call_async(request))
+        await until(call.done)
+        response = call.result()
+        assert response.success is success
+        assert text in response.message
+
+
+async def test_a_headset_that_vanishes_in_a_call_ends_it(site: Site, peer: Peer) -> None:
+    """The ROS caller gets its error when the headset that serves is cut off, long before the deadline."""
+    asked = asyncio.Event()
+
+    async def handler(request: Any) -> bytes:
+        asked.set()
+        await asyncio.sleep(60)
+        return b""
+
+    await site.headset.serve("/ask", SET, handler, agents=[1])
+    client = await peer.session.run(lambda: peer.session.node.create_client(SetBool, "/ask"))
+    await until(client.service_is_ready)
+    call = await peer.session.run(lambda: client.call_async(SetBool.Request()))
+    await asyncio.wait_for(asked.wait(), 5)
+    await site.headset.abort()
+    await until(call.done, 3)
+    assert "has left" in call.result().message
+
+
+async def test_an_action_over_the_wire(site: Site, peer: Peer, count_action: Any) -> None:
+    """Goal, feedback and result; and the result of a goal whose headset lost its connection meanwhile."""
+
+    def execute(goal: Any) -> Any:
+        for number in range(goal.request.to):
+            goal.publish_feedback(count_action.Feedback(at=number))
+        time.sleep(0.2)  # in ROS a result can overtake the feedback before it
+        goal.succeed()
+        return count_action.Result(reached=goal.request.to, text="done")
+
+    server = await peer.session.run(lambda: ActionServer(peer.session.node, count_action, "/count", execute))
+    while b'"/count":"macs_test_msgs/action/Count"' not in await site.headset.ask(1, "FunctionalityGetter"):
+        await asyncio.sleep(0.05)
+    counting = await site.headset.action("/count", "macs_test_msgs/Count", agents=[1], buffer_size=100)
+    goal = await counting.send_goal(1, bytes(serialize_message(count_action.Goal(to=3))), timeout_s=10)
+    assert [deserialize_message(data, count_action.Feedback).at async for data in goal] == [0, 1, 2]
+    assert (await goal.result(5)).status == SUCCEEDED
+    site.headset.drop_connection()
+    while True:
+        try:
+            again = await counting.resume(1, goal.id)
+            break
+        except Unreachable:  # it is not back yet
+            await asyncio.sleep(0.02)
+    status, data = await again.result(10)
+    assert status == SUCCEEDED
+    assert deserialize_message(data, count_action.Result).text == "done"
+    await peer.session.run(server.destroy)
+
+
+async def test_a_robot_that_restarts_streams_on(site: Site, peer: Peer, domain: int) -> None:
+    """After kill -9 of the robot agent and a new start, headsets get the topic again without doing anything."""
+    subscription = await site.headset.subscribe("/chatter", "std_msgs/String", agents=[1])
+    publisher = await peer.publisher(String, "/chatter", matched=1)
+
+    published = 0
+
+    async def publish() -> None:
+        nonlocal published
+        while True:
+            published += 1
+            publisher.publish(String(data=str(published)))
+            await asyncio.sleep(0.02)
+
+    task = asyncio.create_task(publish())
+    await asyncio.wait_for(subscription.__anext__(), 10)
+    await site.robot.stop(signal.SIGKILL)
+    await site.robot.start()
+    restarted = published
+    while (
+        int(deserialize_message((await asyncio.wait_for(subscription.__anext__(), 20)).data, String).data) < restarted
+    ):
+        pass
+    task.cancel()
+
+
+async def test_what_a_robot_offers_and_its_state_are_asked_by_a_headset(site: Site, peer: Peer) -> None:
+    """Over TCP, a headset asks the robot, and its other requests go on."""
+    await peer.publisher(String, "/chatter")
+    while b'"/chatter":"std_msgs/msg/String"' not in await site.headset.ask(1, "FunctionalityGetter"):
+        await asyncio.sleep(0.05)
+    assert b'"stopped":false' in await site.headset.ask(1, "RobotStatus")
+    control = await site.headset.ask(1, "RobotControl", b'{"action": "take", "topic": "/cmd_vel"}')
+    assert b"nobody registered" in control
+    assert (await site.headset.online()).ros_agent_ids == [1]
+
+
+async def test_the_robot_leaves_at_once(site: Site) -> None:
+    """SIGINT and SIGTERM end the agent cleanly, with exit code 0, and everybody sees it leave."""
+    for number in (signal.SIGTERM, signal.SIGINT):
+        assert await site.robot.stop(number) == 0
+        while (await site.headset.online()).ros_agent_ids:
+            await asyncio.sleep(0.02)
+        await site.robot.start()
