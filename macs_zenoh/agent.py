@@ -300,15 +300,14 @@ class Agent:
         self._keep(self.mesh.watch_tokens(PRESENCE.every(), self._token))
         for key in await self.mesh.tokens(PRESENCE.every()):
             self._token(key, True)
-        if wanted_id is None:
-            await self._lease_id()
-        else:
-            await self._claim_fixed_id(wanted_id)
-        self._keep(self.mesh.subscribe(inbox(self.type_number, self.id), self._receive))
         self._keep(self.mesh.subscribe(BROADCAST.every(), self._receive))
         if self.group:
             members = GROUP.every(group=self.group, type=self.type_number)
             self._keep(self.mesh.subscribe(members, lambda batch: self._receive(batch, by_group=True)))
+        if wanted_id is None:
+            await self._lease_id()
+        else:
+            await self._claim_fixed_id(wanted_id)
 
     async def _claim_fixed_id(self, agent_id: int) -> None:
         if not 1 <= agent_id <= 0xFFFF:
@@ -344,7 +343,12 @@ class Agent:
             tried.add(agent_id)
 
     async def _claim(self, agent_id: int) -> bool:
-        """Declare presence under an id and see that nobody with an older right to it did the same at once."""
+        """Declare presence under an id and see that nobody with an older right to it did the same at once.
+
+        The inbox comes before the token: whoever sees the agent can reach it.
+        """
+        self.id = agent_id
+        messages = self.mesh.subscribe(inbox(self.type_number, agent_id), self._receive)
         token = self.mesh.declare_token(
             PRESENCE.of(type=self.type_number, id=agent_id, group=self.group, zid=self.mesh.zid)
         )
@@ -352,8 +356,10 @@ class Agent:
         others = [agent.zid for agent in self.directory.claimants(self.type_number, agent_id)]
         if not blocks.keeps(self.mesh.zid, others):
             token.close()
+            messages.close()
+            self.id = 0
             return False
-        self.id = agent_id
+        self._keep(messages)
         self._keep(token)
         return True
 

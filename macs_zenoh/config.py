@@ -125,11 +125,12 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     block_limit_ms: Annotated[int, Meta(ge=1, le=60_000)] = 500
     """How long a blocking put may wait for a stuck link before that link is closed (Zenoh: 5 s for everyone)."""
     drop_wait_ms: Millis = 20
-    """How long a droppable message waits for room before it is dropped."""
+    """How long a droppable message waits for room before it is dropped. Zenoh waits 1 ms, which loses messages on a
+    machine that is merely busy; while a link stays full, only the first waits."""
     fragment_wait_ms: Millis = 50
     """The same for a message of several fragments, for all of them together: without it, big messages vanish."""
     tx_queue_batches: Annotated[int, Meta(ge=1, le=16)] = 8
-    """Batches queued per priority and link. Above 16 Zenoh panics at the first link."""
+    """Batches of 64 KiB queued per priority and link (Zenoh: 2). Above 16 Zenoh panics at the first link."""
     shared_memory: bool = False
     """Implicit shared memory bypasses size limits and can drop silently, so it is off (Zenoh: on)."""
     multicast: bool = False
@@ -320,6 +321,8 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     group: GroupId = 0
     max_nodes: Annotated[int, Meta(ge=1, le=10_000)] = 256
     """Interface nodes that headsets may have registered here at one time."""
+    managers: list[str] = []
+    """Own management messages, as for the gateway (docs/managers.md)."""
     expose: list[NamePattern] = msgspec.field(default_factory=lambda: ["/**"])
     """Topics, services and actions that headsets may use; existing programs name them freely, so all by default."""
     hide: list[NamePattern] = msgspec.field(default_factory=lambda: list(ROBOT_HIDES))

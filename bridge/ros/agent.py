@@ -20,11 +20,13 @@ from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.requests import STATUS, ControlReply, ControlRequest, control, status
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
+from macs_zenoh import managers
 from macs_zenoh.agent import Agent, Call, Message
 from macs_zenoh.config import RobotSettings, Settings
 from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import MacsError, Refused, WireError
 from macs_zenoh.keyexpr import type_name, type_number
+from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.messages import AddNode, FunctionalityRequest, Metadata, RemoveNode, decode_data, encode_data
 from macs_zenoh.wire import Layout
 
@@ -41,7 +43,10 @@ STOP_MESSAGES_S = 0.1
 class RobotAgent:
     """Connects an agent on the mesh with a ROS session. Made by `open_robot`."""
 
-    def __init__(self, agent: Agent, session: RosSession, settings: RobotSettings) -> None:
+    def __init__(
+        self, agent: Agent, session: RosSession, settings: RobotSettings, managers: Managers | None = None
+    ) -> None:
+        self._managers = managers or {}
         self.agent = agent
         self.session = session
         robot = Robot(
@@ -83,6 +88,8 @@ class RobotAgent:
             try:
                 if message.metadata.node_name:
                     self.nodes.deliver(message)
+                elif message.metadata.message_manager in self._managers:
+                    self._manage(message)
                 elif message.metadata.message_manager in REQUESTS:
                     # an answer may take a while; an emergency stop behind it must not wait
                     self._answering.add(answer := asyncio.create_task(self._answer(message)))
@@ -111,6 +118,19 @@ class RobotAgent:
         else:
             data = encode_data(self._controlled(sender, message.data))
         self._send(sender, Metadata(request_id=message.metadata.request_id), data)
+
+    def _manage(self, message: Message) -> None:
+        """A management message for a manager that somebody added."""
+        sender, name = Registrant.of(message), message.metadata.message_manager
+        manager = self._managers[name]
+        try:
+            data = decode_data(manager.Data, message.data)
+            answer = manager.manage(data, Asker(*sender, self._group_of(sender)))
+        except (Refused, WireError) as error:
+            self.nodes.drops.note("refused_by_manager", f"{name} for {sender}", str(error))
+            return
+        if answer is not None:
+            self._send(sender, Metadata(request_id=message.metadata.request_id), encode_data(answer))
 
     def _state(self) -> bytes:
         return status(self.nodes, self.session.full_name, self.agent.drops + self.agent.mesh.drops)
@@ -201,6 +221,7 @@ async def open_robot(
 
     Raises Unreachable when ROS cannot start; ConfigError; what `macs_zenoh.join` raises.
     """
+    own = managers.load(settings.robot.managers)
     session = await asyncio.to_thread(RosSession, NODE_NAME, domain_id=domain_id, ros_args=ros_args)
     try:
         settings = await session.run(lambda: parameters.apply(session.node, settings))
@@ -208,7 +229,7 @@ async def open_robot(
         async with macs_zenoh.join(
             "ros", id=robot.id, group=robot.group, settings=settings.mesh, on_waiting=on_waiting
         ) as agent:
-            ros_agent = RobotAgent(agent, session, robot)
+            ros_agent = RobotAgent(agent, session, robot, own)
             await ros_agent.start()
             work = asyncio.create_task(ros_agent.work())
             log.info("robot %d serves %s", agent.id, session.full_name)

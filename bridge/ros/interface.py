@@ -54,8 +54,8 @@ class Drops(Counter[str]):
     ``no_node`` data for a node that is not registered; ``held_full`` data before its registration, more than is kept;
     ``bad_cdr`` data that cannot be a ROS message; ``lost_in_ros`` messages that ROS lost before we could take them;
     ``failed`` messages that ROS or the mesh did not take; ``late_answer`` answers after their deadline, or to nothing;
-    ``not_in_control`` and ``stopped`` commands that safety did not let pass; ``bad_request`` what asks for nothing
-    that there is.
+    ``refused_by_manager`` management messages that an own manager did not take; ``not_in_control`` and ``stopped``
+    commands that safety did not let pass; ``bad_request`` what asks for nothing that there is.
     """
 
     LOGGED = 1000

@@ -3,54 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
 
 import macs_zenoh
 from macs_zenoh.messages import Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.wire import encode_frame, encode_message
 from tests.integration.conftest import Connect, StartGateway
+from tests.links import counted
 
 IMAGE_BYTES = 100_000
-
-
-class Link:
-    """A TCP link to the router that counts what goes up."""
-
-    def __init__(self) -> None:
-        self.endpoint = ""
-        self.up_bytes = 0
-
-
-@asynccontextmanager
-async def counted(router: str) -> AsyncIterator[Link]:
-    """A counting relay in front of the router."""
-    link = Link()
-    host, _, port = router.removeprefix("tcp/").rpartition(":")
-    tasks: set[asyncio.Task[None]] = set()
-
-    async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, up: bool) -> None:
-        with suppress(ConnectionError):
-            while data := await reader.read(65536):
-                link.up_bytes += len(data) if up else 0
-                writer.write(data)
-                await writer.drain()
-        writer.close()
-
-    async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        router_reader, router_writer = await asyncio.open_connection(host, int(port))
-        tasks.add(asyncio.create_task(pump(reader, router_writer, up=True)))
-        tasks.add(asyncio.create_task(pump(router_reader, writer, up=False)))
-
-    server = await asyncio.start_server(accept, "127.0.0.1", 0)
-    link.endpoint = f"tcp/127.0.0.1:{server.sockets[0].getsockname()[1]}"
-    try:
-        yield link
-    finally:
-        server.close()
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def test_one_copy_for_any_number_of_headsets(router: str, start_gateway: StartGateway, connect: Connect) -> None:

@@ -6,7 +6,7 @@ import array
 import asyncio
 import signal
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,50 +15,12 @@ from as2_ca_msgs.msg import LocalGenericMessage
 from std_msgs.msg import String
 
 from bridge.awareness.client import GatewayClient
+from tests.links import Link, counted
 from tests.programs import Program, free_port, macs
 from tests.ros.ros_peer import Peer, get, until
 
 LARGE = 10_000
 """Bytes of a message that would be noticed on a link."""
-
-
-class Link:
-    """A robot's link to the router, its bytes towards the robot counted."""
-
-    def __init__(self) -> None:
-        self.endpoint = ""
-        self.down_bytes = 0
-
-
-@asynccontextmanager
-async def counted(router: str) -> AsyncIterator[Link]:
-    """A relay in front of the router."""
-    link = Link()
-    host, _, port = router.removeprefix("tcp/").rpartition(":")
-    tasks: set[asyncio.Task[None]] = set()
-
-    async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, down: bool) -> None:
-        with suppress(ConnectionError):
-            while data := await reader.read(65536):
-                link.down_bytes += len(data) if down else 0
-                writer.write(data)
-                await writer.drain()
-        writer.close()
-
-    async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        router_reader, router_writer = await asyncio.open_connection(host, int(port))
-        tasks.add(asyncio.create_task(pump(reader, router_writer, down=False)))
-        tasks.add(asyncio.create_task(pump(router_reader, writer, down=True)))
-
-    server = await asyncio.start_server(accept, "127.0.0.1", 0)
-    link.endpoint = f"tcp/127.0.0.1:{server.sockets[0].getsockname()[1]}"
-    try:
-        yield link
-    finally:
-        server.close()
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 @dataclass
