@@ -201,7 +201,10 @@ class Mesh:
         """Whether a router is connected now; always true for a router."""
         self._on_link: list[Callable[[bool], None]] = []
         self._tasks: set[asyncio.Task[None]] = set()
-        self._links = session.info.declare_transport_events_listener(self._transport_changed, history=True)
+        # links, not transports, and directly: Zenoh tells of a lost link before it tells that everybody behind it
+        # left, and of the lost transport only after that
+        on_link = zenoh.handlers.Callback(self._link_changed, indirect=False)
+        self._links = session.info.declare_link_events_listener(on_link, history=True)
 
     @classmethod
     async def open(cls, settings: MeshSettings, *, on_waiting: Callable[[str], None] | None = None) -> Mesh:
@@ -263,25 +266,21 @@ class Mesh:
         """Call ``callback(up)`` whenever the connection to the routers is lost or back."""
         self._on_link.append(callback)
 
-    def _transport_changed(self, event: zenoh.TransportEvent) -> None:
-        zid = str(event.transport.zid)
-        if event.transport.whatami != zenoh.WhatAmI.ROUTER:
-            return
-        self._from_thread(self._set_router, zid, event.kind == zenoh.SampleKind.PUT)
+    def _link_changed(self, event: zenoh.LinkEvent) -> None:
+        self._from_thread(self._set_link, str(event.link.zid), event.kind == zenoh.SampleKind.PUT)
 
-    def _set_router(self, zid: str, up: bool) -> None:
+    def _set_link(self, zid: str, up: bool) -> None:
         before = self.linked
         (self._routers.add if up else self._routers.discard)(zid)
         self.linked = bool(self._routers) or not self._needs_router
-        # losing one router of several shakes what we know about others just as losing the only one does
-        if not up or not before:
-            for callback in self._on_link:
-                callback(self.linked and up)
-            if not up and self.linked:
-                for callback in self._on_link:
-                    callback(True)
         if before != self.linked:
             log.info("router %s", "connected" if self.linked else "lost; reconnecting")
+        if up and before:
+            return
+        # losing one router of several shakes what we know about others just as losing the only one does
+        for state in [False, True] if not up and self.linked else [up]:
+            for callback in self._on_link:
+                callback(state)
 
     # -- publish and subscribe -----------------------------------------------------------------------------------
 
