@@ -28,7 +28,17 @@ from dataclasses import dataclass
 from types import TracebackType
 
 from macs_zenoh.errors import CallTimeout, Unreachable, UsageError, WireError
-from macs_zenoh.messages import BROADCAST, ROS, Metadata, NodeType, OnlineReply, Welcome, decode_data, node_name
+from macs_zenoh.messages import (
+    BROADCAST,
+    ROS,
+    Metadata,
+    NodeRefused,
+    NodeType,
+    OnlineReply,
+    Welcome,
+    decode_data,
+    node_name,
+)
 from macs_zenoh.wire import MAX_FRAME_BYTES, split_message
 
 from . import frames
@@ -530,6 +540,9 @@ class Headset:
         elif not metadata.message_manager and self._take_answer(message):
             return
         else:
+            if metadata.message_manager == NodeRefused.manager:
+                refused = decode_data(NodeRefused, message.data)
+                log.warning("robot %d refused %s: %s", refused.robot_id, refused.tos_name, refused.reason)
             mailbox = self._inbox
         if mailbox is not None:
             await mailbox.offer(message)

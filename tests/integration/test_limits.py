@@ -164,7 +164,7 @@ async def test_descriptors_run_out() -> None:
         await answers(late)
 
 
-async def test_a_refusal_is_told(router: str, start_gateway: StartGateway) -> None:
+async def test_a_refusal_is_told(router: str, start_gateway: StartGateway, caplog: pytest.LogCaptureFixture) -> None:
     """A headset whose registration a robot refuses is told why, by a management message of its own."""
     gateway = await start_gateway()
 
@@ -179,6 +179,7 @@ async def test_a_refusal_is_told(router: str, start_gateway: StartGateway) -> No
             assert message.metadata.message_manager == NodeRefused.manager
             refused = decode_data(NodeRefused, message.data)
             assert (refused.robot_id, refused.tos_name, refused.reason) == (1, "/secret", "no such type here")
+            assert "robot 1 refused /secret: no such type here" in caplog.text
 
 
 async def test_a_name_with_another_type_is_kept_away(
