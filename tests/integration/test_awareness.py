@@ -125,6 +125,7 @@ async def test_who_joins_late_learns_the_last_values(meet: Meet) -> None:
     late = Module(await meet("late"), "t", last_value=True)
     assert (await late.next()).data == b"a2"
     plain = Module(await meet("plain"), "t")
+    await a.wait_for("plain", "t", timeout_s=5)
     a.send("", "t", b"a3")
     assert [(await late.next()).data, (await plain.next()).data] == [b"a3", b"a3"]
     assert late.received.empty()
