@@ -21,7 +21,7 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Awaitable, Callable, Iterable
 from enum import Enum
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import zenoh
@@ -104,9 +104,16 @@ class _Arrivals:
 
     def put(self, publisher: zenoh.Publisher, payload: Payload) -> None:
         """Publish. Zenoh calls our own subscriptions back within this, and they take the payload as it is."""
+        self._put(publisher, payload, payload)
+
+    def put_here(self, publisher: zenoh.Publisher, payload: Payload) -> None:
+        """Publish to our own subscriptions only: Zenoh finds them, and is given nothing to copy."""
+        self._put(publisher, payload, b"")
+
+    def _put(self, publisher: zenoh.Publisher, payload: Payload, zenohs: Payload) -> None:
         self._own.payload = payload
         try:
-            publisher.put(payload)
+            publisher.put(zenohs)
         except zenoh.ZError as error:  # the session is closed
             log.debug("put: %s", error)
         finally:
@@ -174,6 +181,15 @@ class _Arrivals:
         return True
 
 
+class _Apart(NamedTuple):
+    """Two publishers for one key: our own subscriptions, and everybody else's."""
+
+    here: zenoh.Publisher
+    away: zenoh.Publisher
+    settled_at: float
+    """When Zenoh surely knows who listens: until then it sends to the router in any case."""
+
+
 class Mesh:
     """One program's place on the mesh. Made by `open`; an async context manager.
 
@@ -183,6 +199,7 @@ class Mesh:
 
     PUBLISHERS = 4096
     LARGE_BYTES = 128 << 10
+    SETTLE_S = 2.0
 
     def __init__(self, session: zenoh.Session, settings: MeshSettings, backlog_bytes: int = 64 << 20) -> None:
         self.settings = settings
@@ -192,6 +209,7 @@ class Mesh:
         self._loop = asyncio.get_running_loop()
         self._arrivals = _Arrivals(self._loop, self._from_thread, self.drops)
         self._publishers: dict[Traffic, OrderedDict[str, zenoh.Publisher]] = {kind: OrderedDict() for kind in Traffic}
+        self._apart: OrderedDict[str, _Apart] = OrderedDict()
         self._publishers_lock = threading.Lock()
         self._on_room: list[Callable[[], None]] = []
         self._sender = _Sender(backlog_bytes, self._arrivals.put, lambda: self._from_thread(self._room))
@@ -271,6 +289,7 @@ class Mesh:
 
     def _set_link(self, zid: str, up: bool) -> None:
         before = self.linked
+        self._apart.clear()  # who listens is unknown again
         (self._routers.add if up else self._routers.discard)(zid)
         self.linked = bool(self._routers) or not self._needs_router
         if before != self.linked:
@@ -288,14 +307,22 @@ class Mesh:
         """Publish. From any thread; never waits for more than a full link's ``block_limit_ms``.
 
         Kept traffic that is large, or that follows a large one, is sent by a thread of its own, so that 20 MiB over
-        a slow link do not hold up the loop.
+        a slow link do not hold up the loop; between two agents of this program it is not copied at all.
         """
         if not self.linked:
             self.drops["no_route"] += 1
         publisher = self._publishers[traffic].get(key) or self._declare(key, traffic)
         if traffic is not Traffic.CALL or (self._sender.idle and len(payload) <= self.LARGE_BYTES):
             self._arrivals.put(publisher, payload)
-        elif not self._sender.put(publisher, payload):
+        else:
+            self._put_apart(self._apart.get(key) or self._declare_apart(key), payload)
+
+    def _put_apart(self, apart: _Apart, payload: Payload) -> None:
+        """Our own subscriptions get the payload as it is, now; the sender copies it for others, if any listen."""
+        self._arrivals.put_here(apart.here, payload)
+        if time.monotonic() > apart.settled_at and not apart.away.matching_status.matching:  # type: ignore[attr-defined]
+            return
+        if not self._sender.put(apart.away, payload):
             self.drops["backlog"] += 1
 
     @property
@@ -329,6 +356,20 @@ class Mesh:
             if len(publishers) > self.PUBLISHERS:
                 publishers.popitem(last=False)  # undeclared when the last put with it is done
         return publisher
+
+    def _declare_apart(self, key: str) -> _Apart:
+        priority, congestion, express = Traffic.CALL.value
+        here, away = (
+            self._session.declare_publisher(
+                key, priority=priority, congestion_control=congestion, express=express, allowed_destination=where
+            )
+            for where in (zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE)
+        )
+        with self._publishers_lock:
+            apart = self._apart[key] = _Apart(here, away, time.monotonic() + self.SETTLE_S)
+            if len(self._apart) > self.PUBLISHERS:
+                self._apart.popitem(last=False)
+        return apart
 
     # -- calls ---------------------------------------------------------------------------------------------------
 

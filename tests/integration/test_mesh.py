@@ -1,0 +1,86 @@
+"""The Zenoh session on a real router: who gets what, in which order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.mesh import Mesh, Sample
+from tests.integration.conftest import until
+from tests.routers import Router
+
+KEY = "macs/to/unity/0/1/unity/2"
+LARGE = Mesh.LARGE_BYTES + 1
+
+
+def keeper(into: list[tuple[int, bytes]]) -> Callable[[list[Sample]], None]:
+    """Keeps size and end of every sample."""
+    return lambda batch: into.extend((len(payload), bytes(payload[-4:])) for _, payload in batch)
+
+
+def payloads(count: int) -> list[bytes]:
+    """Large and small ones in turn, numbered."""
+    return [(LARGE if i % 2 == 0 else 8) * b"x" + i.to_bytes(4, "big") for i in range(count)]
+
+
+async def test_large_and_small_keep_their_order_here_and_elsewhere(router: str) -> None:
+    """What one program puts on a key reaches its own subscription and another program's once, in its order."""
+    here: list[tuple[int, bytes]] = []
+    away: list[tuple[int, bytes]] = []
+    async with (
+        await Mesh.open(MeshSettings(connect=[router])) as mesh,
+        await Mesh.open(MeshSettings(connect=[router])) as other,
+    ):
+        mesh.subscribe(KEY, keeper(here))
+        other.subscribe(KEY, keeper(away))
+        await until(lambda: (mesh.put(KEY, b"begin"), away)[1])  # the routers know who listens
+        sent = payloads(40)
+        for payload in sent:
+            mesh.put(KEY, payload)
+        expected = [(len(payload), payload[-4:]) for payload in sent]
+        await until(lambda: here[-40:] == expected and away[-40:] == expected)
+        assert not mesh.drops
+
+
+@pytest.mark.parametrize("settled", [True, False])
+async def test_who_subscribes_later_gets_large_payloads(
+    router: str, settled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A program that begins to listen to a key on which large payloads stayed in one program gets the next ones."""
+    if settled:
+        monkeypatch.setattr(Mesh, "SETTLE_S", 0.0)
+    here: list[tuple[int, bytes]] = []
+    away: list[tuple[int, bytes]] = []
+    async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
+        mesh.subscribe(KEY, keeper(here))
+        for payload in payloads(4):
+            mesh.put(KEY, payload)
+        await until(lambda: len(here) == 4)
+        async with await Mesh.open(MeshSettings(connect=[router])) as other:
+            other.subscribe(KEY, keeper(away))
+            number = 4
+
+            def put() -> list[tuple[int, bytes]]:
+                nonlocal number
+                mesh.put(KEY, LARGE * b"x" + number.to_bytes(4, "big"))
+                number += 1
+                return away
+
+            await until(put)
+            await until(lambda: len(here) == number)
+        assert [end for _, end in here] == [i.to_bytes(4, "big") for i in range(number)]
+
+
+async def test_a_lost_router_costs_nothing_between_agents_of_one_program() -> None:
+    """Large payloads pass between two agents of one program while there is no router."""
+    here: list[tuple[int, bytes]] = []
+    async with Router() as router, await Mesh.open(MeshSettings(connect=[router.endpoint])) as mesh:
+        mesh.subscribe(KEY, keeper(here))
+        await router.stop()
+        await until(lambda: not mesh.linked)
+        for payload in payloads(6):
+            mesh.put(KEY, payload)
+        await until(lambda: len(here) == 6)
+        assert [end for _, end in here] == [i.to_bytes(4, "big") for i in range(6)]
