@@ -1,7 +1,7 @@
 """macs-zenoh: a Zenoh mesh on which ROS 2 robots and XR headsets reach each other by id, by group or all at once."""
 
 from .agent import Agent, Call, Message, join
-from .config import MeshSettings
+from .config import MeshSettings, TrafficRule
 from .directory import AgentInfo
 from .errors import MacsError, Refused, Unreachable
 from .messages import Metadata, NodeType
@@ -16,6 +16,7 @@ __all__ = [
     "Metadata",
     "NodeType",
     "Refused",
+    "TrafficRule",
     "Unreachable",
     "join",
 ]

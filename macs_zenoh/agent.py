@@ -15,27 +15,25 @@ import logging
 import time
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from typing import NamedTuple
 
 from msgspec import structs
 
-from . import blocks, keyexpr
-from .config import MeshSettings, changed
+from . import keyexpr
+from .config import MeshSettings, Priority, TrafficRule, changed
 from .directory import AgentInfo, Change, Directory
 from .errors import CallTimeout, OutOfRange, Unreachable, UsageError, WireError
-from .keyexpr import BROADCAST, CALL, GROUP, LEASE, PRESENCE, STREAM, type_name, type_number
-from .mesh import Mesh, Sample, Subscription, Traffic
+from .identity import Identity
+from .keyexpr import BROADCAST, CALL, GROUP, STREAM, type_name, type_number
+from .mesh import Handler, Mesh, Sample, Subscription, Traffic
 from .messages import BROADCAST as EVERYBODY
 from .messages import Metadata, NodeType
-from .routing import inbox, keys_of, takes_group_copy
+from .presence import Presence
+from .routing import call, inbox, keys_of, takes_group_copy
 from .wire import Layout, encode_frame, encode_message, parse_frame, parse_frames
 
 log = logging.getLogger("macs.agent")
-
-SETTLE_S = 0.3
-"""How long a claimed id waits for somebody else's claim on it to show up."""
-
 
 RETRY_S = 0.05
 """How long a call waits before it asks again an agent that is online and does not serve it yet."""
@@ -62,6 +60,7 @@ class Call(NamedTuple):
 
 CallHandler = Callable[[Call], Awaitable[bytes]]
 OnPresence = Callable[[AgentInfo, bool], None]
+OnId = Callable[[int, int], None]
 
 
 class Agent:
@@ -79,7 +78,8 @@ class Agent:
         self.group = group
         self.id = 0
         self.drops: Counter[str] = Counter()
-        self.directory = Directory()
+        self._presence = Presence(mesh, self._presence_changed, lambda contested: self._identity.contested(contested))
+        self._identity = Identity(mesh, self._presence, agent_type, group, listen=self._listen, on_id=self._id_changed)
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
         self._stream_keys: dict[str, str] = {}
         self._inbox: deque[Message] = deque()
@@ -87,13 +87,19 @@ class Agent:
         self._closed = False
         self._declared: list[Subscription] = []
         self._on_presence: list[OnPresence] = []
-        self._sweep: asyncio.TimerHandle | None = None
+        self._on_id: list[OnId] = []
+        self._served: list[tuple[str, Handler, Subscription]] = []
         self._warned: set[tuple[int, int]] = set()
 
     @property
     def type(self) -> str:
         """``ros``, ``unity`` or the type's number as text."""
         return type_name(self.type_number)
+
+    @property
+    def directory(self) -> Directory:
+        """Who is online."""
+        return self._presence.directory
 
     def __repr__(self) -> str:
         return f"<Agent {self.type}/{self.id} group {self.group}>"
@@ -126,10 +132,22 @@ class Agent:
 
         ``frame`` is a whole frame whose management data lists who gets it (StreamData).
         """
+        self.mesh.put(self._stream_key(node), frame, Traffic.STREAM)
+
+    def prioritise_stream(self, node: str, priority: Priority | None) -> None:
+        """Put a node's topic data at this priority; None: at the usual one. From any thread."""
+        self.mesh.prioritise(self._stream_key(node), priority)
+
+    def keep_stream(self, node: str, frames: int | None) -> bool:
+        """Keep so many frames of a node's topic data for gateways that miss some; None: as the traffic rules say.
+        Returns whether any are kept. From any thread."""
+        return self.mesh.keep(self._stream_key(node), frames)
+
+    def _stream_key(self, node: str) -> str:
         key = self._stream_keys.get(node)
         if key is None:
             key = self._stream_keys[node] = STREAM.of(type=self.type_number, id=self.id, node=node)
-        self.mesh.put(key, frame, Traffic.STREAM)
+        return key
 
     def _send(
         self, to: int, ids: tuple[int, ...], groups: tuple[int, ...], data: bytes, metadata: Metadata | None
@@ -191,7 +209,7 @@ class Agent:
 
     def _read(self, key: str, payload: bytes | bytearray, *, by_group: bool) -> list[Message]:
         parsed = keyexpr.parse(key)
-        if parsed is None:
+        if parsed is None or not payload:  # nothing: `macs doctor` tries whether this arrives
             return []
         plane, fields = parsed
         sender = (int(fields["from_type"]), int(fields["from_id"]))
@@ -224,9 +242,8 @@ class Agent:
         CallTimeout.
         """
         kind = type_number(to)
-        key = CALL.of(type=kind, id=id, verb=verb, from_type=self.type_number, from_id=self.id)
-        message = encode_message(self._stamp(metadata or Metadata()).encode(), data)
-        frame = encode_frame(kind, (id,), message=message, layout=self._layout)
+        stamped = self._stamp(metadata or Metadata())
+        key, frame = call((kind, id), verb, (self.type_number, self.id), data, stamped, self._layout)
         deadline = time.monotonic() + timeout_s
         while True:
             try:
@@ -251,10 +268,15 @@ class Agent:
                 raise UsageError(f"{key} is not a call")
             frame = parse_frame(payload, self._layout)
             metadata = Metadata.decode(frame.metadata) if frame.metadata else Metadata()
-            call = Call(verb, type_name(int(fields["from_type"])), int(fields["from_id"]), metadata, bytes(frame.body))
-            return await handler(call)
+            sender = type_name(int(fields["from_type"])), int(fields["from_id"])
+            return await handler(Call(verb, *sender, metadata, bytes(frame.body)))
 
-        return self._keep(self.mesh.serve(CALL.every(type=self.type_number, id=self.id, verb=verb), answer))
+        serving = self.mesh.serve(self._calls_of(verb), answer)
+        self._served.append((verb, answer, serving))
+        return self._keep(serving)
+
+    def _calls_of(self, verb: str) -> str:
+        return CALL.every(type=self.type_number, id=self.id, verb=verb)
 
     # -- presence ------------------------------------------------------------------------------------------------
 
@@ -268,100 +290,45 @@ class Agent:
         for agent in self.directory:
             callback(agent, True)
 
-    def _token(self, key: str, alive: bool) -> None:
-        self._tell(self.directory.token(key, alive, time.monotonic()))
+    def on_id(self, callback: OnId) -> None:
+        """Call ``callback(old, new)`` when the id has had to change; then ``id`` is the new one already.
 
-    def _link(self, up: bool) -> None:
-        self.directory.link(up, time.monotonic())
-        self._schedule_sweep()
+        That happens to agents that took a free id, when two parts of a mesh meet in which two took the same. What
+        this agent receives, serves and sends goes on under the new id. What others registered here was for the old
+        one, which is somebody else's now.
+        """
+        self._on_id.append(callback)
 
-    def _tell(self, changes: list[Change]) -> None:
+    def _presence_changed(self, changes: list[Change]) -> None:
         for agent, online in changes:
             if agent.zid != self.mesh.zid:
                 log.info("%s/%d %s", agent.type_name, agent.id, "is online" if online else "has left")
             for callback in self._on_presence:
                 callback(agent, online)
-        self._schedule_sweep()
 
-    def _schedule_sweep(self) -> None:
-        if self._sweep is not None:
-            self._sweep.cancel()
-            self._sweep = None
-        if (deadline := self.directory.next_deadline()) is not None:
-            delay_s = max(0.0, deadline - time.monotonic())
-            self._sweep = asyncio.get_running_loop().call_later(
-                delay_s + 0.01, lambda: self._tell(self.directory.tick(time.monotonic()))
-            )
+    def _id_changed(self, old: int, new: int) -> None:
+        self.id = new
+        self._stream_keys = {}
+        for verb, answer, serving in self._served:
+            if serving.is_open:
+                serving.become(self.mesh.serve(self._calls_of(verb), answer))
+        for callback in self._on_id:
+            callback(old, new)
 
     # -- life ----------------------------------------------------------------------------------------------------
 
     async def _join(self, wanted_id: int | None) -> None:
-        self.mesh.on_link(self._link)
-        self._keep(self.mesh.watch_tokens(PRESENCE.every(), self._token))
-        for key in await self.mesh.tokens(PRESENCE.every()):
-            self._token(key, True)
+        self._keep(self.mesh.answer_pings())
+        await self._presence.start()
         self._keep(self.mesh.subscribe(BROADCAST.every(), self._receive))
         if self.group:
             members = GROUP.every(group=self.group, type=self.type_number)
             self._keep(self.mesh.subscribe(members, lambda batch: self._receive(batch, by_group=True)))
-        if wanted_id is None:
-            await self._lease_id()
-        else:
-            await self._claim_fixed_id(wanted_id)
+        self.id = await self._identity.take(wanted_id)
+        self.serve("ping", _echo)
 
-    async def _claim_fixed_id(self, agent_id: int) -> None:
-        if not 1 <= agent_id <= 0xFFFF:
-            raise OutOfRange("id", agent_id, 1, 0xFFFF)
-        await self._wait_for_stale(agent_id)
-        if self.directory.get(self.type_number, agent_id) is not None:
-            raise UsageError(f"{self.type}/{agent_id} is already online; choose another id, or leave it out")
-        if not await self._claim(agent_id):
-            raise UsageError(f"{self.type}/{agent_id} was taken by somebody else in this moment; choose another id")
-
-    async def _wait_for_stale(self, agent_id: int) -> None:
-        """Give the token of an earlier life of this agent the time of a lease to end."""
-        gone = asyncio.Event()
-        stale = (self.type_number, agent_id)
-        self.on_presence(lambda agent, online: gone.set() if agent.key == stale and not online else None)
-        if stale in self.directory:
-            log.info("%s/%d is still online; waiting for it to go", self.type, agent_id)
-            with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(gone.wait(), self.mesh.settings.lease_ms / 1000 + 1.0)
-        self._on_presence.clear()
-
-    async def _lease_id(self) -> None:
-        tried: set[int] = set()
-        while True:
-            leased = [LEASE.parse(key) for key in await self.mesh.tokens(LEASE.every())]
-            taken = tried | {agent.id for agent in self.directory if agent.type == self.type_number}
-            held = {int(lease["block"]) for lease in leased if lease} if self.type != "ros" else set()
-            agent_id = blocks.free_id(taken, held)
-            if agent_id is None:
-                raise Unreachable("a free id", f"all ids of type {self.type} are taken")
-            if await self._claim(agent_id):
-                return
-            tried.add(agent_id)
-
-    async def _claim(self, agent_id: int) -> bool:
-        """Declare presence under an id and see that nobody with an older right to it did the same at once.
-
-        The inbox comes before the token: whoever sees the agent can reach it.
-        """
-        self.id = agent_id
-        messages = self.mesh.subscribe(inbox(self.type_number, agent_id), self._receive)
-        token = self.mesh.declare_token(
-            PRESENCE.of(type=self.type_number, id=agent_id, group=self.group, zid=self.mesh.zid)
-        )
-        await asyncio.sleep(SETTLE_S)
-        others = [agent.zid for agent in self.directory.claimants(self.type_number, agent_id)]
-        if not blocks.keeps(self.mesh.zid, others):
-            token.close()
-            messages.close()
-            self.id = 0
-            return False
-        self._keep(messages)
-        self._keep(token)
-        return True
+    def _listen(self, agent_id: int) -> Subscription:
+        return self.mesh.subscribe(inbox(self.type_number, agent_id), self._receive)
 
     def _keep(self, declared: Subscription) -> Subscription:
         self._declared.append(declared)
@@ -370,12 +337,17 @@ class Agent:
     def close(self) -> None:
         """Leave: the agent is offline at once. The mesh stays open."""
         self._closed = True
+        self._identity.close()
         for declared in reversed(self._declared):
             declared.close()
         self._declared.clear()
-        if self._sweep is not None:
-            self._sweep.cancel()
+        self._presence.close()
         self._arrived.set()
+
+
+async def _echo(call: Call) -> bytes:
+    """The call ``ping``: whoever gets this answer may call this agent."""
+    return call.data
 
 
 @asynccontextmanager
@@ -386,6 +358,7 @@ async def join(
     group: int = 0,
     connect: Sequence[str] = (),
     settings: MeshSettings | None = None,
+    traffic: Sequence[TrafficRule] = (),
     on_waiting: Callable[[str], None] | None = None,
 ) -> AsyncIterator[Agent]:
     """Join the mesh as an agent and leave it at the end of the block.
@@ -396,6 +369,7 @@ async def join(
         group: 1 to 255, or 0 for none.
         connect: router endpoints, e.g. ``["tcp/127.0.0.1:7447"]``; several give fail-over.
         settings: everything else about the connection; ``connect``, if given, replaces its endpoints.
+        traffic: rules for what this agent sends, by key.
         on_waiting: called once with the endpoints while no router answers; it waits as long as it takes.
 
     Raises:
@@ -408,7 +382,7 @@ async def join(
     settings = settings or MeshSettings()
     if connect:
         settings = changed(settings, connect=list(connect))
-    async with await Mesh.open(settings, on_waiting=on_waiting) as mesh:
+    async with await Mesh.open(settings, traffic=traffic, on_waiting=on_waiting) as mesh:
         agent = Agent(mesh, kind, group)
         try:
             await agent._join(id)

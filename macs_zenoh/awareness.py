@@ -27,8 +27,9 @@ from . import blocks, named
 from .agent import Agent
 from .errors import Refused, Unreachable, UsageError, WireError
 from .keyexpr import LAST, NAME, NAMED, NAMED_ALL, WANTED, type_name
-from .mesh import Mesh, Sample, Subscription, Traffic
+from .mesh import Mesh, Sample, Subscription, Token, Traffic
 from .named import Arrivals, Envelope, LastValues, Named, Names, Outcome, RateLimits, check_word
+from .wire import PROBE
 
 log = logging.getLogger("macs.awareness")
 
@@ -96,6 +97,7 @@ class Awareness:
         agent_type: int,
         agent_id: int = 0,
         rates_hz: Mapping[str, float] | None = None,
+        reliable: Mapping[str, int] | None = None,
         max_message_bytes: int = MAX_MESSAGE_BYTES,
     ) -> None:
         check_word("agent name", name)
@@ -109,11 +111,13 @@ class Awareness:
         self._lock = threading.Lock()
         self._keys: dict[tuple[str, str], str] = {}
         self._rates = RateLimits(rates_hz or {})
+        self._reliable = dict(reliable or {})
         self._last = LastValues()
         self._arrivals = Arrivals()
         self._number = 0
         self._callbacks: dict[str, list[Registration]] = {}
         self._declared: list[Subscription] = []
+        self._token_of_name = Token()
         self._per_type: dict[str, list[Subscription]] = {}
         self._asking: set[str] = set()
         self._warned: set[tuple[str, str]] = set()
@@ -162,7 +166,10 @@ class Awareness:
                 payload = self._encode(data, deadline_s)
                 if not receiver:
                     self._last.keep(message_type, payload)
-                outcome = self._expected(receiver, message_type) if self.mesh.linked else Outcome.NO_ROUTER
+                if self.mesh.linked:
+                    outcome = self._expected(receiver, message_type)
+                else:
+                    outcome = Outcome.KEPT if not receiver and message_type in self._reliable else Outcome.NO_ROUTER
         if outcome not in (Outcome.RATE_LIMITED, Outcome.NO_ROUTER):
             self.mesh.put(self._key(receiver, message_type), payload, Traffic.CALL)
         return self._count(outcome)
@@ -219,6 +226,8 @@ class Awareness:
                 key = NAMED.of(name=receiver, message_type=message_type, from_name=self.name)
             else:
                 key = NAMED_ALL.of(message_type=message_type, from_name=self.name)
+                if message_type in self._reliable:
+                    self.mesh.keep(key, self._reliable[message_type])
             if len(self._keys) >= self.KEYS:
                 self._keys.clear()
             self._keys[receiver, message_type] = key
@@ -258,7 +267,7 @@ class Awareness:
         self._callbacks.setdefault(message_type, []).append(registration)
         if first:
             self._per_type[message_type] = [
-                self.mesh.subscribe(NAMED_ALL.every(message_type=message_type), self._receive_all),
+                self.mesh.subscribe(NAMED_ALL.every(message_type=message_type), self._receive_all, reliable=True),
                 self.mesh.declare_token(WANTED.of(name=self.name, message_type=message_type, zid=self.mesh.zid)),
             ]
         if last_value:
@@ -299,6 +308,8 @@ class Awareness:
 
     def _take(self, sender: str, message_type: str, payload: bytes, *, to_all: bool, last: bool = False) -> bool:
         """Pass a message on; whether somebody takes its type. A repetition is taken and not passed on."""
+        if payload.startswith(PROBE):
+            return False
         try:
             envelope, data = named.decode(payload)
         except WireError as error:
@@ -310,6 +321,8 @@ class Awareness:
             return False
         if last and not self._arrivals.newer(sender, message_type, envelope):
             return True
+        if last and message_type in self._reliable and self._arrivals.knows(sender, message_type, envelope):
+            return True  # it comes in its turn, behind others that were missed
         if not self._arrivals.fresh(sender, message_type, envelope):
             self.counters["repeated"] += 1
             return True
@@ -364,19 +377,19 @@ class Awareness:
 
     async def start(self) -> None:
         """Claim the name and listen. Raises UsageError when somebody else has it."""
-        self._keep(self.mesh.watch_tokens(NAME.every(), self._token))
-        self._keep(self.mesh.watch_tokens(WANTED.every(), self._token))
+        # asked right after a watcher is declared for the same key, Zenoh may leave tokens out
         for key in await self.mesh.tokens(NAME.every(name=self.name)):
             self._token(key, True)
+        self._keep(self.mesh.watch_tokens(NAME.every(), self._token))
+        self._keep(self.mesh.watch_tokens(WANTED.every(), self._token))
         await self._wait_for_stale()
         if self.names.claimants(self.name):
             raise UsageError(f"an agent called {self.name!r} is already on the mesh; choose another name")
         self._keep(self.mesh.subscribe(NAMED.every(name=self.name), self._receive))
         self._keep(self.mesh.serve(NAMED.every(name=self.name), self._confirm))
         self._keep(self.mesh.serve(LAST.every(name=self.name), self._tell_last))
-        self._keep(
-            self.mesh.declare_token(NAME.of(name=self.name, type=self.agent_type, id=self.agent_id, zid=self.mesh.zid))
-        )
+        self._keep(self._token_of_name)
+        self._token_of_name.become(self._declare_name())
         await asyncio.sleep(SETTLE_S)
         if not blocks.keeps(self.mesh.zid, self.names.claimants(self.name)):
             raise UsageError(f"another agent took the name {self.name!r} in this moment; choose another")
@@ -387,6 +400,16 @@ class Awareness:
         while self.names.claimants(self.name):
             if not await self._change_before(deadline):
                 return
+
+    def change_id(self, agent_id: int) -> None:
+        """The agent with this name has another id now."""
+        self.agent_id = agent_id
+        if self._token_of_name.is_open:
+            self._token_of_name.become(self._declare_name())  # which is there before the old one ends
+
+    def _declare_name(self) -> Token:
+        key = NAME.of(name=self.name, type=self.agent_type, id=self.agent_id, zid=self.mesh.zid)
+        return self.mesh.declare_token(key)
 
     def close(self) -> None:
         """Leave: the name is free at once. The mesh stays open."""
@@ -408,17 +431,25 @@ class Awareness:
             return
         self._changed.set()
         if name == self.name:
-            if alive and len(self.names.claimants(name)) > 1:
-                # only where two halves of a mesh have met again: who joins sees the name that is there
-                self._lose(
-                    "name_taken_twice", name, f"another agent is called {name!r} as well; both get its messages"
-                )
+            if alive:
+                self._check_name()
             return
         if alive and NAME.parse(key) is not None:
             for message_type in self._asking:
                 self._ask(name, message_type)
         for callback in self._on_change:
             callback(name)
+
+    def _check_name(self) -> None:
+        """Tell once when another agent has our name, each by itself: both were given it, and keep it.
+
+        That happens only where two parts of a mesh have met again: who joins sees the name that is there.
+        """
+        for other in self.names.claimants(self.name):
+            if other != self.mesh.zid and ("name_taken_twice", other) not in self._warned:
+                self._warned.add(("name_taken_twice", other))
+                self.counters["name_taken_twice"] += 1
+                log.error("session %s is called %r as well; both get its messages. Rename one", other, self.name)
 
     async def _change_before(self, deadline: float) -> bool:
         """Wait for a token to come or go; False when the deadline was earlier."""
@@ -436,6 +467,7 @@ async def join(
     name: str,
     *,
     rates_hz: Mapping[str, float] | None = None,
+    reliable: Mapping[str, int] | None = None,
     max_message_bytes: int = MAX_MESSAGE_BYTES,
 ) -> AsyncIterator[Awareness]:
     """Give an agent a name that others send to, until the end of the block.
@@ -444,6 +476,7 @@ async def join(
         agent: made by `macs_zenoh.join`; its type and id are what `macs ls` shows with the name.
         name: any text of 1 to 200 characters that nobody else on the mesh has.
         rates_hz: per message type, how many messages per second may be sent to each receiver.
+        reliable: per message type, how many messages to all are kept for agents that miss some (docs/reliable.md).
         max_message_bytes: what is larger is refused by `send` and `deliver`.
 
     Raises UsageError: the name is taken or cannot be one.
@@ -454,8 +487,10 @@ async def join(
         agent_type=agent.type_number,
         agent_id=agent.id,
         rates_hz=rates_hz,
+        reliable=reliable,
         max_message_bytes=max_message_bytes,
     )
+    agent.on_id(lambda old, new: awareness.change_id(new))
     try:
         await awareness.start()
         yield awareness

@@ -1,15 +1,30 @@
-"""Who hands out which ids. Pure: who else holds what comes in, a choice goes out.
+"""Who hands out which ids, and who keeps one that several have. Pure: who else holds what comes in, a choice goes out.
 
 A gateway leases a *block*, 256 ids with the same high byte, and gives them to the agents that connect to it, from 1
 up, as they are used to. A lease is a liveliness token that carries the holder's Zenoh id; when two choose the same
 thing at once, the smaller Zenoh id keeps it and the other chooses again. The same rule settles single ids.
+
+Two parts of a mesh that could not see each other may have chosen the same; `Contests` settles that when they meet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
 
 from .keyexpr import BLOCK_SIZE, block_of
+
+T = TypeVar("T", bound=Hashable)
+
+PATIENCE_S = 1.5
+"""How long the rightful holder of something leased waits for the others to give way, which takes them 0.3 s."""
+
+GATEWAY_PATIENCE_S = 10.0
+"""The same for an id that is another gateway's: it is never configured, and hundreds may have to change at once."""
+
+COMPLAINT_S = 2 * PATIENCE_S
+"""After so long nobody will give way any more: what is configured twice stays so until a person changes it."""
 
 BLOCKS = 256
 """Blocks on one mesh: ids are 16 bits."""
@@ -34,3 +49,70 @@ def free_id_in(block: int, taken: Collection[int]) -> int | None:
 def free_id(taken: Collection[int], leased_blocks: Collection[int] = ()) -> int | None:
     """The lowest id that is neither taken nor inside somebody's block."""
     return next((i for i in range(1, 0x10000) if i not in taken and block_of(i) not in leased_blocks), None)
+
+
+class Verdict(NamedTuple, Generic[T]):
+    """What to do about something of ours that ``others`` (Zenoh ids) hold as well: give way, or tell a person."""
+
+    what: T
+    others: list[str]
+    give_way: bool
+
+
+@dataclass
+class _Contest:
+    others: frozenset[str]
+    since: float
+    settled: bool = False
+
+
+class Contests(Generic[T]):
+    """What we hold and others hold as well: ids, or blocks.
+
+    Of several that leased the same the smallest Zenoh id keeps it. What is configured (``fixed``) is never given up;
+    so whoever only leased it gives way after its patience even with the smallest Zenoh id, and where nobody can,
+    each tells it once. ``gateway`` says of a Zenoh id whether it is a gateway's, where that matters.
+    """
+
+    def __init__(
+        self, mine: str, fixed: Callable[[T], bool], gateway: Callable[[str], bool] = lambda zid: False
+    ) -> None:
+        self._mine = mine
+        self._fixed = fixed
+        self._gateway = gateway
+        self._open: dict[T, _Contest] = {}
+
+    def __contains__(self, what: object) -> bool:
+        return what in self._open
+
+    def look(self, contested: Mapping[T, Collection[str]], now: float) -> list[T]:
+        """All that is contested now, with the others' Zenoh ids. Returns what is so no longer."""
+        over = [what for what in self._open if not contested.get(what)]
+        for what in over:
+            del self._open[what]
+        for what, zids in contested.items():
+            others = frozenset(zids)
+            before = self._open.get(what)
+            if others and (before is None or not others <= before.others):
+                self._open[what] = _Contest(others, now)
+        return over
+
+    def judge(self, now: float) -> list[Verdict[T]]:
+        """What is to be done now; each is told once."""
+        verdicts = []
+        for what, contest in self._open.items():
+            if not contest.settled and now >= self._due(what, contest):
+                contest.settled = True
+                verdicts.append(Verdict(what, sorted(contest.others), not self._fixed(what)))
+        return verdicts
+
+    def next_deadline(self) -> float | None:
+        """When `judge` has something to say, None when it has not."""
+        return min((self._due(what, c) for what, c in self._open.items() if not c.settled), default=None)
+
+    def _due(self, what: T, contest: _Contest) -> float:
+        if self._fixed(what):
+            return contest.since + COMPLAINT_S
+        if not keeps(self._mine, contest.others):
+            return contest.since
+        return contest.since + (GATEWAY_PATIENCE_S if all(map(self._gateway, contest.others)) else PATIENCE_S)

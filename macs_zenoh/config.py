@@ -1,6 +1,6 @@
 """The configuration, typed: what a settings file may say, its defaults, and the ranges that hold.
 
-A settings file is TOML with up to four sections, one per struct below::
+A settings file is TOML with up to four sections and a list of rules, one struct each below::
 
     [mesh]                                   # MeshSettings: every program on the mesh
     connect = ["tcp/192.168.1.10:7447"]
@@ -13,6 +13,10 @@ A settings file is TOML with up to four sections, one per struct below::
 
     [awareness]                              # AwarenessSettings: `macs awareness`
     name = "drone0"
+
+    [[traffic]]                              # TrafficRule: every program that sends
+    match = "macs/from/ros/*/nd__camera$*"
+    max_hz = 10
 
 It is loaded once, in ``main``, and passed down. A misspelled name or a value out of range is a
 `ConfigError` whose path names file and field. The ranges hold however a struct is made, because the
@@ -28,12 +32,13 @@ import os
 import re
 import sys
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, get_args
 
 import msgspec
 from msgspec import Meta
 
 from macs_zenoh.errors import ConfigError
+from macs_zenoh.keyexpr import expression_problem
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -56,10 +61,20 @@ Bytes = Annotated[int, Meta(ge=39, le=0xFFFF_FFFF)]
 
 NamePattern = Annotated[str, Meta(pattern=r"^(/[A-Za-z0-9_*]+)+$", max_length=256)]
 """A full ROS name in which ``*`` stands for anything within one level and ``**`` for any number of levels."""
+Priority = Literal["real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background"]
+"""Zenoh's priorities by the names that its configuration has for them, the highest first."""
 AgentPattern = Annotated[str, Meta(pattern=r"^(\*|[a-z0-9]+(/[0-9]+)?)$")]
+
+ROUTER_RETRY_MS = 500
+"""A router waits at least so long before it dials another one again: a link between routers that is back within 100 ms
+of its loss may stay dead (seen with Zenoh 1.10.2): connected, but without tokens and data."""
 
 LOCAL_ROUTER = "tcp/127.0.0.1:7447"
 EVERY_INTERFACE = "tcp/[::]:7447"
+
+
+STREAM_PRIORITIES = ("data", "data_low", "background")
+"""Of topic data, unless a rule says otherwise."""
 
 
 class ZenohEntry(NamedTuple):
@@ -119,9 +134,13 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     lease_ms: Annotated[int, Meta(ge=500, le=600_000)] = 2000
     """How long a stopped host stays on the mesh after its last sign of life (Zenoh: 10 s)."""
     retry_min_ms: Annotated[int, Meta(ge=1, le=60_000)] = 50
-    """First pause before another attempt to reach a router (Zenoh: 1 s, which is long for a teleoperator)."""
+    """First pause before another attempt to reach a router (Zenoh: 1 s, which is long for a teleoperator); between
+    routers at least `ROUTER_RETRY_MS`."""
     retry_max_ms: Annotated[int, Meta(ge=1, le=60_000)] = 200
     """Longest such pause; each is twice the one before."""
+    open_limit_ms: Annotated[int, Meta(ge=100, le=60_000)] = 3000
+    """How long reaching one router may take before the next one's turn (Zenoh: 10 s). It is what a switched-off host
+    costs, which refuses nothing; TCP, TLS and Zenoh's greeting need four round trips."""
     block_limit_ms: Annotated[int, Meta(ge=1, le=60_000)] = 500
     """How long a blocking put may wait for a stuck link before that link is closed (Zenoh: 5 s for everyone)."""
     drop_wait_ms: Millis = 20
@@ -131,6 +150,8 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """The same for a message of several fragments, for all of them together: without it, big messages vanish."""
     tx_queue_batches: Annotated[int, Meta(ge=1, le=16)] = 8
     """Batches of 64 KiB queued per priority and link (Zenoh: 2). Above 16 Zenoh panics at the first link."""
+    stream_queue_batches: Annotated[int, Meta(ge=1, le=16)] = 8
+    """The same for topic data. On a slow link fewer: eight hold up what comes last by 0.2 s at 20 Mbit/s."""
     shared_memory: bool = False
     """Implicit shared memory bypasses size limits and can drop silently, so it is off (Zenoh: on)."""
     multicast: bool = False
@@ -178,17 +199,11 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def _zenoh_table(self) -> list[tuple[str, Any, tuple[str, ...]]]:
         """Rows of (Zenoh's path, value, the fields here that decide it)."""
         listen = self.listen or ([EVERY_INTERFACE] if self.mode == "router" else [])
-        retry = {"period_init_ms": self.retry_min_ms, "period_max_ms": self.retry_max_ms, "period_increase_factor": 2}
+        pauses = (self.retry_min_ms, self.retry_max_ms)
+        if self.mode == "router":
+            pauses = (max(pauses[0], ROUTER_RETRY_MS), max(pauses[1], ROUTER_RETRY_MS))
+        retry = {"period_init_ms": pauses[0], "period_max_ms": pauses[1], "period_increase_factor": 2}
         queues = "transport/link/tx/queue"
-        priorities = (
-            "real_time",
-            "interactive_high",
-            "interactive_low",
-            "data_high",
-            "data",
-            "data_low",
-            "background",
-        )
         return [
             ("mode", self.mode, ("mode",)),
             ("connect/endpoints", self.routers, ("connect",)),
@@ -200,6 +215,7 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             ("scouting/multicast/enabled", self.multicast, ("multicast",)),
             # A router waits half a second for what it might discover: without scouting there is nothing.
             *([] if self.multicast else [("scouting/delay", 0, ())]),
+            ("transport/unicast/open_timeout", self.open_limit_ms, ("open_limit_ms",)),
             ("transport/shared_memory/enabled", self.shared_memory, ("shared_memory",)),
             ("transport/link/tx/lease", self.lease_ms, ("lease_ms",)),
             (f"{queues}/congestion_control/drop/wait_before_drop", self.drop_wait_ms * 1000, ("drop_wait_ms",)),
@@ -209,7 +225,13 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
                 ("fragment_wait_ms",),
             ),
             (f"{queues}/congestion_control/block/wait_before_close", self.block_limit_ms * 1000, ("block_limit_ms",)),
-            *((f"{queues}/size/{name}", self.tx_queue_batches, ("tx_queue_batches",)) for name in priorities),
+            *(
+                (f"{queues}/size/{name}", getattr(self, field), (field,))
+                for name in get_args(Priority)
+                for field in ["stream_queue_batches" if name in STREAM_PRIORITIES else "tx_queue_batches"]
+            ),
+            # As zenohd has it: `macs doctor` reads versions, sessions and links between routers there.
+            *([("adminspace/enabled", True, ())] if self.mode == "router" else []),
             *([("namespace", self.namespace, ("namespace",))] if self.namespace else []),
         ]
 
@@ -241,6 +263,8 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     """A connection that takes nothing for so long while something waits is closed."""
     block: GroupId | None = None
     """The block of 256 agent ids this gateway gives out first, 0 being 1..255; unset: lease the first free one."""
+    blocks: list[GroupId] = []
+    """The only blocks it may lease: where routers hold its certificate to them (docs/security.md). Empty: any."""
     managers: list[str] = []
     """Own management messages, as my_package.world_class_manager:WorldClassManager (docs/managers.md)."""
     tell_refusals: bool = True
@@ -273,6 +297,11 @@ class TopicRule(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """These three replace what is taken from the topic's other endpoints and from the registration."""
     max_hz: Annotated[float, Meta(gt=0, le=10_000)] | None = None
     """Topic data to headsets: at most so many messages per second; of those in between, the latest is sent."""
+    priority: Priority | None = None
+    """Topic data to headsets: its priority on the mesh instead of ``data``. It wins over a `TrafficRule`."""
+    keep_for_recovery: Annotated[int, Meta(ge=1, le=100_000)] | None = None
+    """Topic data to headsets: keep the last so many messages, and send those again that a gateway missed while the
+    mesh was interrupted (docs/reliable.md). It has nothing to do with ROS QoS, and wins over a `TrafficRule`."""
     read_only: bool | None = None
     """Headsets may subscribe to the topic, not publish to it."""
 
@@ -336,7 +365,7 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     stop_topic: Annotated[str, Meta(pattern=r"^(/[A-Za-z_]\w*)*$")] = "/emergency_stop"
     """The emergency stop: true on this topic (std_msgs/Bool) stops, false releases. Empty: there is none."""
     stop_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
-    """Who may stop: ``*``, ``unity``, ``unity/5`` or ``group/3``."""
+    """Who may stop: ``*``, ``unity``, ``unity/5``, ``group/3`` or ``operator/5`` (`macs stop --as`)."""
     release_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
     """Who may release a stop."""
     rules: list[TopicRule] = []
@@ -363,6 +392,9 @@ class AwarenessSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fiel
     """Per message type: how long a message to one robot may wait for it, and is repeated until it is confirmed."""
     last_values: list[str] = []
     """Message types of which every other robot's last message to all is asked for when this one joins."""
+    reliable: dict[str, Annotated[int, Meta(ge=1, le=100_000)]] = {}
+    """Per message type: keep the last so many messages to all, for robots that miss some while the mesh is interrupted
+    (docs/reliable.md)."""
     only_addressed: bool = True
     """Take only what is for this robot or for all. Off: also what the plain topic carries for others."""
     drop_own: bool = True
@@ -373,6 +405,36 @@ class AwarenessSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fiel
             raise self._wrong("beside", "needs the id of the robot agent")
 
 
+class TrafficRule(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What holds for messages whose key fits an expression; one ``[[traffic]]`` table. See docs/traffic.md.
+
+    Of several rules that fit a key, each setting comes from the first one that gives it. A rule holds where a message
+    enters the mesh: in the gateway for what its headsets send, in the robot agent for its topics.
+    """
+
+    section: ClassVar[str] = "traffic"
+
+    match: str
+    """A Zenoh key expression: ``*`` is one chunk, ``**`` any number, ``$*`` a part of one, as in
+    ``macs/from/ros/*/nd__camera$*``. Without the mesh's namespace."""
+
+    max_hz: Annotated[float, Meta(gt=0, le=1_000_000)] | None = None
+    """So many messages per second for each key; the rest is dropped."""
+    max_bytes: Annotated[int, Meta(ge=1, le=0xFFFF_FFFF)] | None = None
+    """A larger message is dropped, a larger call refused. Counted with its header, as it is on the mesh."""
+    max_bytes_per_s: Annotated[int, Meta(ge=1, le=1_000_000_000_000)] | None = None
+    """So many bytes per second for all keys of this rule together, as far as this program sends them."""
+    priority: Priority | None = None
+    """Instead of that of its class (commands ``real_time``, calls ``interactive_high``, topic data ``data``)."""
+    reliable: Annotated[int, Meta(ge=1, le=100_000)] | None = None
+    """The source keeps so many messages of each key; receivers ask for those that they missed."""
+
+    def _check(self) -> None:
+        problem = expression_problem(self.match)
+        if problem is not None:
+            raise self._wrong("match", f"{self.match!r} is not a key expression: {problem}")
+
+
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole settings file."""
 
@@ -380,29 +442,47 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     gateway: GatewaySettings = GatewaySettings()
     robot: RobotSettings = RobotSettings()
     awareness: AwarenessSettings = AwarenessSettings()
+    traffic: list[TrafficRule] = []
 
 
-def load(path: str | os.PathLike[str]) -> Settings:
-    """Read a settings file (TOML).
+def load(*paths: str | os.PathLike[str]) -> Settings:
+    """Read settings files (TOML); of several, a later one wins, setting by setting.
 
-    Raises `ConfigError`: it cannot be read, is not TOML, has an unknown name or a value out of range.
+    Raises `ConfigError`: one cannot be read, is not TOML, has an unknown name or a value out of range.
     """
-    source = str(path)
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(source, error.strerror or str(error)) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(source, f"not UTF-8 at byte {error.start}") from error
-    return parse(text, source)
+    document: dict[str, Any] = {}
+    settings = Settings()
+    for path in paths:
+        source = str(path)
+        try:
+            text = Path(path).read_text(encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(source, error.strerror or str(error)) from error
+        except UnicodeDecodeError as error:
+            raise ConfigError(source, f"not UTF-8 at byte {error.start}") from error
+        for name, section in _document(text, source).items():
+            before = document.get(name)
+            if isinstance(before, dict) and isinstance(section, dict):
+                section = {**before, **section}
+            document[name] = section
+        settings = _settings(document, source)
+    return settings
 
 
 def parse(text: str, source: str = "settings") -> Settings:
     """Turn the text of a settings file into settings; ``source`` names it in errors."""
+    return _settings(_document(text, source), source)
+
+
+def _document(text: str, source: str) -> dict[str, Any]:
     try:
-        document = tomllib.loads(text)
+        document: dict[str, Any] = tomllib.loads(text)
+        return document
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(source, f"not TOML: {error}") from error
+
+
+def _settings(document: dict[str, Any], source: str) -> Settings:
     try:
         return msgspec.convert(document, Settings)
     except msgspec.ValidationError as error:
@@ -434,7 +514,8 @@ def _hint(where: str, problem: str) -> str:
     """``, did you mean `port`?`` after an unknown name that is nearly a known one."""
     unknown = re.fullmatch(r"unknown name `(.+)`", problem)
     sections: dict[str, Any] = {
-        kind.section: kind for kind in (MeshSettings, GatewaySettings, RobotSettings, AwarenessSettings, TopicRule)
+        kind.section: kind
+        for kind in (MeshSettings, GatewaySettings, RobotSettings, AwarenessSettings, TopicRule, TrafficRule)
     }
     owner = sections.get(re.sub(r"\[\d+\]$", "", where), Settings)
     if unknown is None:

@@ -40,12 +40,15 @@ class Change(NamedTuple):
 
 
 class Directory:
-    """Everybody online. Two sessions may claim one (type, id) for a moment; the newest claim counts."""
+    """Everybody online. Several sessions may claim one (type, id), as after two parts of a mesh met that had both
+    given it out; the smallest Zenoh id's claim counts, so that everybody who sees them all sees the same. A claim in
+    doubt counts last: it may be of an earlier life."""
 
     def __init__(self, grace_s: float = 2.0) -> None:
         self.grace_s = grace_s
         self._claims: dict[tuple[int, int], dict[str, AgentInfo]] = {}
         self._ids: dict[int, set[int]] = {}
+        self._contested: set[tuple[int, int]] = set()
         self._doubtful: set[AgentInfo] = set()
         self._linked = True
         self._settled_at = 0.0
@@ -81,6 +84,23 @@ class Directory:
         """Everybody who holds a token for this (type, id): more than one is a conflict."""
         return list(self._claims.get((agent_type, agent_id), {}).values())
 
+    def claims(self) -> list[AgentInfo]:
+        """Every claim, by type, id and session: an agent that is there twice is listed twice."""
+        return sorted(agent for claims in self._claims.values() for agent in claims.values())
+
+    @property
+    def is_contested(self) -> bool:
+        """Whether any (type, id) is claimed by several sessions."""
+        return bool(self._contested)
+
+    def contested(self, zid: str) -> dict[tuple[int, int], list[str]]:
+        """What a session holds and others hold without doubt as well: (type, id) and the others' Zenoh ids."""
+        return {
+            key: [other for other, claim in self._claims[key].items() if other != zid and claim not in self._doubtful]
+            for key in self._contested
+            if zid in self._claims[key]
+        }
+
     def token(self, key: str, alive: bool, now: float) -> list[Change]:
         """A presence token appeared or ended. Keys that are no presence keys are ignored."""
         fields = PRESENCE.parse(key)
@@ -90,8 +110,7 @@ class Directory:
         if alive:
             return self._claim(agent)
         if not self._linked or now < self._settled_at:
-            self._doubtful.add(agent)
-            return []
+            return self._doubt(agent)
         return self._release(agent)
 
     def link(self, up: bool, now: float) -> None:
@@ -109,20 +128,34 @@ class Directory:
         """Let agents leave that were in doubt and have not come back within the grace."""
         if not self._linked or now < self._settled_at:
             return []
-        doubtful, self._doubtful = self._doubtful, set()
-        return [change for agent in sorted(doubtful) for change in self._release(agent)]
+        changes = [change for agent in sorted(self._doubtful) for change in self._release(agent)]
+        self._doubtful.clear()
+        return changes
 
     def _current(self, key: tuple[int, int]) -> AgentInfo:
-        return next(reversed(self._claims[key].values()))
+        claims = self._claims[key]
+        if len(claims) == 1:
+            return next(iter(claims.values()))
+        return min(claims.values(), key=lambda claim: (claim in self._doubtful, claim.zid))
+
+    def _doubt(self, agent: AgentInfo) -> list[Change]:
+        if self._claims.get(agent.key, {}).get(agent.zid) != agent:
+            return []
+        before = self._current(agent.key)
+        self._doubtful.add(agent)
+        current = self._current(agent.key)
+        return [] if current == before else [Change(current, online=True)]
 
     def _claim(self, agent: AgentInfo) -> list[Change]:
-        self._doubtful.discard(agent)
         claims = self._claims.setdefault(agent.key, {})
         before = self._current(agent.key) if claims else None
-        claims.pop(agent.zid, None)
+        self._doubtful.discard(agent)
         claims[agent.zid] = agent
+        if len(claims) > 1:
+            self._contested.add(agent.key)
         self._ids.setdefault(agent.type, set()).add(agent.id)
-        return [] if before == agent else [Change(agent, online=True)]
+        current = self._current(agent.key)
+        return [] if before == current else [Change(current, online=True)]
 
     def _release(self, agent: AgentInfo) -> list[Change]:
         claims = self._claims.get(agent.key, {})
@@ -130,6 +163,8 @@ class Directory:
             return []  # already replaced, e.g. by the same agent in another group
         before = self._current(agent.key)
         del claims[agent.zid]
+        if len(claims) < 2:
+            self._contested.discard(agent.key)
         if not claims:
             del self._claims[agent.key]
             self._ids[agent.type].discard(agent.id)

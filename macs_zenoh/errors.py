@@ -141,6 +141,13 @@ class Unreachable(MacsError):
         self.why = why
 
 
+class NotServed(Unreachable):
+    """Nobody answers this call: no such agent is there, or it does not know the verb."""
+
+    def __init__(self, target: str) -> None:
+        super().__init__(target, "nobody there answers this call")
+
+
 class CallTimeout(Unreachable):
     """A call was not answered in time."""
 

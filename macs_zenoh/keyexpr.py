@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from functools import lru_cache
 from urllib.parse import quote, unquote
 
 from .errors import UsageError
-from .messages import ROS, UNITY
+from .messages import OPERATOR, ROS, UNITY
 
 BLOCK_SIZE = 256
 """Ids per block: the block of an id is its high byte."""
 
-_TYPE_NAMES = {ROS: "ros", UNITY: "unity"}
+_TYPE_NAMES = {ROS: "ros", UNITY: "unity", OPERATOR: "operator"}
 _TYPE_NUMBERS = {name: number for number, name in _TYPE_NAMES.items()}
 
 FieldValue = int | str
@@ -34,7 +35,7 @@ _SAFE = "".join({chr(c) for c in range(32, 127)} - set("/*$?#%"))
 
 
 def type_name(agent_type: int) -> str:
-    """How an agent type is written in keys: 1 → ``ros``, 2 → ``unity``, others as the number."""
+    """How an agent type is written in keys: 1 → ``ros``, 2 → ``unity``, 255 → ``operator``, others as the number."""
     return _TYPE_NAMES.get(agent_type) or str(agent_type)
 
 
@@ -43,7 +44,7 @@ def type_number(name: str) -> int:
     number = _TYPE_NUMBERS.get(name)
     if number is None:
         if len(name) > 3 or not name.isascii() or not name.isdigit() or not 1 <= int(name) <= 255:
-            raise UsageError(f"unknown agent type {name!r}: use 'ros', 'unity' or a number from 1 to 255")
+            raise UsageError(f"unknown agent type {name!r}: use 'ros', 'unity', 'operator' or a number from 1 to 255")
         number = int(name)
     return number
 
@@ -108,6 +109,71 @@ class Key:
         if unknown:
             raise UsageError(f"key {self.template} has no field {', '.join(sorted(unknown))}")
         return (template or self.template).format(**{name: _write(name, value) for name, value in values.items()})
+
+
+def expression_problem(text: str) -> str | None:
+    """Why Zenoh would not take this for a key expression in canonical form; None when it would."""
+    if not text.strip("/"):
+        return "it is empty"
+    chunks = text.split("/")
+    if "" in chunks:
+        return "a / begins it, ends it or follows another"
+    for chunk, following in zip(chunks, [*chunks[1:], ""], strict=True):
+        if chunk == "**" and following in ("*", "**"):
+            return f"instead of **/{following} write {'*/**' if following == '*' else '**'}"
+        if chunk not in ("*", "**") and (problem := _chunk_problem(chunk)) is not None:
+            return problem
+    return None
+
+
+def _chunk_problem(chunk: str) -> str | None:
+    if forbidden := set(chunk) & set("?#"):
+        return f"{min(forbidden)} is not allowed"
+    if chunk == "$*":
+        return "instead of $* alone write *"
+    if "$*$" in chunk:
+        return "nothing that begins with $ may follow $*"
+    rest = chunk.replace("$*", "")
+    if "*" in rest:
+        return f"instead of {chunk} write {re.sub('[$*]*[*]', '$*', chunk)}: * within a chunk is $*"
+    return "$ is only allowed in $*" if "$" in rest else None
+
+
+@lru_cache(maxsize=1024)
+def _chunks(expression: str) -> tuple[re.Pattern[str] | None, ...]:
+    """The chunks of an expression as patterns; None for ``**``. ``@`` makes a chunk verbatim: no wildcard fits it,
+    and one in it has no meaning."""
+    return tuple(
+        None
+        if chunk == "**"
+        else re.compile(re.escape(chunk))
+        if chunk.startswith("@")
+        else re.compile("(?!@)" + re.escape(chunk).replace(r"\$\*", ".*").replace(r"\*", ".*"), re.DOTALL)
+        for chunk in expression.split("/")
+    )
+
+
+def fits(expression: str, key: str) -> bool:
+    """Whether a key, one without wildcards, is among those of an expression, as Zenoh understands it."""
+    reached = {0}  # how many of the expression's chunks may stand for the chunks of the key so far
+    chunks = _chunks(expression)
+    for chunk in key.split("/"):
+        reached = _past_any(chunks, reached)
+        reached = {
+            at if chunks[at] is None else at + 1
+            for at in reached
+            if at < len(chunks) and _stands_for(chunks[at], chunk)
+        }
+    return len(chunks) in _past_any(chunks, reached)
+
+
+def _past_any(chunks: tuple[re.Pattern[str] | None, ...], reached: set[int]) -> set[int]:
+    """The same and what follows each ``**``, which may stand for nothing."""
+    return reached | {at + 1 for at in reached if at < len(chunks) and chunks[at] is None}
+
+
+def _stands_for(pattern: re.Pattern[str] | None, chunk: str) -> bool:
+    return not chunk.startswith("@") if pattern is None else pattern.fullmatch(chunk) is not None
 
 
 def _write(name: str, value: FieldValue) -> str:
@@ -214,6 +280,12 @@ LAST = Key(
     subscriber="the named agent (queryable)",
     payload="none; the reply is one message: envelope and data",
 )
+PING = Key(
+    "macs/ping/{zid}",
+    publisher="`macs doctor` (query; a put to itself, for the router's timestamp)",
+    subscriber="every agent and gateway (queryable); the doctor's own second session",
+    payload="any bytes; the reply is one message: facts in JSON, and the bytes back",
+)
 
 KEYS: dict[str, Key] = {
     "unicast": UNICAST,
@@ -228,6 +300,7 @@ KEYS: dict[str, Key] = {
     "named": NAMED,
     "named all": NAMED_ALL,
     "last value": LAST,
+    "ping": PING,
 }
 """Every key space by the name of its plane."""
 

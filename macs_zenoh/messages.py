@@ -27,6 +27,8 @@ ROS = 1
 """Agent type of robots."""
 UNITY = 2
 """Agent type of headsets."""
+OPERATOR = 255
+"""Agent type of people who watch and stop robots, with `macs ls` and `macs stop`. No TCP agent has it."""
 
 AgentType = Annotated[int, Meta(ge=0, le=255)]
 AgentId = Annotated[int, Meta(ge=0, le=0xFFFF)]

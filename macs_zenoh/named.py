@@ -41,6 +41,8 @@ class Outcome(Enum):
     """The receiver is there and has not confirmed it by the deadline."""
     NO_ROUTER = "no router"
     """This program has no connection to the mesh now."""
+    KEPT = "kept"
+    """The same, and the message is kept: who takes its type gets it when there is a router again."""
     TO_ITSELF = "to itself"
 
     @property
@@ -136,6 +138,10 @@ class Names:
         if fields is not None:
             return self._want(str(fields["name"]), str(fields["message_type"]), str(fields["zid"]), alive)
         return None
+
+    def claims(self) -> list[Named]:
+        """Every claim, by name and session: a name that two agents have is listed twice."""
+        return [claims[zid] for _, claims in sorted(self._claims.items()) for zid in sorted(claims)]
 
     def claimants(self, name: str) -> list[str]:
         """Sessions that hold a name: more than one is a conflict."""
@@ -254,6 +260,10 @@ class Arrivals:
         newest = _touch(self._newest, key, envelope.number, 8 * self.SENDERS)
         self._newest[key] = max(newest, envelope.number)
         return True
+
+    def knows(self, sender: str, message_type: str, envelope: Envelope) -> bool:
+        """Whether a message of this type has come from this life of the sender."""
+        return (sender, message_type, envelope.session) in self._newest
 
     def newer(self, sender: str, message_type: str, envelope: Envelope) -> bool:
         """Whether nothing newer of this type has come from this life of the sender."""

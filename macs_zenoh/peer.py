@@ -22,6 +22,7 @@ from msgspec import Struct, structs
 from .errors import BadField, NotAllowed, TooFast, WireError
 from .messages import (
     NO_CUSTOM,
+    OPERATOR,
     ROS,
     AddNode,
     Configuration,
@@ -152,6 +153,7 @@ class Peer:
         scratch: bytearray | None = None,
     ) -> None:
         self.agent_id = agent_id
+        self.former_ids: set[int] = set()
         self.connection_number = connection_number
         self.agent_type = 0
         self.group = 0
@@ -176,9 +178,16 @@ class Peer:
     # -- out -----------------------------------------------------------------------------------------------------
 
     def welcome(self) -> bytes:
-        """The first message on every connection; agents give up when anything else comes before it."""
+        """The first message on every connection; agents give up when anything else comes before it. A headset takes a
+        later one as its new id, and answers again."""
         metadata = Metadata(request_id=self.connection_number, message_manager=Welcome.manager)
         return encode_message(metadata.encode(), encode_data(Welcome(agent_id=self.agent_id)))
+
+    def renumber(self, agent_id: int) -> None:
+        """From now on the agent has another id. `welcome` tells it; until it has read that it uses the former one."""
+        self.former_ids.add(self.agent_id)
+        self.agent_id = agent_id
+        self._metadata.clear()
 
     # -- in ------------------------------------------------------------------------------------------------------
 
@@ -276,6 +285,8 @@ class Peer:
         kind, group = configuration.agent_type, configuration.group_id
         if kind == 0:
             raise BadField("configuration", "agent type 0 is no agent")
+        if kind == OPERATOR:
+            raise NotAllowed("operators come over Zenoh, where a router can check who they are")
         if self.state is State.ONLINE:
             if kind != self.agent_type:
                 raise NotAllowed(f"a configured agent of type {self.agent_type} cannot become type {kind}")
@@ -295,7 +306,7 @@ class Peer:
                 events.append(Rejected(error))
 
     def _go_offline(self, message: GoOffline, events: list[Event]) -> None:
-        if message.agent_id not in (0, self.agent_id):
+        if message.agent_id not in {0, self.agent_id, *self.former_ids}:
             raise NotAllowed(f"agent {self.agent_id} cannot send agent {message.agent_id} offline")
         events.append(self._leave("went offline"))
 

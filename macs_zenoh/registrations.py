@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from msgspec import structs
+
 from .messages import AddNode, RemoveNode
 
 AgentKey = tuple[int, int]
@@ -74,6 +76,25 @@ class Registrations:
     def leave(self, agent: AgentKey) -> None:
         """Forget everything an agent registered. Robots notice its end by themselves."""
         self._wishes = {key: wish for key, wish in self._wishes.items() if key[0] != agent}
+
+    def rename(self, agent: AgentKey, agent_id: int) -> None:
+        """An agent has another id now: its registrations are those of the new one."""
+        renamed = {}
+        for (owner, node_type, node_name), wish in self._wishes.items():
+            if owner == agent:
+                owner = (agent[0], agent_id)
+                wish.node = structs.replace(wish.node, registrant_agent_id=agent_id)
+            renamed[owner, node_type, node_name] = wish
+        self._wishes = renamed
+
+    def of_agent(self, agent: AgentKey, robots: Robots) -> list[Task]:
+        """All that robots have to know of an agent."""
+        return [
+            Task(robot_id, wish.node)
+            for (owner, _, _), wish in self._wishes.items()
+            if owner == agent
+            for robot_id in _covered(wish, robots)
+        ]
 
     def of_robot(self, robot_id: int, group: int) -> list[Task]:
         """All that a robot has to be told when it comes, comes back or changes its group."""

@@ -6,9 +6,10 @@ for its group. Nobody hears its own broadcast or group message; an id list that 
 
 from __future__ import annotations
 
-from .keyexpr import BROADCAST, GROUP, UNICAST, block_of
+from .keyexpr import BROADCAST, CALL, GROUP, UNICAST, block_of
 from .messages import BROADCAST as EVERYBODY
-from .wire import Header
+from .messages import Metadata
+from .wire import MACS, Header, Layout, encode_frame, encode_message
 
 
 def keys_of(header: Header, from_type: int, from_id: int) -> list[str]:
@@ -29,6 +30,14 @@ def keys_of(header: Header, from_type: int, from_id: int) -> list[str]:
 def unicast_key(agent_type: int, agent_id: int, from_type: int, from_id: int) -> str:
     """The inbox key of one agent, for one sender."""
     return UNICAST.of(type=agent_type, block=block_of(agent_id), id=agent_id, from_type=from_type, from_id=from_id)
+
+
+def call(
+    to: tuple[int, int], verb: str, sender: tuple[int, int], data: bytes, metadata: Metadata, layout: Layout = MACS
+) -> tuple[str, bytes]:
+    """Key and frame of a call; ``to`` and ``sender`` are (type, id), and the metadata's sender is the same one."""
+    key = CALL.of(type=to[0], id=to[1], verb=verb, from_type=sender[0], from_id=sender[1])
+    return key, encode_frame(to[0], (to[1],), message=encode_message(metadata.encode(), data), layout=layout)
 
 
 def inbox(agent_type: int, agent_id: int) -> str:

@@ -1,8 +1,9 @@
-"""A TCP link to a router whose bytes are counted."""
+"""A TCP link to a router whose bytes are counted, and which can stand still or be cut."""
 
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 
@@ -15,11 +16,40 @@ class Link:
         self.up_bytes = 0
         """Towards the router."""
         self.down_bytes = 0
+        self._moves = asyncio.Event()
+        self._moves.set()
+        self.is_cut = False
+        self.ends: set[asyncio.StreamWriter] = set()
+
+    def cut(self) -> None:
+        """End all connections at once, and let no new one come about until `mend`."""
+        self.is_cut = True
+        for end in self.ends:
+            end.transport.abort()
+
+    def mend(self) -> None:
+        """Whoever tries again gets through."""
+        self.is_cut = False
+
+    def hold(self) -> None:
+        """From now on nothing goes towards the router, as on a link that is full: what is sent waits."""
+        self._moves.clear()
+
+    def release(self) -> None:
+        """What waits goes on."""
+        self._moves.set()
+
+    async def moves(self) -> None:
+        """Wait while the link is held."""
+        await self._moves.wait()
 
 
 @asynccontextmanager
-async def counted(router: str) -> AsyncIterator[Link]:
-    """A counting relay in front of the router at this endpoint; connect to ``link.endpoint``."""
+async def counted(router: str, *, buffer_bytes: int | None = None) -> AsyncIterator[Link]:
+    """A counting relay in front of the router at this endpoint; connect to ``link.endpoint``.
+
+    ``buffer_bytes`` is what the kernel holds on either side of a link; otherwise it is megabytes on this machine.
+    """
     link = Link()
     host, _, port = router.removeprefix("tcp/").rpartition(":")
     tasks: set[asyncio.Task[None]] = set()
@@ -27,19 +57,30 @@ async def counted(router: str) -> AsyncIterator[Link]:
     async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, up: bool) -> None:
         with suppress(ConnectionError):
             while data := await reader.read(65536):
+                if up:
+                    await link.moves()
                 link.up_bytes += len(data) if up else 0
                 link.down_bytes += 0 if up else len(data)
                 writer.write(data)
                 await writer.drain()
         writer.close()
+        link.ends.discard(writer)
 
     async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if link.is_cut:
+            writer.transport.abort()
+            return
         router_reader, router_writer = await asyncio.open_connection(host, int(port))
+        link.ends |= {writer, router_writer}
         tasks.add(asyncio.create_task(pump(reader, router_writer, up=True)))
         tasks.add(asyncio.create_task(pump(router_reader, writer, up=False)))
 
-    server = await asyncio.start_server(accept, "127.0.0.1", 0)
-    link.endpoint = f"tcp/127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    listener = socket.create_server(("127.0.0.1", 0))
+    link.endpoint = f"tcp/127.0.0.1:{listener.getsockname()[1]}"
+    if buffer_bytes is not None:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer_bytes)
+        link.endpoint += f"#so_sndbuf={buffer_bytes}"
+    server = await asyncio.start_server(accept, sock=listener)
     try:
         yield link
     finally:

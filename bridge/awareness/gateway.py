@@ -226,7 +226,7 @@ class Gateway:
         self.node.say_undelivered(receiver, message_type, str(error))
 
     def _outcome(self, receiver: str, message_type: str, outcome: Outcome) -> None:
-        if outcome in (Outcome.SENT, Outcome.DELIVERED):
+        if outcome in (Outcome.SENT, Outcome.DELIVERED, Outcome.KEPT):
             return
         if self.on_topic and not receiver:
             return  # on the plain topic it may have reached somebody

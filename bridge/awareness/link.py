@@ -55,7 +55,8 @@ class MeshLink:
         self._on_refused = on_refused
         self._on_change = on_change
         self._loop = asyncio.get_running_loop()
-        self._mesh: asyncio.Future[tuple[Mesh, int]] = asyncio.get_running_loop().create_future()
+        self._mesh: asyncio.Future[Mesh] = asyncio.get_running_loop().create_future()
+        self._agent_id = 0
         self._before: Counter[str] = Counter()
         self._wanted: dict[str, Registration | None] = {}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -67,14 +68,23 @@ class MeshLink:
         async with AsyncExitStack() as stack:
             try:
                 if wanted.beside and wanted.id is not None:
-                    mesh = await Mesh.open(self.settings.mesh, on_waiting=on_waiting)
+                    mesh = await Mesh.open(self.settings.mesh, traffic=self.settings.traffic, on_waiting=on_waiting)
                     await stack.enter_async_context(mesh)
-                    self._mesh.set_result((mesh, wanted.id))
+                    self._agent_id = wanted.id
+                    self._mesh.set_result(mesh)
                 else:
                     agent = await stack.enter_async_context(
-                        macs_zenoh.join("ros", id=wanted.id, settings=self.settings.mesh, on_waiting=on_waiting)
+                        macs_zenoh.join(
+                            "ros",
+                            id=wanted.id,
+                            settings=self.settings.mesh,
+                            traffic=self.settings.traffic,
+                            on_waiting=on_waiting,
+                        )
                     )
-                    self._mesh.set_result((agent.mesh, agent.id))
+                    self._agent_id = agent.id
+                    agent.on_id(self._id_changed)
+                    self._mesh.set_result(agent.mesh)
             except MacsError as error:
                 self._mesh.set_exception(error)
                 raise
@@ -89,14 +99,15 @@ class MeshLink:
 
     async def activate(self, name: str) -> None:
         """Take the name, as soon as there is a router. Raises UsageError when it cannot be had."""
-        mesh, agent_id = await asyncio.shield(self._mesh)
+        mesh = await asyncio.shield(self._mesh)
         settings = self.settings.awareness
         awareness = Awareness(
             mesh,
             name,
             agent_type=ROS,
-            agent_id=agent_id,
+            agent_id=self._agent_id,
             rates_hz=settings.rates_hz,
+            reliable=settings.reliable,
             max_message_bytes=settings.max_message_bytes,
         )
         try:
@@ -109,6 +120,11 @@ class MeshLink:
         for message_type in self._wanted:
             self._register(message_type)
         self._on_change()
+
+    def _id_changed(self, _old: int, new: int) -> None:
+        self._agent_id = new
+        if self.awareness is not None:
+            self.awareness.change_id(new)
 
     def deactivate(self) -> None:
         """Give the name up."""

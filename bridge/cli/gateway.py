@@ -116,7 +116,7 @@ async def _serve(settings: Settings) -> int:
 
     _raise_descriptor_limit()
     own = managers.load(settings.gateway.managers)
-    async with await Mesh.open(settings.mesh) as mesh:
+    async with await Mesh.open(settings.mesh, traffic=settings.traffic) as mesh:
         gateway = Gateway(mesh, settings.gateway, own)
         try:
             await gateway.start()

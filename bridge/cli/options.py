@@ -14,12 +14,17 @@ from macs_zenoh import config
 from macs_zenoh.config import Settings
 
 
-def add_log_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("-v", "--verbose", action="store_true", help="log more")
+def add_log_options(parser: argparse.ArgumentParser, verbose: str = "log more") -> None:
+    parser.add_argument("-v", "--verbose", action="store_true", help=verbose)
 
 
 def add_settings_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--settings", metavar="FILE", help="our settings file (TOML), see config/macs.toml")
+    parser.add_argument(
+        "--settings",
+        metavar="FILE",
+        action="append",
+        help="our settings file (TOML), see config/macs.toml; repeat: a later one wins",
+    )
 
 
 def add_mesh_options(parser: argparse.ArgumentParser, *, modes: tuple[str, ...] = ("client", "peer")) -> None:
@@ -40,8 +45,8 @@ def add_mesh_options(parser: argparse.ArgumentParser, *, modes: tuple[str, ...] 
 
 
 def settings_file(args: argparse.Namespace) -> Settings:
-    """What the settings file says, all defaults without one. Raises `ConfigError`."""
-    return config.load(args.settings) if args.settings else Settings()
+    """What the settings files say, all defaults without one. Raises `ConfigError`."""
+    return config.load(*args.settings or ())
 
 
 def settings(args: argparse.Namespace) -> Settings:

@@ -32,6 +32,7 @@ async def _serve(settings: MeshSettings) -> int:
     from macs_zenoh.mesh import Mesh
 
     async with await Mesh.open(settings):
-        running.say_ready("router on " + ", ".join(settings.listen or [EVERY_INTERFACE]))
+        of_file = f"the endpoints of {settings.config_file}" if settings.config_file else EVERY_INTERFACE
+        running.say_ready("router on " + (", ".join(settings.listen) or of_file))
         await asyncio.Event().wait()
     return 0

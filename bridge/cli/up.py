@@ -78,7 +78,7 @@ class Plan:
     router_port: int | None
     """None: there is a router already."""
     routers: list[str]
-    settings_file: str | None
+    settings_files: list[str]
     demo: bool
     once: bool
     verbose: bool
@@ -102,7 +102,7 @@ class Plan:
         return [word for router in self.routers for word in ("-e", router)]
 
     def _child(self, verb: str, argv: list[str]) -> Child:
-        common = ["--settings", self.settings_file] if self.settings_file else []
+        common = [word for file in self.settings_files for word in ("--settings", file)]
         return Child(verb, ["bridge", verb, *common, *(["-v"] if self.verbose else []), *argv])
 
 
@@ -121,7 +121,7 @@ def make_plan(args: argparse.Namespace, settings: Settings) -> Plan:
         robot=changed(settings.robot, id=args.id or settings.robot.id or DEFAULT_ROBOT, group=args.group),
         router_port=router_port,
         routers=routers,
-        settings_file=args.settings,
+        settings_files=args.settings or [],
         demo=args.demo,
         once=args.once,
         verbose=args.verbose,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from macs_zenoh.mesh import Token
+from macs_zenoh.messages import UNITY
+from macs_zenoh.registrations import AgentKey
 
 from .connection import Connection
 
@@ -20,14 +22,17 @@ class Agents:
         self._tokens: dict[Connection, Token] = {}
         self._groups: dict[Group, set[Connection]] = {}
         self._group_of: dict[Connection, Group] = {}
+        self._reserved: set[int] = set()
+        self.former: dict[AgentKey, Connection] = {}
+        """Who had an id until a moment ago: answers to it may be on their way."""
 
     def __len__(self) -> int:
         return len(self._by_id)
 
     @property
     def ids(self) -> set[int]:
-        """Ids given out."""
-        return set(self._by_id)
+        """Ids given out, or about to be."""
+        return self._by_id.keys() | self._reserved
 
     def connections(self) -> list[Connection]:
         """All connections."""
@@ -53,6 +58,36 @@ class Agents:
             self._group_of[connection] = group
             self._groups.setdefault(group, set()).add(connection)
         return emptied if emptied not in self._groups else None
+
+    def reserve(self, agent_id: int) -> None:
+        """An id is about to be given out."""
+        self._reserved.add(agent_id)
+
+    def unreserve(self, agent_id: int) -> None:
+        """It was given out, or it will not be."""
+        self._reserved.discard(agent_id)
+
+    def renumber(self, connection: Connection, agent_id: int) -> None:
+        """An agent has another id from now on; its former one stays known until `forget_former`."""
+        self.former[connection.key] = connection
+        del self._by_id[connection.agent_id]
+        self._by_id[agent_id] = connection
+        connection.peer.renumber(agent_id)
+
+    def replace_token(self, connection: Connection, token: Token) -> Token:
+        """The presence of an online agent is ``token`` now. Returns the one before, for the caller to close."""
+        before, self._tokens[connection] = self._tokens[connection], token
+        return before
+
+    def forget_former(self, agent: AgentKey, connection: Connection) -> None:
+        """Nobody answers this agent under its former id any more."""
+        if self.former.get(agent) is connection:
+            del self.former[agent]
+
+    def needs_block(self, agent_id: int) -> bool:
+        """Whether this id is a headset's, or may become one's: those are reached through their block."""
+        connection = self._by_id.get(agent_id)
+        return connection is not None and connection.peer.agent_type in (0, UNITY)
 
     def leave(self, connection: Connection) -> tuple[bool, Group | None]:
         """A connection ended. Returns whether it was online, and a group that lost its last member."""

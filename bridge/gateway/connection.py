@@ -199,6 +199,14 @@ class Connection(asyncio.BufferedProtocol):
         types = self._nodes.get(metadata.node_name)
         return types is None or metadata.node_type in types
 
+    def has(self, metadata: Metadata) -> bool:
+        """Whether the agent registered the node of this name and type itself."""
+        return metadata.node_type in self._nodes.get(metadata.node_name, ())
+
+    def registrants(self) -> list[GoneAgent]:
+        """Who is registered on the nodes of this robot program."""
+        return [GoneAgent(*agent) for agent in dict.fromkeys(key[:2] for key in self._told)]
+
     def tell(self, node: AddNode | RemoveNode) -> bool:
         """Whether this robot program has to be told: it makes a second ROS node of a registration heard twice."""
         key = (node.registrant_agent_type, node.registrant_agent_id, node.node_type, node.node_name)

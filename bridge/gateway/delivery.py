@@ -13,7 +13,7 @@ from macs_zenoh.directory import Directory
 from macs_zenoh.errors import WireError
 from macs_zenoh.keyexpr import BROADCAST, GROUP, UNICAST
 from macs_zenoh.mesh import Sample
-from macs_zenoh.messages import Metadata, StreamData, decode_management
+from macs_zenoh.messages import ROS, Metadata, NodeType, StreamData, decode_management
 from macs_zenoh.routing import takes_group_copy
 from macs_zenoh.wire import Frame, Layout, parse_frames
 
@@ -21,6 +21,9 @@ from .agents import Agents
 from .connection import Connection
 
 log = logging.getLogger("macs.gateway")
+
+ANSWERS = frozenset((NodeType.CLIENT, NodeType.ACTION))
+"""Nodes of headsets to which robots answer."""
 
 KNOWN = 4096
 """How many keys, metadata and registrant lists are remembered as already read."""
@@ -50,6 +53,8 @@ class Delivery:
         for key, payload in batch:
             connection = self._targets.get(key) or self._find(key)
             if connection is None:
+                if self._agents.former:
+                    self._late_answer(key, payload)
                 continue
             for frame, metadata in self._read(key, payload):
                 self._send(connection, frame, metadata)
@@ -93,7 +98,9 @@ class Delivery:
             for frame, metadata in self._read(key, payload):
                 for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
                     connection = self._agents.find(*registrant)
-                    if connection is not None and self._may_have(connection, frame, metadata):
+                    if connection is None or not self._may_have(connection, frame, metadata):
+                        continue
+                    if connection.has(metadata):  # else the frame is older than the agent, which has another's id
                         connection.send_stream(metadata.node_name, frame.messages)
         self.flush()
 
@@ -136,6 +143,18 @@ class Delivery:
             self._targets.clear()
         self._targets[key] = connection
         return connection
+
+    def _late_answer(self, key: str, payload: bytes | bytearray) -> None:
+        """An answer to a service call that an agent made under the id it had then. Anything else that is sent to
+        that id is for whoever has it now."""
+        fields = UNICAST.parse(key)
+        if fields is None or fields["from_type"] != ROS:
+            return
+        connection = self._agents.former.get((int(fields["type"]), int(fields["id"])))
+        if connection is not None:
+            for frame, metadata in self._read(key, payload):
+                if metadata.node_type in ANSWERS and connection.has(metadata):
+                    self._send(connection, frame, metadata)
 
     def _hold_sender(self, sender: tuple[object, object], receivers: list[Connection]) -> None:
         """Slow down a sender on this gateway. Those elsewhere are slowed by nobody: the outbox's limit decides."""

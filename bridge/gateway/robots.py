@@ -9,14 +9,17 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from contextlib import suppress
+
+from msgspec import structs
 
 from macs_zenoh.directory import Change, Directory
-from macs_zenoh.errors import Refused, Unreachable
-from macs_zenoh.keyexpr import CALL
+from macs_zenoh.errors import OutOfRange, Refused, Unreachable
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.messages import ROS, AddNode, Metadata, NodeRefused, NodeType, RemoveNode, encode_data
 from macs_zenoh.registrations import AgentKey, Registrations, Robots, Task
-from macs_zenoh.wire import Layout, encode_frame, encode_message
+from macs_zenoh.routing import call
+from macs_zenoh.wire import Layout
 
 log = logging.getLogger("macs.gateway")
 
@@ -24,6 +27,8 @@ CALL_TIMEOUT_S = 2.0
 RETRY_S = (0.05, 0.05, 0.1, 0.2, 0.5)
 """Pauses between attempts, the last one repeated: a robot that has just come is online a moment before it serves."""
 ATTEMPTS = 120
+MOVE_S = 1.0
+"""How long an agent's change to another id waits for a robot."""
 
 TaskKey = tuple[int, AgentKey, int, str]
 
@@ -47,6 +52,7 @@ class RobotCalls:
         self._on_refused = on_refused
         self._registrations = Registrations()
         self._running: dict[TaskKey, asyncio.Task[None]] = {}
+        self._seen: Robots = {}
 
     def close(self) -> None:
         """End all calls."""
@@ -83,6 +89,51 @@ class RobotCalls:
                 self._start(task)
         self._streams_changed()
 
+    async def prepare(self, agent: AgentKey, agent_id: int, slow: set[int]) -> list[Task]:
+        """Have robots know an agent under the id that it is about to have, too; what they were told. Services, which
+        take one agent only, are left to `rename`. Robots in ``slow`` are not waited for; those that do not answer in
+        time get into it."""
+        tasks = self._registrations.of_agent(agent, self._robots())
+        nodes = [(task.robot_id, task.node) for task in tasks if task.node.node_type != NodeType.SERVICE]
+        return await self._try(
+            [Task(r, structs.replace(node, registrant_agent_id=agent_id)) for r, node in nodes], slow
+        )
+
+    async def rename(self, agent: AgentKey, agent_id: int, told: list[Task], slow: set[int]) -> None:
+        """An agent has another id now; robots forget the one before. ``told`` is what `prepare` gave."""
+        before = self._registrations.of_agent(agent, self._robots())
+        self._registrations.rename(agent, agent_id)
+        for key in [key for key in self._running if key[1] == agent]:
+            self._running.pop(key).cancel()
+        nodes = [(task.robot_id, task.node) for task in before]
+        forget = [Task(r, RemoveNode(*agent, node.node_type, node.node_name)) for r, node in nodes]
+        forgotten = await self._try(forget, slow)
+        for task in [*forget, *self._registrations.of_agent((agent[0], agent_id), self._robots())]:
+            if task not in told and task not in forgotten:
+                self._start(task)
+
+    async def _try(self, tasks: list[Task], slow: set[int]) -> list[Task]:
+        """Tell robots something at once, for not longer than ``MOVE_S``; what they have confirmed."""
+        told = []
+
+        async def ask(task: Task) -> None:
+            with suppress(Refused, Unreachable):
+                await self._ask(task)
+                told.append(task)
+
+        asked = {asyncio.ensure_future(ask(task)): task for task in tasks if task.robot_id not in slow}
+        if asked:
+            _, late = await asyncio.wait(asked, timeout=MOVE_S)
+            for asking in late:
+                slow.add(asked[asking].robot_id)
+                asking.cancel()
+        return told
+
+    def repeat(self, agent: AgentKey) -> None:
+        """Tell robots again everything that one agent registered."""
+        for task in self._registrations.of_agent(agent, self._robots()):
+            self._start(task)
+
     def repeat_all(self) -> None:
         """Our own link was lost: robots may have seen our headsets leave, so tell them everything again."""
         for robot_id, group in self._robots().items():
@@ -93,7 +144,9 @@ class RobotCalls:
         return {agent.id: agent.group for agent in self._directory.of_type(ROS)}
 
     def _streams_changed(self) -> None:
-        self._on_streams(self._registrations.streams(NodeType.SUBSCRIBER, self._robots()))
+        """Streams of robots that are away stay: a reliable one goes on where it was when its robot is back."""
+        self._seen.update(self._robots())
+        self._on_streams(self._registrations.streams(NodeType.SUBSCRIBER, self._seen))
 
     def _start(self, task: Task) -> None:
         node = task.node
@@ -112,9 +165,9 @@ class RobotCalls:
                 await self._ask(task)
                 log.info("%s: done", what)
                 return
-            except Refused as refusal:
-                log.warning("%s was refused: %s", what, refusal.reason)
-                self._refused(task, refusal.reason)
+            except (Refused, OutOfRange) as refusal:  # by the robot, or here by a traffic rule
+                log.warning("%s was refused: %s", what, refusal)
+                self._refused(task, str(refusal))
                 return
             except Unreachable as error:
                 log.debug("%s: %s", what, error)
@@ -139,10 +192,8 @@ class RobotCalls:
         node = task.node
         sender = (node.registrant_agent_type, node.registrant_agent_id)
         verb = "add_node" if isinstance(node, AddNode) else "remove_node"
-        key = CALL.of(type=ROS, id=task.robot_id, verb=verb, from_type=sender[0], from_id=sender[1])
         metadata = Metadata(*sender, message_manager=node.manager)
-        message = encode_message(metadata.encode(), encode_data(node))
-        frame = encode_frame(ROS, (task.robot_id,), message=message, layout=self._layout)
+        key, frame = call((ROS, task.robot_id), verb, sender, encode_data(node), metadata, self._layout)
         await self._mesh.query(key, frame, timeout_s=CALL_TIMEOUT_S)
 
 

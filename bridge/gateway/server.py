@@ -11,7 +11,6 @@ import asyncio
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -19,9 +18,9 @@ from typing import NamedTuple
 from macs_zenoh.config import GatewaySettings
 from macs_zenoh.directory import Change, Directory
 from macs_zenoh.errors import Refused, Unreachable
-from macs_zenoh.keyexpr import BROADCAST, CALL, GROUP, PRESENCE, STREAM, UNICAST, type_name
+from macs_zenoh.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
 from macs_zenoh.managers import Asker, Managers
-from macs_zenoh.mesh import Mesh, OnBatch, Subscription, Traffic
+from macs_zenoh.mesh import Mesh, OnBatch, Payload, Subscription, Traffic
 from macs_zenoh.messages import (
     ROS,
     UNITY,
@@ -32,14 +31,13 @@ from macs_zenoh.messages import (
     NodeRefused,
     NodeType,
     OnlineReply,
-    RemoveNode,
-    decode_data,
     encode_data,
 )
 from macs_zenoh.peer import Asked, AskedOnline, Event, Joined, Limits, Peer, Registering, Sent, Streamed
+from macs_zenoh.presence import Presence
 from macs_zenoh.registrations import AgentKey
-from macs_zenoh.routing import inbox, keys_of
-from macs_zenoh.wire import FrameDecoder, Header, Layout, encode_message, parse_frame
+from macs_zenoh.routing import keys_of
+from macs_zenoh.wire import FrameDecoder, Header, Layout, encode_message
 
 from .agents import Agents, Group
 from .brake import Brake
@@ -47,6 +45,8 @@ from .connection import Connection
 from .delivery import Delivery
 from .door import Door
 from .leases import Leases
+from .own_keys import OwnKeys
+from .renumbering import Renumbering
 from .robots import RobotCalls
 
 log = logging.getLogger("macs.gateway")
@@ -62,6 +62,8 @@ class Route(NamedTuple):
 
     keys: list[str]
     header: Header
+    limited: bool = False
+    """Whether a traffic rule limits one of the keys, so that frames count one by one."""
 
 
 @dataclass
@@ -87,8 +89,8 @@ class Gateway:
         self._all_closed = asyncio.Event()
         self.settings = settings
         self.port = 0
-        self.directory = Directory()
         self.agents = Agents()
+        self._presence = Presence(mesh, self._tell, lambda contested: self._renumbering.contested(contested))
         self._drops: Counter[str] = Counter()
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
         self._limits = Limits(
@@ -105,15 +107,37 @@ class Gateway:
         self._subscriptions: dict[str, Subscription] = {}
         self._streams: set[str] = set()
         self._server: asyncio.Server | None = None
-        self._sweep: asyncio.TimerHandle | None = None
         self._run = NO_RUN
         self._brake = Brake()
         mesh.on_room(self._brake.release)
         self._delivery = Delivery(self.agents, self.directory, self._layout)
-        self._leases = Leases(mesh, settings.block, self._block_leased, self._greet_waiting)
+        self._own_keys = OwnKeys(mesh, self.agents, self._delivery, self._layout)
+        self._leases = Leases(
+            mesh,
+            settings.block,
+            settings.blocks,
+            on_block=self._block_leased,
+            on_ids=self._greet_waiting,
+            on_lost=lambda block: self._renumbering.block_lost(block),
+        )
         self._robots = RobotCalls(
             mesh, self.directory, self._layout, on_streams=self._streams_wanted, on_refused=self._tell_refusal
         )
+        self._renumbering = Renumbering(
+            mesh.zid,
+            self._presence,
+            self.agents,
+            self._leases,
+            self._robots,
+            self._own_keys,
+            on_change=self._id_changes,
+            on_block_left=lambda block: self._unsubscribe(UNICAST.every(type=UNITY, block=block)),
+        )
+
+    @property
+    def directory(self) -> Directory:
+        """Who is online."""
+        return self._presence.directory
 
     @property
     def blocks(self) -> list[int]:
@@ -132,12 +156,11 @@ class Gateway:
 
         Raises ConfigError when the block is somebody else's, Unreachable when the port cannot be had.
         """
-        self.mesh.on_link(self._link)
-        self._subscriptions[PRESENCE.every()] = self.mesh.watch_tokens(PRESENCE.every(), self._token)
-        for key in await self.mesh.tokens(PRESENCE.every()):
-            self._token(key, True)
+        await self._presence.start()
+        self.mesh.on_link(lambda up: self._robots.repeat_all() if up else None)
         await self._leases.take()
         self._subscribe(BROADCAST.every(), self._delivery.broadcast)
+        self._subscriptions["ping"] = self.mesh.answer_pings()
         host, port = self.settings.host, self.settings.port
         try:
             self._server = await asyncio.get_running_loop().create_server(
@@ -152,6 +175,7 @@ class Gateway:
         """Stop accepting, tell the mesh, send what waits for ``FLUSH_S`` at most, leave."""
         if self._server is not None:
             self._server.close()
+        self._renumbering.close()
         self._robots.close()
         connections = [*self.agents.connections(), *self._waiting]
         if connections:
@@ -162,10 +186,10 @@ class Gateway:
             for connection in connections:
                 connection.abort()
         self._leases.close()
+        self._own_keys.close()
+        self._presence.close()
         for subscription in self._subscriptions.values():
             subscription.close()
-        if self._sweep is not None:
-            self._sweep.cancel()
         if self.drops:
             log.info("lost in all: %s", ", ".join(f"{name} {count}" for name, count in sorted(self.drops.items())))
 
@@ -212,6 +236,12 @@ class Gateway:
     def _block_leased(self, block: int) -> None:
         self._subscribe(UNICAST.every(type=UNITY, block=block), self._delivery.inbox)
 
+    def _id_changes(self, connection: Connection) -> None:
+        """A connection is about to have another id."""
+        self._put_run()
+        self._routes[connection] = {}
+        self._delivery.forget()
+
     def closed(self, connection: Connection) -> None:
         """Forget a connection; its presence ends at once."""
         self._door.leave(connection.host)
@@ -224,8 +254,7 @@ class Gateway:
         was_online, empty_group = self.agents.leave(connection)
         self._group_emptied(empty_group)
         if was_online:
-            for key in self._own_keys(connection):
-                self._unsubscribe(key)
+            self._own_keys.undeclare(connection.key)
             self._robots.leave(connection.key)
             log.debug("%s is offline", connection)
         if not self.agents:
@@ -257,7 +286,8 @@ class Gateway:
             if len(routes) >= KNOWN_ROUTES:
                 routes.clear()
             header = frame.header
-            route = routes[destination] = Route(keys_of(header, *connection.key), header)
+            keys = keys_of(header, *connection.key)
+            route = routes[destination] = Route(keys, header, any(self.mesh.limited(key) for key in keys))
         if not route.keys:
             connection.complain("no_destination", "a message names no agent and no group", frame.count)
             return
@@ -268,6 +298,11 @@ class Gateway:
                     problem = f"a message goes to {type_name(kind)}/{agent_id}, not online"
                     connection.complain("unknown_agent", problem, frame.count)
         traffic = Traffic.COMMAND if sent.metadata.node_type == PUBLISHER else Traffic.CALL
+        if route.limited:
+            self._put_run()
+            for single in frame.each():
+                self._put(route.keys, single.data, traffic)
+            return
         run = self._run
         if run.route is not route or run.traffic is not traffic or run.bytes + len(frame.data) > Mesh.LARGE_BYTES:
             self._put_run()
@@ -286,16 +321,19 @@ class Gateway:
         """Put frames that go the same way as one sample: a put costs more than a frame."""
         run, self._run = self._run, NO_RUN
         if run.frames:
-            payload = run.frames[0] if len(run.frames) == 1 else b"".join(run.frames)
-            for key in run.route.keys:
-                self.mesh.put(key, payload, run.traffic)
+            self._put(run.route.keys, run.frames[0] if len(run.frames) == 1 else b"".join(run.frames), run.traffic)
+
+    def _put(self, keys: list[str], payload: Payload, traffic: Traffic) -> None:
+        for key in keys:
+            self.mesh.put(key, payload, traffic)
 
     def handle(self, connection: Connection, event: Event) -> None:
         """One thing a TCP agent did."""
         self._put_run()
         if isinstance(event, Streamed):
             key = STREAM.of(type=ROS, id=connection.agent_id, node=event.metadata.node_name or "_")
-            self.mesh.put(key, event.frame.data, Traffic.STREAM)
+            for frame in event.frame.each() if self.mesh.limited(key) else [event.frame]:
+                self.mesh.put(key, frame.data, Traffic.STREAM)
         elif isinstance(event, Joined):
             self._joined(connection, event)
         elif isinstance(event, Registering):
@@ -334,76 +372,38 @@ class Gateway:
 
     def _joined(self, connection: Connection, event: Joined) -> None:
         kind, agent_id = connection.key
-        if kind != UNITY:
-            self._subscribe(inbox(kind, agent_id), self._delivery.inbox)
-        if kind == ROS:
-            self._serve_robot(connection)
+        self._own_keys.declare(connection)
         if event.group:
             self._subscribe(GROUP.every(type=kind, group=event.group), self._delivery.group)
         # the token last: whoever sees the agent can reach it
-        presence = PRESENCE.of(type=kind, id=agent_id, group=event.group, zid=self.mesh.zid)
-        self._group_emptied(self.agents.join(connection, self.mesh.declare_token(presence)))
+        token = self._presence.declare(kind, agent_id, event.group)
+        self._group_emptied(self.agents.join(connection, token))
         self._delivery.forget()
+        self._renumbering.joined(connection)
         log.info("%s is online%s", connection, f" in group {event.group}" if event.group else "")
 
     def _answer_online(self, connection: Connection, request_id: int) -> None:
-        ids: dict[int, list[int]] = {kind: self._elsewhere(kind) for kind in (ROS, UNITY)}
+        ids = {kind: {agent.id for agent in self._presence.elsewhere(kind)} for kind in (ROS, UNITY)}
         for own in self.agents.online():  # what we know ourselves comes back through the mesh a moment later
-            ids.setdefault(own.key[0], []).append(own.agent_id)
+            ids.setdefault(own.key[0], set()).add(own.agent_id)
         reply = OnlineReply(ros_agent_ids=sorted(ids[ROS]), unity_agent_ids=sorted(ids[UNITY]))
         self._reply(connection, Metadata(request_id=request_id), encode_data(reply))
 
-    def _elsewhere(self, kind: int) -> list[int]:
-        """Ids of the online agents of a type that are not behind this gateway."""
-        return [agent.id for agent in self.directory.of_type(kind) if agent.zid != self.mesh.zid]
-
-    # -- TCP robots ----------------------------------------------------------------------------------------------
-
-    def _serve_robot(self, connection: Connection) -> None:
-        """Registrations for an existing robot program: passed on as the message it knows, which it never answers."""
-
-        def pass_on(kind: type[AddNode | RemoveNode]) -> Callable[[str, bytes], Awaitable[bytes]]:
-            async def deliver(key: str, payload: bytes) -> bytes:
-                fields = CALL.parse(key)
-                if fields is None or self.agents.find(*connection.key) is not connection:
-                    raise Refused("the robot is not connected")
-                sender = Metadata(int(fields["from_type"]), int(fields["from_id"]), message_manager=kind.manager)
-                body = parse_frame(payload, self._layout).body
-                if not connection.tell(decode_data(kind, body)):
-                    return b""  # it has that node already
-                connection.send_call(encode_message(sender.encode(), body))
-                self._delivery.flush()
-                return b""
-
-            return deliver
-
-        for verb, kind in (("add_node", AddNode), ("remove_node", RemoveNode)):
-            key = CALL.every(type=ROS, id=connection.agent_id, verb=verb)
-            if key not in self._subscriptions:
-                self._subscriptions[key] = self.mesh.serve(key, pass_on(kind))
-
     # -- subscriptions -------------------------------------------------------------------------------------------
-
-    def _own_keys(self, connection: Connection) -> list[str]:
-        """What is subscribed for one agent alone."""
-        kind, agent_id = connection.key
-        if kind == UNITY:
-            return []
-        verbs = [CALL.every(type=ROS, id=agent_id, verb=verb) for verb in ("add_node", "remove_node")]
-        return [inbox(kind, agent_id), *(verbs if kind == ROS else [])]
 
     def _streams_wanted(self, streams: set[tuple[int, str]]) -> None:
         """Listen to exactly these streams of robots: (robot id, node name)."""
         wanted = {STREAM.of(type=ROS, id=robot_id, node=node) for robot_id, node in streams}
         for key in wanted - self._streams:
-            self._subscribe(key, self._delivery.stream)
+            # whether a robot keeps a stream for recovery is seen from its messages: others cost nothing more
+            self._subscribe(key, self._delivery.stream, reliable=True)
         for key in self._streams - wanted:
             self._unsubscribe(key)
         self._streams = wanted
 
-    def _subscribe(self, key: str, on_batch: OnBatch) -> None:
+    def _subscribe(self, key: str, on_batch: OnBatch, *, reliable: bool = False) -> None:
         if key not in self._subscriptions:
-            self._subscriptions[key] = self.mesh.subscribe(key, on_batch)
+            self._subscriptions[key] = self.mesh.subscribe(key, on_batch, reliable=reliable)
 
     def _unsubscribe(self, key: str) -> None:
         subscription = self._subscriptions.pop(key, None)
@@ -411,15 +411,6 @@ class Gateway:
             subscription.close()
 
     # -- presence ------------------------------------------------------------------------------------------------
-
-    def _token(self, key: str, alive: bool) -> None:
-        self._tell(self.directory.token(key, alive, time.monotonic()))
-
-    def _link(self, up: bool) -> None:
-        self.directory.link(up, time.monotonic())
-        if up:
-            self._robots.repeat_all()
-        self._schedule_sweep()
 
     def _tell(self, changes: list[Change]) -> None:
         gone = [GoneAgent(agent.type, agent.id) for agent, online in changes if not online]
@@ -432,14 +423,3 @@ class Gateway:
             self._delivery.flush()
         for change in changes:
             self._robots.presence(change)
-        self._schedule_sweep()
-
-    def _schedule_sweep(self) -> None:
-        if self._sweep is not None:
-            self._sweep.cancel()
-            self._sweep = None
-        if (deadline := self.directory.next_deadline()) is not None:
-            self._sweep = asyncio.get_running_loop().call_later(
-                max(0.0, deadline - time.monotonic()) + 0.01,
-                lambda: self._tell(self.directory.tick(time.monotonic())),
-            )

@@ -16,12 +16,13 @@ from typing import Any
 import msgspec
 from rclpy.serialization import deserialize_message, serialize_message
 
+from bridge.ros.graph import SEND_GOAL
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.services import ABSENT_S, Search, first_line
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import resolve
 from macs_zenoh.agent import Message
-from macs_zenoh.messages import ROS, ActionVerb, AddNode, Metadata, NodeType
+from macs_zenoh.messages import ActionVerb, AddNode, NodeType
 
 log = logging.getLogger("macs.ros")
 
@@ -76,11 +77,13 @@ class ActionNode(InterfaceNode):
         return bool(self.registrants) or bool(self._goals)
 
     def open(self) -> None:
+        node = self.robot.session.node
+        goals = dict(node.get_service_names_and_types()).get(self.topic + SEND_GOAL, [])
+        self.interface.check(self.topic, {of_type.removesuffix("_SendGoal") for of_type in goals})
         self._types = resolve(str(self.interface), "action")
         # 12 MB, of which robots without actions need nothing
         from rclpy.action import ActionClient
 
-        node = self.robot.session.node
         with ros_errors(self.request.tos_name):
             self._client = ActionClient(node, self._types, self.request.tos_name)
 
@@ -240,15 +243,7 @@ class ActionNode(InterfaceNode):
         self._check_use()
 
     def _tell(self, goal: Goal, verb: ActionVerb, code: int, rest: bytes = b"") -> None:
-        metadata = Metadata(
-            sender_agent_type=ROS,
-            sender_agent_id=self.robot.agent_id,
-            request_id=goal.request_id,
-            message_manager=verb.value,
-            node_type=self.NODE_TYPE,
-            node_name=self.key.node_name,
-            data_exchange_type=self.interface.short,
-        )
+        metadata = self.metadata(verb.value, goal.request_id)
         self.robot.send(goal.owner, metadata, goal.id + struct.pack("B", code) + rest)
 
     def _watch(self) -> None:

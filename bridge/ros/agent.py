@@ -11,6 +11,7 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
+from typing import TypeVar
 
 import macs_zenoh
 from bridge.ros import parameters
@@ -31,6 +32,8 @@ from macs_zenoh.messages import AddNode, FunctionalityRequest, Metadata, RemoveN
 from macs_zenoh.wire import Layout
 
 log = logging.getLogger("macs.ros")
+
+_Registration = TypeVar("_Registration", AddNode, RemoveNode)
 
 NODE_NAME = "rosagent"
 
@@ -57,6 +60,8 @@ class RobotAgent:
             send=self._send,
             rules=Rules(settings),
             group_of=self._group_of,
+            prioritise_stream=agent.prioritise_stream,
+            keep_stream=agent.keep_stream,
         )
         self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
         self.offers = Offers(robot, agent.publish_stream)
@@ -71,6 +76,7 @@ class RobotAgent:
             except Refused as refusal:
                 log.error("there is no emergency stop: %s", refusal.reason)
         self.agent.on_presence(self._presence)
+        self.agent.on_id(self._id_changed)
         self.agent.mesh.on_link(self._link)
         for verb, handler in (
             ("add_node", self._add_node),
@@ -145,11 +151,11 @@ class RobotAgent:
     # -- verbs ---------------------------------------------------------------------------------------------------
 
     async def _add_node(self, call: Call) -> bytes:
-        await self.nodes.add(decode_data(AddNode, call.data))
+        await self.nodes.add(_own(decode_data(AddNode, call.data), call))
         return b""
 
     async def _remove_node(self, call: Call) -> bytes:
-        self.nodes.remove(decode_data(RemoveNode, call.data))
+        self.nodes.remove(_own(decode_data(RemoveNode, call.data), call))
         return b""
 
     async def _offers(self, _call: Call) -> bytes:
@@ -180,6 +186,14 @@ class RobotAgent:
         found = self.agent.directory.get(*agent)
         return found.group if found else 0
 
+    def _id_changed(self, _old: int, new: int) -> None:
+        """Whoever registered here asked for the old id, which is another robot's now; as after a restart, gateways
+        register again what is wanted of the new one. The emergency stop holds."""
+        self.nodes.forget_all()
+        self.offers.close()
+        self.nodes.robot.agent_id = new
+        self.offers = Offers(self.nodes.robot, self.agent.publish_stream)
+
     def _link(self, up: bool) -> None:
         """Without a router nobody is seen to leave, and no command comes: after a lease all commanders count as gone.
 
@@ -199,6 +213,15 @@ class RobotAgent:
             gone = Registrant(agent.type, agent.id)
             self.nodes.forget(gone)
             self.offers.forget(gone)
+
+
+def _own(request: _Registration, call: Call) -> _Registration:
+    """A registration by the agent that it is for: the key says who calls, and routers hold callers to their keys."""
+    caller = Registrant(type_number(call.sender_type), call.sender_id)
+    registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
+    if registrant != caller:
+        raise Refused(f"{caller} cannot register or remove nodes for {registrant}")
+    return request
 
 
 @asynccontextmanager
@@ -227,7 +250,12 @@ async def open_robot(
         settings = await session.run(lambda: parameters.apply(session.node, settings))
         robot = settings.robot
         async with macs_zenoh.join(
-            "ros", id=robot.id, group=robot.group, settings=settings.mesh, on_waiting=on_waiting
+            "ros",
+            id=robot.id,
+            group=robot.group,
+            settings=settings.mesh,
+            traffic=settings.traffic,
+            on_waiting=on_waiting,
         ) as agent:
             ros_agent = RobotAgent(agent, session, robot, own)
             await ros_agent.start()

@@ -20,9 +20,10 @@ from bridge.ros.safety import EmergencyStop
 from bridge.ros.session import RosSession
 from bridge.ros.types import InterfaceName
 from macs_zenoh.agent import Message
+from macs_zenoh.config import Priority
 from macs_zenoh.errors import Refused
 from macs_zenoh.keyexpr import type_name, type_number
-from macs_zenoh.messages import AddNode, Metadata, NodeType, RemoveNode
+from macs_zenoh.messages import ROS, AddNode, Metadata, NodeType, RemoveNode
 from macs_zenoh.wire import MACS, Layout
 
 log = logging.getLogger("macs.ros")
@@ -73,14 +74,17 @@ class Drops(Counter[str]):
             log.warning("%s: %s (logged once, counted as %s)", about, text, name)
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Robot:
     """What interface nodes work with.
 
     Attributes:
         session: the ROS node and its thread.
-        agent_id: the robot's id on the mesh.
+        agent_id: the robot's id on the mesh now.
         publish_stream: puts a frame on the mesh.
+        prioritise_stream: sets the priority of a node's frames; None: the usual one.
+        keep_stream: sets how many of a node's frames are kept for recovery; None: as the traffic rules say. Returns
+            whether any are.
         layout: of the mesh's frames.
         send: a message to one agent.
         rules: what the settings say by name.
@@ -97,6 +101,8 @@ class Robot:
     rules: Rules = field(default_factory=Rules)
     group_of: Callable[[Registrant], int] = lambda agent: 0
     stop: EmergencyStop = field(default_factory=EmergencyStop)
+    prioritise_stream: Callable[[str, Priority | None], None] = lambda node, priority: None
+    keep_stream: Callable[[str, int | None], bool] = lambda node, frames: False
 
 
 class InterfaceNode(ABC):
@@ -116,6 +122,8 @@ class InterfaceNode(ABC):
         self.topic = self.full_name(request.tos_name)
         self.interface = InterfaceName.parse(request.data_exchange_type, self.INTERFACE)
         self.registrants: set[Registrant] = set()
+        self.linger_s = 0.0
+        """How long an agent stays registered that is not seen on the mesh any more."""
         self.is_open = False
         self.opening: asyncio.Task[None] | None = None
         self.unused: Callable[[], None] = lambda: None
@@ -189,6 +197,18 @@ class InterfaceNode(ABC):
 
     def retire(self) -> None:  # noqa: B027 - only some nodes have something open
         """The node will be closed: end what is open. On the loop, before `close`."""
+
+    def metadata(self, manager: str = "", request_id: int = 0) -> Metadata:
+        """Of a message from this node."""
+        return Metadata(
+            sender_agent_type=ROS,
+            sender_agent_id=self.robot.agent_id,
+            request_id=request_id,
+            message_manager=manager,
+            node_type=self.NODE_TYPE,
+            node_name=self.key.node_name,
+            data_exchange_type=self.interface.short,
+        )
 
     def status(self) -> dict[str, Any]:
         """What there is to see from outside, as JSON."""

@@ -37,6 +37,7 @@ class InterfaceNodes:
         self._nodes: dict[NodeKey, InterfaceNode] = {}
         self._early = EarlyMessages()
         self._expiry: asyncio.TimerHandle | None = None
+        self._lingering: dict[tuple[NodeKey, Registrant], asyncio.TimerHandle] = {}
 
         self.stop: StopNode | None = None
 
@@ -63,7 +64,9 @@ class InterfaceNodes:
             node = self._create(request)
         else:
             node.check_same(request)
-        node.register(Registrant(request.registrant_agent_type, request.registrant_agent_id))
+        registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
+        node.register(registrant)
+        self._end_lingering(node, registrant)
         assert node.opening is not None
         await asyncio.shield(node.opening)
 
@@ -89,7 +92,16 @@ class InterfaceNodes:
         for node in self:
             node.left(registrant)
             if registrant in node.registrants:
-                self._deregister(node, registrant)
+                if node.linger_s:
+                    self._linger(node, registrant)
+                else:
+                    self._deregister(node, registrant)
+
+    def forget_all(self) -> None:
+        """Remove all that anybody registered; only the emergency stop stays."""
+        for node in self:
+            if node is not self.stop:
+                self._remove(node)
 
     def deliver(self, message: Message) -> None:
         """Pass a message that names an interface node to it. Never raises for what a peer sent.
@@ -146,12 +158,26 @@ class InterfaceNodes:
         for message in self._early.take(node.key):
             node.receive(message)
 
+    def _linger(self, node: InterfaceNode, registrant: Registrant) -> None:
+        """Its gateway may only have lost the way to us: what it will ask for then has to be there."""
+        self._end_lingering(node, registrant)
+        self._lingering[node.key, registrant] = asyncio.get_running_loop().call_later(
+            node.linger_s, self._deregister, node, registrant
+        )
+
+    def _end_lingering(self, node: InterfaceNode, registrant: Registrant) -> None:
+        if (lingering := self._lingering.pop((node.key, registrant), None)) is not None:
+            lingering.cancel()
+
     def _deregister(self, node: InterfaceNode, registrant: Registrant) -> None:
+        self._end_lingering(node, registrant)
         node.deregister(registrant)
         if not node.in_use:
             self._remove(node)
 
     def _remove(self, node: InterfaceNode) -> None:
+        for registrant in node.registrants:
+            self._end_lingering(node, registrant)
         del self._nodes[node.key]
         node.is_open = False
         node.retire()

@@ -20,6 +20,7 @@ class Control:
     def __init__(self, hold_s: float) -> None:
         self.hold_s = hold_s
         self._holder: Hashable | None = None
+        self._since = -math.inf
         self._until = -math.inf
 
     def holder(self, now: float) -> Hashable | None:
@@ -30,10 +31,17 @@ class Control:
         """How long the holder keeps it without a further command."""
         return max(0.0, self._until - now) if self._holder is not None else 0.0
 
+    def seconds_held(self, now: float) -> float:
+        """How long the holder has had it."""
+        return now - self._since if self.holder(now) is not None else 0.0
+
     def take(self, agent: Hashable, now: float) -> bool:
         """Have or keep control; every command does. False when somebody else has it."""
-        if self.holder(now) not in (None, agent):
+        holder = self.holder(now)
+        if holder not in (None, agent):
             return False
+        if holder is None:
+            self._since = now
         self._holder, self._until = agent, now + self.hold_s
         return True
 
@@ -41,7 +49,7 @@ class Control:
         """Hand control over. False when ``agent`` does not have it."""
         if self.holder(now) != agent:
             return False
-        self._holder, self._until = to, now + self.hold_s
+        self._holder, self._since, self._until = to, now, now + self.hold_s
         return True
 
     def release(self, agent: Hashable) -> bool:

@@ -20,7 +20,7 @@ from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import InterfaceName, resolve
 from macs_zenoh.agent import Message
-from macs_zenoh.errors import Refused, WireError
+from macs_zenoh.errors import WireError
 from macs_zenoh.messages import ROS, AddNode, CallFailure, Metadata, NodeType, decode_data, encode_data
 
 log = logging.getLogger("macs.ros")
@@ -337,16 +337,8 @@ class ServiceNode(InterfaceNode):
         if registrant is None or len(self._open_calls) > self.robot.rules.settings.max_calls:
             self._fail(request_id, f"{self.topic} takes no calls now")
             return
-        metadata = Metadata(
-            sender_agent_type=ROS,
-            sender_agent_id=self.robot.agent_id,
-            request_id=request_id,
-            message_manager=CallFailure.manager,  # we understand a failure; receivers look at the node name first
-            node_type=self.NODE_TYPE,
-            node_name=self.key.node_name,
-            data_exchange_type=self.interface.short,
-        )
-        self.robot.send(registrant, metadata, request)
+        # we understand a failure; receivers look at the node name first
+        self.robot.send(registrant, self.metadata(CallFailure.manager, request_id), request)
 
     def _expire(self, request_id: int) -> None:
         who = " and ".join(map(str, self.registrants)) or "the headset"
@@ -426,9 +418,8 @@ class ServiceNode(InterfaceNode):
 
 def check_service_type(node: Any, service: str, interface: InterfaceName) -> bool:
     """Whether the service exists. Raises Refused when it has another type. In the ROS thread."""
-    types = dict(node.get_service_names_and_types()).get(service)
-    if types and str(interface) not in types:
-        raise Refused(f"{service} is a {' and '.join(sorted(types))} on this robot, not a {interface}")
+    types = dict(node.get_service_names_and_types()).get(service, [])
+    interface.check(service, types)
     return bool(types) and node.count_services(service) > 0
 
 

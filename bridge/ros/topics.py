@@ -11,7 +11,7 @@ import contextlib
 import logging
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
@@ -25,7 +25,8 @@ from bridge.ros.stream import StreamFraming, cdr_problem
 from bridge.ros.types import InterfaceName, least_cdr_bytes, resolve
 from macs_zenoh.agent import Message
 from macs_zenoh.errors import MacsError, Refused
-from macs_zenoh.messages import ROS, AddNode, Metadata, NodeType, StreamData
+from macs_zenoh.messages import AddNode, NodeType, StreamData
+from macs_zenoh.recovery import SILENT_S
 
 log = logging.getLogger("macs.ros")
 
@@ -45,6 +46,7 @@ class SubscriberNode(InterfaceNode):
         self._profile: Any = None
         self._message: type[Any] | None = None
         self._rate = RateLimit(self.rule.max_hz) if self.rule.max_hz else None
+        self._gaps = Gaps()
         self._loop = asyncio.get_running_loop()
         self._frame = self._framing()
 
@@ -54,6 +56,9 @@ class SubscriberNode(InterfaceNode):
     def open(self) -> None:
         self._message = resolve(str(self.interface))
         check_topic_type(self.robot.session.node, self.request.tos_name, self.interface)
+        self.robot.prioritise_stream(self.key.node_name, self.rule.priority)
+        if self.robot.keep_stream(self.key.node_name, self.rule.keep_for_recovery):
+            self.linger_s = SILENT_S
         self._subscribe(self._profile_of(self._publishers()))
 
     def close(self) -> None:
@@ -61,19 +66,14 @@ class SubscriberNode(InterfaceNode):
         if subscription is not None:
             self.robot.session.node.destroy_subscription(subscription)
 
+    def retire(self) -> None:
+        self.robot.keep_stream(self.key.node_name, None)
+
     def receive(self, message: Message) -> None:
         self.robot.drops.note("no_node", self.key.node_name, "data for a node that only sends")
 
     def _framing(self) -> StreamFraming:
-        metadata = Metadata(
-            sender_agent_type=ROS,
-            sender_agent_id=self.robot.agent_id,
-            message_manager=StreamData.manager,
-            node_type=self.NODE_TYPE,
-            node_name=self.key.node_name,
-            data_exchange_type=self.interface.short,
-        )
-        return StreamFraming(metadata, self.registrants, self.robot.layout)
+        return StreamFraming(self.metadata(StreamData.manager), self.registrants, self.robot.layout)
 
     # -- in the ROS thread ---------------------------------------------------------------------------------------
 
@@ -102,15 +102,21 @@ class SubscriberNode(InterfaceNode):
                 self._subscription = node.create_subscription(self._message, topic, self._forward, profile, raw=True)
         self._profile = profile
 
-    def _forward(self, cdr: bytes) -> None:
-        self._publish(cdr)
+    def _forward(self, cdr: bytes, info: Mapping[str, Any]) -> None:
+        self._pass_on(cdr, info)
         handle, message = self._subscription.handle, self._message
         with handle:
             for _ in range(self.BURST):
                 taken = handle.take_message(message, True)
                 if taken is None:
                     return
-                self._publish(taken[0])
+                self._pass_on(*taken)
+
+    def _pass_on(self, cdr: bytes, info: Mapping[str, Any]) -> None:
+        """One message with what rclpy knows about it. From any one thread."""
+        if self._gaps.take(info["publication_sequence_number"]):
+            self._loop.call_soon_threadsafe(self._loop.call_later, self._gaps.SETTLE_S, self._tell_gaps)
+        self._publish(cdr)
 
     def _publish(self, cdr: bytes) -> None:
         if self._rate is None:
@@ -140,6 +146,7 @@ class SubscriberNode(InterfaceNode):
             self.robot.drops.note("failed", self.topic, str(error))
 
     def _publisher_matched(self, change: Any) -> None:
+        self._gaps.publishers(change.current_count)
         if change.current_count_change > 0:
             self.robot.session.submit(self._follow)
 
@@ -158,8 +165,56 @@ class SubscriberNode(InterfaceNode):
             self._subscribe(profile)
 
     def _lost(self, status: Any) -> None:
+        """ROS itself counts what the network lost, not what it threw away for want of room."""
+        if not self._gaps.counting:
+            self._note_lost(int(status.total_count_change))
+
+    def _tell_gaps(self) -> None:
+        if missing := self._gaps.missing():
+            self._note_lost(missing)
+
+    def _note_lost(self, count: int) -> None:
         text = "ROS lost messages before they were taken; a larger buffer size may help"
-        self.robot.drops.note("lost_in_ros", self.topic, text, int(status.total_count_change))
+        self.robot.drops.note("lost_in_ros", self.topic, text, count)
+
+
+class Gaps:
+    """Counts what is missing between messages, by the numbers that their publisher gives them. Pure.
+
+    A subscription keeps the last ``depth`` messages, and ROS counts none that it throws away for newer ones, whether
+    they are reliable or not. While there are several publishers the numbers say nothing: each has its own, and rclpy
+    does not tell whose a message is.
+    """
+
+    SETTLE_S = 0.2
+    """How long a gap waits to be told: one between two publishers' numbers comes before ROS tells of the change."""
+
+    def __init__(self) -> None:
+        self._publishers = 0
+        self._last: int | None = None
+        self._missing = 0
+
+    @property
+    def counting(self) -> bool:
+        """Whether the numbers say anything now."""
+        return self._publishers == 1 and self._last is not None
+
+    def publishers(self, count: int) -> None:
+        """There are so many now; numbers from before mean nothing any more."""
+        self._publishers, self._last, self._missing = count, None, 0
+
+    def take(self, number: int | None) -> bool:
+        """A message came, None without a number. True for the first that shows a gap since `missing` was asked."""
+        last, self._last = self._last, number
+        if self._publishers != 1 or last is None or number is None or number <= last + 1:
+            return False
+        before, self._missing = self._missing, self._missing + number - last - 1
+        return not before
+
+    def missing(self) -> int:
+        """How many are missing since this was asked."""
+        missing, self._missing = self._missing, 0
+        return missing
 
 
 class RateLimit:
@@ -338,6 +393,7 @@ class PublisherNode(InterfaceNode):
             holder = self.control.holder(now)
             status["control"] = {
                 "holder": str(holder) if holder else None,
+                "seconds_held": round(self.control.seconds_held(now), 1),
                 "seconds_left": round(self.control.seconds_left(now), 1) if holder else 0,
             }
         if self.deadman is not None:
@@ -354,9 +410,7 @@ class PublisherNode(InterfaceNode):
 def check_topic_type(node: Any, topic: str, interface: InterfaceName) -> None:
     """Raise Refused when the topic exists and carries another type. In the ROS thread."""
     endpoints = [*node.get_publishers_info_by_topic(topic), *node.get_subscriptions_info_by_topic(topic)]
-    types = {endpoint.topic_type for endpoint in endpoints}
-    if types and str(interface) not in types:
-        raise Refused(f"{topic} carries {' and '.join(sorted(types))} on this robot, not {interface}")
+    interface.check(topic, {endpoint.topic_type for endpoint in endpoints})
 
 
 def _describe(profile: Any) -> str:

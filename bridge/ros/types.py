@@ -10,6 +10,7 @@ import importlib
 import os
 import re
 import sys
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,6 +56,11 @@ class InterfaceName(NamedTuple):
         if match["kind"] not in (None, kind):
             raise Refused(f"{text} is a {match['kind']} type, a {kind} type was expected")
         return cls(match["package"], kind, match["name"])
+
+    def check(self, name: str, types: Collection[str]) -> None:
+        """Raise Refused when the robot knows something of this name, and none of its types is this one."""
+        if types and str(self) not in types:
+            raise Refused(f"{name} has type {' and '.join(sorted(types))} on this robot, not {self}")
 
 
 def resolve(text: str, kind: str = "msg") -> type[Any]:

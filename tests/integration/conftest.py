@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AsyncExitStack
 
 import pytest
 
 from bridge.gateway import Gateway
 from bridge.headset.client import Headset
-from macs_zenoh.config import GatewaySettings, MeshSettings, changed
+from macs_zenoh.config import GatewaySettings, MeshSettings, TrafficRule, changed
 from macs_zenoh.mesh import Mesh
 from tests.programs import free_port
 
@@ -29,11 +29,12 @@ async def router() -> AsyncIterator[str]:
 
 @pytest.fixture
 async def start_gateway(router: str) -> AsyncIterator[StartGateway]:
-    """Starts gateways on the router; keyword arguments are their settings."""
+    """Starts gateways on the router; keyword arguments are their settings, and ``traffic`` rules."""
     async with AsyncExitStack() as stack:
 
-        async def start(endpoint: str = router, **settings: object) -> Gateway:
-            mesh = await stack.enter_async_context(await Mesh.open(MeshSettings(connect=[endpoint])))
+        async def start(endpoint: str = router, traffic: Sequence[TrafficRule] = (), **settings: object) -> Gateway:
+            opening = Mesh.open(MeshSettings(connect=[endpoint]), traffic=traffic)
+            mesh = await stack.enter_async_context(await opening)
             gateway = Gateway(mesh, changed(GatewaySettings(port=0), **settings))
             stack.push_async_callback(gateway.close)
             await gateway.start()

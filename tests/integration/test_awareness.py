@@ -218,7 +218,7 @@ async def test_a_name_that_two_have_is_noticed(meet: Meet, caplog: pytest.LogCap
     token = b.mesh.declare_token(NAME.of(name="a", type=1, id=9, zid=b.mesh.zid))
     await until(lambda: a.counters["name_taken_twice"] == 1)
     token.close()
-    assert "another agent is called 'a' as well" in caplog.text
+    assert f"session {b.mesh.zid} is called 'a' as well" in caplog.text
 
 
 async def test_a_bad_message_costs_only_itself(meet: Meet, caplog: pytest.LogCaptureFixture) -> None:

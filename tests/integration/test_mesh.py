@@ -8,6 +8,7 @@ import pytest
 
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh, Sample
+from macs_zenoh.mesh.outgoing import Outgoing
 from tests.integration.conftest import until
 from tests.routers import Router
 
@@ -50,7 +51,7 @@ async def test_who_subscribes_later_gets_large_payloads(
 ) -> None:
     """A program that begins to listen to a key on which large payloads stayed in one program gets the next ones."""
     if settled:
-        monkeypatch.setattr(Mesh, "SETTLE_S", 0.0)
+        monkeypatch.setattr(Outgoing, "SETTLE_S", 0.0)
     here: list[tuple[int, bytes]] = []
     away: list[tuple[int, bytes]] = []
     async with await Mesh.open(MeshSettings(connect=[router])) as mesh:

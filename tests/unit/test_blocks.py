@@ -5,7 +5,18 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from macs_zenoh.blocks import BLOCKS, free_block, free_id, free_id_in, keeps
+from macs_zenoh.blocks import (
+    BLOCKS,
+    COMPLAINT_S,
+    GATEWAY_PATIENCE_S,
+    PATIENCE_S,
+    Contests,
+    Verdict,
+    free_block,
+    free_id,
+    free_id_in,
+    keeps,
+)
 from macs_zenoh.keyexpr import BLOCK_SIZE, block_of
 
 zids = st.text("0123456789abcdef", min_size=1, max_size=4)
@@ -72,3 +83,83 @@ def test_who_is_alone_keeps() -> None:
     """A holder whose claim is the only one, or not yet to be seen, keeps what it holds."""
     assert keeps("a1", ["a1"])
     assert keeps("a1", [])
+
+
+# -- what several have -----------------------------------------------------------------------------------------------
+
+
+def contests(mine: str, *, fixed: bool = False) -> Contests[int]:
+    """Contests of a holder all of whose claims are configured, or leased."""
+    return Contests(mine, lambda what: fixed)
+
+
+def test_who_leased_the_same_with_a_greater_session_gives_way_at_once() -> None:
+    """Of two that leased the same, the one with the greater Zenoh id gives way at once, and is told so once."""
+    greater = contests("b2")
+    assert greater.look({7: ["a1"]}, 10.0) == []
+    assert greater.next_deadline() == 10.0
+    assert greater.judge(10.0) == [Verdict(7, ["a1"], give_way=True)]
+    assert greater.judge(99.0) == []
+    assert greater.next_deadline() is None
+
+
+def test_the_rightful_holder_waits_before_it_gives_way() -> None:
+    """The smallest Zenoh id keeps what it leased; if the other has not given way in time, it must be configured there
+    and is left to it."""
+    smaller = contests("a1")
+    smaller.look({7: ["b2"]}, 10.0)
+    assert smaller.judge(10.0 + PATIENCE_S - 0.01) == []
+    assert smaller.judge(10.0 + PATIENCE_S) == [Verdict(7, ["b2"], give_way=True)]
+    smaller = contests("a1")
+    smaller.look({7: ["b2"]}, 10.0)
+    assert smaller.look({}, 10.3) == [7]
+    assert smaller.next_deadline() is None
+    assert smaller.judge(99.0) == []
+
+
+def test_gateways_get_the_time_they_need() -> None:
+    """For ids that another gateway has to give up, the rightful holder waits as long as hundreds may take."""
+    holder: Contests[int] = Contests("a1", lambda what: False, {"b2"}.__contains__)
+    holder.look({7: ["b2"], 8: ["c3"]}, 10.0)
+    assert holder.judge(10.0 + PATIENCE_S) == [Verdict(8, ["c3"], give_way=True)]
+    assert holder.next_deadline() == 10.0 + GATEWAY_PATIENCE_S
+
+
+def test_what_is_configured_is_never_given_up() -> None:
+    """A configured holder, whatever its Zenoh id, complains once, naming the others, when nobody can give way any
+    more; never before those who leased it had their time."""
+    assert COMPLAINT_S > PATIENCE_S
+    for mine, other in (("a1", "b2"), ("b2", "a1")):
+        holder = contests(mine, fixed=True)
+        holder.look({7: [other]}, 10.0)
+        assert holder.judge(10.0 + COMPLAINT_S - 0.01) == []
+        assert holder.judge(10.0 + COMPLAINT_S) == [Verdict(7, [other], give_way=False)]
+        holder.look({7: [other]}, 20.0)
+        assert holder.judge(99.0) == []
+
+
+def test_a_contest_begins_anew_with_somebody_else() -> None:
+    """Fewer others are the same contest; another one is a new one; the end of a contest is told."""
+    holder = contests("a1", fixed=True)
+    holder.look({7: ["b2", "c3"]}, 10.0)
+    holder.look({7: ["c3"]}, 12.0)
+    assert holder.next_deadline() == 10.0 + COMPLAINT_S
+    holder.look({7: ["c3", "d4"]}, 12.5)
+    assert holder.next_deadline() == 12.5 + COMPLAINT_S
+    assert 7 in holder
+    assert holder.look({}, 13.0) == [7]
+    assert 7 not in holder
+
+
+@given(st.dictionaries(zids, st.booleans(), min_size=2, max_size=6))
+def test_one_is_left_of_all_who_leased_the_same(holders: dict[str, bool]) -> None:
+    """However many hold the same, when all see each other and do what they are told, those who leased it are gone if
+    one is configured, and exactly one is left if none is."""
+    everybody = {zid: contests(zid, fixed=fixed) for zid, fixed in holders.items()}
+    left = set(everybody)
+    for now in (0.0, 0.3, PATIENCE_S, PATIENCE_S + 0.3, COMPLAINT_S):
+        for zid in left:
+            everybody[zid].look({7: sorted(left - {zid})}, now)
+        left -= {zid for zid in left for verdict in everybody[zid].judge(now) if verdict.give_way}
+    configured = {zid for zid, fixed in holders.items() if fixed}
+    assert left == (configured or {min(holders)})

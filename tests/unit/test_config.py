@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from macs_zenoh import config
-from macs_zenoh.config import GatewaySettings, MeshSettings, RobotSettings, Settings
+from macs_zenoh.config import GatewaySettings, MeshSettings, RobotSettings, Settings, TopicRule, TrafficRule
 from macs_zenoh.errors import ConfigError
 
 SHIPPED = sorted((Path(__file__).parents[2] / "config").glob("*.toml"))
@@ -48,6 +48,14 @@ def test_a_file_sets_its_fields(tmp_path: Path) -> None:
         ("[[robot.rules]]\nmatch = 'cmd_vel'", "f.toml: robot.rules[0].match", "matching regex"),
         ("[[robot.rules]]\nmatch = '/a'\nmaxhz = 5", "f.toml: robot.rules[0]", "did you mean `max_hz`?"),
         ("[[robot.rules]]\nmatch = '/a'\ndeadman_s = 1", "f.toml: robot.rules.deadman_s", "needs a deadman_message"),
+        ("[[traffic]]\nmatch = 'macs/all/**'\nmax_hz = 0", "f.toml: traffic[0].max_hz", "expected `float` > 0"),
+        ("[[traffic]]\nmatch = 'macs/all/**'\npriority = 'high'", "f.toml: traffic[0].priority", "'high'"),
+        ("[[traffic]]\nmatch = 'macs/all/**'\nreliable = 0", "f.toml: traffic[0].reliable", ">= 1"),
+        ("[[traffic]]\nmatch = 'macs/all/**'\nmaxhz = 5", "f.toml: traffic[0]", "did you mean `max_hz`?"),
+        ("[[traffic]]\nmax_hz = 5", "f.toml: traffic[0]", "missing required field `match`"),
+        ("[[traffic]]\nmatch = '/cmd_vel'", "f.toml: traffic.match", "'/cmd_vel' is not a key expression"),
+        ("[[traffic]]\nmatch = 'macs/nd__cam*'", "f.toml: traffic.match", "write nd__cam$*"),
+        ("[trafic]\nmatch = 'macs/**'", "f.toml", "did you mean `traffic`?"),
         ("[robot]\nstop_allow = ['someone in group 3']", "f.toml: robot.stop_allow[0]", "matching regex"),
         ("[mesh]\nconnect = ['tcp/a:1', 5]", "f.toml: mesh.connect[1]", "expected `str`"),
         ("[mesh]\nconnect = ['10.0.0.1:7447']", "f.toml: mesh.connect", "write tcp/10.0.0.1:7447"),
@@ -66,6 +74,35 @@ def test_an_error_names_file_and_field(text: str, path: str, problem: str) -> No
         config.parse(text, "f.toml")
     assert caught.value.path == path
     assert problem in caught.value.problem
+
+
+def test_a_file_has_rules_for_traffic_and_topics() -> None:
+    """Rules keep their order, and what a rule does not say is unset."""
+    settings = config.parse(
+        "[[traffic]]\nmatch = 'macs/from/**'\nmax_hz = 5\npriority = 'data_low'\n"
+        "[[traffic]]\nmatch = '**'\nmax_bytes = 1000\nmax_bytes_per_s = 2000\nreliable = 10\n"
+        "[[robot.rules]]\nmatch = '/a'\npriority = 'data_high'\n"
+    )
+    assert settings.traffic == [
+        TrafficRule(match="macs/from/**", max_hz=5.0, priority="data_low"),
+        TrafficRule(match="**", max_bytes=1000, max_bytes_per_s=2000, reliable=10),
+    ]
+    assert settings.traffic[0].reliable is None
+    assert settings.robot.rules == [TopicRule(match="/a", priority="data_high")]
+
+
+def test_a_later_file_wins_setting_by_setting(tmp_path: Path) -> None:
+    """Of two files, what both say is the later one's, and the rest of a section is the earlier one's; errors name the
+    file that brings them."""
+    first, second = tmp_path / "first.toml", tmp_path / "second.toml"
+    first.write_text('[mesh]\nlease_ms = 3000\n[robot]\nid = 1\ngroup = 3\n[[robot.rules]]\nmatch = "/a"\n')
+    second.write_text('[mesh]\nconnect = ["tls/a:1"]\n[robot]\nid = 7\n')
+    settings = config.load(first, second)
+    assert settings.mesh == MeshSettings(connect=["tls/a:1"], lease_ms=3000)
+    assert settings.robot == RobotSettings(id=7, group=3, rules=[TopicRule(match="/a")])
+    second.write_text("[robot]\nidd = 7\n")
+    with pytest.raises(ConfigError, match=r"second\.toml: robot: unknown name `idd`"):
+        config.load(first, second)
 
 
 def test_a_missing_file_is_a_config_error(tmp_path: Path) -> None:

@@ -66,10 +66,9 @@ class Story:
         return changes
 
     def _note(self, what: str, agent: AgentInfo) -> None:
-        """The tokens as Zenoh has them: per session the newest group, per agent the newest session last."""
+        """The tokens as Zenoh has them: per session the newest group."""
         claims = self.tokens.setdefault(agent.key, {})
         if what == "alive":
-            claims.pop(agent.zid, None)
             claims[agent.zid] = agent
         elif claims.get(agent.zid) == agent:
             del claims[agent.zid]
@@ -81,7 +80,7 @@ class Story:
 
     def truth(self) -> list[AgentInfo]:
         """Who is online, by the tokens alone."""
-        return [next(reversed(claims.values())) for _, claims in sorted(self.tokens.items()) if claims]
+        return [claims[min(claims)] for _, claims in sorted(self.tokens.items()) if claims]
 
 
 @given(steps)
@@ -102,7 +101,8 @@ def test_what_is_told_adds_up(story_steps: list[tuple[str, AgentInfo | bool | fl
         for agent in directory:
             assert agent.key in directory
             assert directory.get(*agent.key) == agent
-            assert directory.claimants(*agent.key)[-1] == agent
+            assert agent in directory.claimants(*agent.key)
+        assert {claim.key for claim in directory.claims()} == {agent.key for agent in directory}
 
 
 @given(steps)
@@ -112,6 +112,11 @@ def test_in_the_end_the_tokens_are_right(story_steps: list[tuple[str, AgentInfo 
     for what, value in [*story_steps, ("link", True), ("time", GRACE_S), ("tick", None)]:
         story.happen(what, value)
     assert list(story.directory) == story.truth()
+    tokens = [agent for claims in story.tokens.values() for agent in claims.values()]
+    assert story.directory.claims() == sorted(tokens)
+    for zid in ("a", "b"):
+        theirs = {key: [z for z in claims if z != zid] for key, claims in story.tokens.items() if zid in claims}
+        assert story.directory.contested(zid) == {key: others for key, others in theirs.items() if others}
     assert story.directory.next_deadline() is None
 
 
@@ -170,18 +175,40 @@ def test_a_change_of_group_keeps_the_agent(old_token_first: bool) -> None:
     assert story.told == {(2, 7): after}
 
 
-def test_two_sessions_with_one_id_are_seen() -> None:
-    """Of two that claim one id the newest counts and both are claimants; when it goes, the other is there."""
+@pytest.mark.parametrize("smallest_first", [True, False])
+def test_two_sessions_with_one_id_are_seen(smallest_first: bool) -> None:
+    """Of two that claim one id the smaller session counts, whichever came first, and both are claimants; when it
+    goes, the other is there."""
     story = Story()
-    first, second = AgentInfo(1, 7, 3, "a1"), AgentInfo(1, 7, 0, "b2")
-    story.happen("alive", first)
-    assert story.happen("alive", second) == [Change(second, online=True)]
-    assert story.directory.claimants(1, 7) == [first, second]
+    smaller, greater = AgentInfo(1, 7, 0, "a1"), AgentInfo(1, 7, 3, "b2")
+    first, second = (smaller, greater) if smallest_first else (greater, smaller)
+    assert story.happen("alive", first) == [Change(first, online=True)]
+    assert story.happen("alive", second) == ([] if smallest_first else [Change(smaller, online=True)])
+    assert story.directory.get(1, 7) == smaller
+    assert story.directory.claims() == [smaller, greater]
+    assert story.directory.contested("a1") == {(1, 7): ["b2"]}
+    assert story.directory.contested("c3") == {}
     assert len(story.directory) == 1
-    assert story.happen("ended", second) == [Change(first, online=True)]
-    assert story.happen("ended", first) == [Change(first, online=False)]
+    assert story.happen("ended", smaller) == [Change(greater, online=True)]
+    assert story.directory.contested("b2") == {}
+    assert story.happen("ended", greater) == [Change(greater, online=False)]
     assert story.directory.claimants(1, 7) == []
     assert story.directory.get(1, 7) is None
+
+
+def test_an_earlier_life_in_doubt_does_not_hide_the_later() -> None:
+    """A robot that was restarted while our link was down is seen at once, whatever its old session was called."""
+    story = Story()
+    old, new = AgentInfo(1, 7, 3, "a1"), AgentInfo(1, 7, 3, "b2")
+    story.happen("alive", old)
+    story.happen("link", False)
+    story.happen("ended", old)
+    story.happen("link", True)
+    assert story.happen("alive", new) == [Change(new, online=True)]
+    assert story.directory.get(1, 7) == new
+    story.happen("time", GRACE_S)
+    assert story.happen("tick", None) == []
+    assert list(story.directory) == [new]
 
 
 def test_a_token_told_twice_is_told_once() -> None:

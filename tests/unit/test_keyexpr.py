@@ -11,7 +11,20 @@ from hypothesis import strategies as st
 
 from macs_zenoh import keyexpr
 from macs_zenoh.errors import UsageError
-from macs_zenoh.keyexpr import CALL, GROUP, KEYS, PRESENCE, STREAM, UNICAST, Key, block_of, type_name, type_number
+from macs_zenoh.keyexpr import (
+    CALL,
+    GROUP,
+    KEYS,
+    PRESENCE,
+    STREAM,
+    UNICAST,
+    Key,
+    block_of,
+    expression_problem,
+    fits,
+    type_name,
+    type_number,
+)
 
 FORBIDDEN = "/*$?#%"
 """Characters that Zenoh gives a meaning to, and the one that escapes them."""
@@ -246,3 +259,51 @@ def test_types_may_be_given_by_name() -> None:
 def test_the_block_of_an_id_is_its_high_byte() -> None:
     """Each of the 256 blocks has 256 ids in a row."""
     assert [block_of(agent_id) for agent_id in (0, 1, 255, 256, 511, 512, 65535)] == [0, 0, 0, 1, 1, 2, 255]
+
+
+# -- expressions that people write -----------------------------------------------------------------------------------
+
+expressions = st.text("ab@*$/?#", max_size=9) | st.lists(
+    st.sampled_from(["*", "**", "a", "b", "ab", "@a", "a$*", "$*b", "a$*b", "$*", "@$*", "@a$*"]),
+    min_size=1,
+    max_size=5,
+).map("/".join)
+"""What may be a key expression or not, wildcards and all."""
+
+keys = st.lists(st.sampled_from(["a", "b", "ab", "aab", "@a", "@ab", "@"]), min_size=1, max_size=5).map("/".join)
+
+
+@settings(max_examples=500, deadline=None)
+@given(text=expressions)
+def test_what_zenoh_takes_for_an_expression_is_known_without_it(text: str) -> None:
+    """Whatever is not a key expression in canonical form to Zenoh is refused with a reason, and nothing else is."""
+    try:
+        zenoh.KeyExpr(text)
+    except zenoh.ZError:
+        assert expression_problem(text)
+    else:
+        assert expression_problem(text) is None
+
+
+@settings(max_examples=1000, deadline=None)
+@given(text=expressions.filter(lambda text: expression_problem(text) is None), key=keys)
+def test_a_key_fits_an_expression_as_zenoh_says(text: str, key: str) -> None:
+    """A key is among those of an expression exactly if it is to Zenoh, with all its wildcards and verbatim chunks."""
+    among = zenoh.KeyExpr(text).intersects(zenoh.KeyExpr(key))
+    assert fits(text, key) == among == zenoh.KeyExpr(text).includes(zenoh.KeyExpr(key))
+
+
+@by_plane
+@settings(deadline=None)
+@given(data=st.data())
+def test_a_key_of_ours_fits_what_every_gives(plane: str, data: st.DataObject) -> None:
+    """The expression for some fields fits each key with these fields, whatever they contain."""
+    space = KEYS[plane]
+    fields = data.draw(fields_of(space))
+    some = data.draw(st.sets(st.sampled_from(space.fields)))
+    assert fits(space.every(**{name: fields[name] for name in some}), space.of(**fields))
+
+
+def test_many_wildcards_cost_little() -> None:
+    """Judging a long key by an expression of many wildcards ends: it tries no combinations."""
+    assert not fits("/".join(["**", "a"] * 30), "/".join(["a"] * 300 + ["b"]))

@@ -17,6 +17,7 @@ from recordings import BY_NAME, RECORDINGS, Recording, one_by_one, reading
 from macs_zenoh.errors import BadField, BadJson, BadSizes, FrameTooLarge, NotAllowed, UnknownManager, WireError
 from macs_zenoh.messages import (
     MANAGERS,
+    OPERATOR,
     ROS,
     UNITY,
     AddNode,
@@ -320,6 +321,14 @@ def test_the_id_in_a_configuration_is_not_believed(agent_id: int, request_id: in
     assert sent.metadata.sender_agent_id == peer.agent_id == 7
 
 
+def test_nobody_becomes_an_operator_over_tcp() -> None:
+    """Who calls itself an operator does not get online: a robot that lets operators release it knows who they are."""
+    peer = Peer(7, 42, 0.0)
+    assert errors(peer.receive(configuration(OPERATOR), 1.0)) == [NotAllowed]
+    assert peer.state is State.GREETED
+    assert peer.receive(configuration(UNITY), 2.0) == [Joined(UNITY, 0, None)]
+
+
 def test_a_second_configuration_may_change_the_group() -> None:
     """The same configuration again is nothing; another group is told; another type is refused and nothing changes."""
     peer = online(group=3)
@@ -357,6 +366,26 @@ def test_an_agent_may_go_offline(agent_id: int, configured: bool) -> None:
     assert peer.state is State.GONE
     assert peer.receive(message() + configuration(), 1.0) == []
     assert peer.tick(1e9) == []
+
+
+def test_another_id_holds_from_then_on() -> None:
+    """After a change of id the agent is told it, its answer changes nothing else, what it still writes with the old id
+    is corrected, and it may go offline under either."""
+    for goodbye in (7, 300, 0):
+        peer = online()
+        (sent,) = peer.receive(message(), 1.0)
+        assert isinstance(sent, Sent)
+        assert sent.metadata.sender_agent_id == 7
+        peer.renumber(300)
+        metadata, data = split_message(peer.welcome())
+        assert Metadata.decode(metadata).message_manager == Welcome.manager
+        assert json.loads(bytes(data)) == {"agentId": 300}
+        assert peer.receive(configuration(agent_id=300), 1.0) == []
+        (sent,) = peer.receive(message(), 1.0)
+        assert isinstance(sent, Sent)
+        assert Metadata.decode(sent.frame.metadata).sender_agent_id == 300
+        (left,) = peer.receive(encode_frame(management=encode_management(GoOffline(goodbye))), 1.0)
+        assert isinstance(left, Left)
 
 
 def test_nobody_sends_another_agent_offline() -> None:

@@ -203,3 +203,20 @@ def test_a_task_holds_while_it_is_wanted() -> None:
     registrations.leave((2, 7))
     assert not registrations.holds(task, {1: 3})
     assert registrations.find((2, 7), 1, NODES[0]) is None
+
+
+def test_another_id_takes_all_registrations_along() -> None:
+    """What a headset registered is its own under its next id: for robots online and for those that come later; other
+    headsets' registrations stay as they are."""
+    registrations = Registrations()
+    robots = {1: 0, 2: 3}
+    registrations.add(adding(5, NODES[0]), [1], [3], robots)
+    registrations.add(adding(5, NODES[1]), [1], [], robots)
+    registrations.add(adding(6, NODES[0]), [1], [], robots)
+    registrations.rename((2, 5), 300)
+    assert registrations.of_agent((2, 5), robots) == []
+    theirs = [Task(1, adding(300, NODES[0])), Task(2, adding(300, NODES[0])), Task(1, adding(300, NODES[1]))]
+    assert sorted(registrations.of_agent((2, 300), robots), key=str) == sorted(theirs, key=str)
+    assert registrations.of_agent((2, 6), robots) == [Task(1, adding(6, NODES[0]))]
+    assert registrations.of_robot(9, 3) == [Task(9, adding(300, NODES[0]))]
+    assert registrations.remove(removing(300, NODES[1]), [1], [], robots) == [Task(1, removing(300, NODES[1]))]

@@ -18,6 +18,7 @@ from macs_zenoh.wire import (
     COPY_BYTES,
     EMPTY_MESSAGE,
     MACS,
+    PROBE,
     Frame,
     FrameDecoder,
     Header,
@@ -492,3 +493,13 @@ def test_a_run_never_swallows_a_bad_frame() -> None:
     assert [frame.count for frame in frames] == [1, 1, 1]
     with pytest.raises(BadSizes):
         frames[1].check()
+
+
+def test_a_probe_carries_no_frame() -> None:
+    """What `macs security check` puts is no frame and no error; what is as long as a header is judged as a frame."""
+    assert parse_frames(PROBE) == []
+    assert parse_frames(PROBE + b" 123") == []
+    with pytest.raises(BadSizes):
+        parse_frames(PROBE[:-1])
+    with pytest.raises(BadSizes):
+        parse_frames(PROBE.ljust(MACS.header_bytes, b"x"))

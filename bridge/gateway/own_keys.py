@@ -1,0 +1,70 @@
+"""What is declared on the mesh for one TCP agent alone: the inbox of every agent that is no headset, and for existing
+robot programs the calls that register interface nodes. Headsets share their gateway's block."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+
+from macs_zenoh.errors import Refused
+from macs_zenoh.keyexpr import CALL
+from macs_zenoh.mesh import Mesh, Subscription
+from macs_zenoh.messages import ROS, UNITY, AddNode, Metadata, RemoveNode, decode_data
+from macs_zenoh.registrations import AgentKey
+from macs_zenoh.routing import inbox
+from macs_zenoh.wire import Layout, encode_message, parse_frame
+
+from .agents import Agents
+from .connection import Connection
+from .delivery import Delivery
+
+
+class OwnKeys:
+    """By (type, id), from an agent's configuration to its end."""
+
+    def __init__(self, mesh: Mesh, agents: Agents, delivery: Delivery, layout: Layout) -> None:
+        self._mesh = mesh
+        self._agents = agents
+        self._delivery = delivery
+        self._layout = layout
+        self._declared: dict[AgentKey, list[Subscription]] = {}
+
+    def declare(self, connection: Connection) -> None:
+        """Listen for an agent under the id that it has. Twice changes nothing."""
+        kind, agent_id = connection.key
+        if kind == UNITY or connection.key in self._declared:
+            return
+        declared = [self._mesh.subscribe(inbox(kind, agent_id), self._delivery.inbox)]
+        if kind == ROS:
+            for verb, message in (("add_node", AddNode), ("remove_node", RemoveNode)):
+                calls = CALL.every(type=ROS, id=agent_id, verb=verb)
+                declared.append(self._mesh.serve(calls, self._pass_on(connection, message)))
+        self._declared[connection.key] = declared
+
+    def undeclare(self, agent: AgentKey) -> None:
+        """Listen no more."""
+        for declared in self._declared.pop(agent, ()):
+            declared.close()
+
+    def close(self) -> None:
+        """Listen for nobody."""
+        for agent in list(self._declared):
+            self.undeclare(agent)
+
+    def _pass_on(
+        self, connection: Connection, kind: type[AddNode | RemoveNode]
+    ) -> Callable[[str, bytes], Awaitable[bytes]]:
+        """Registrations for an existing robot program: passed on as the message it knows, which it never answers."""
+
+        async def deliver(key: str, payload: bytes) -> bytes:
+            fields = CALL.parse(key)
+            if fields is None or self._agents.find(*connection.key) is not connection:
+                raise Refused("the robot is not connected")
+            sender = Metadata(int(fields["from_type"]), int(fields["from_id"]), message_manager=kind.manager)
+            body = parse_frame(payload, self._layout).body
+            if not connection.tell(decode_data(kind, body)):
+                return b""  # it has that node already
+            connection.send_call(encode_message(sender.encode(), body))
+            self._delivery.flush()
+            return b""
+
+        return deliver

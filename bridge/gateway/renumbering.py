@@ -1,0 +1,210 @@
+"""Other ids for TCP agents: when two parts of a mesh meet that could not see each other, both may have given out the
+same ones.
+
+A headset takes a later AgentConfigurer as its new id, at any time and without a reconnection (docs/protocol.md). Its
+robots are told the new id before the change and the old one is taken back after it, so that each message of a topic
+comes once. A robot program is not told: it needs no id of its own, as the gateway writes the true sender into all that
+it sends; so it keeps the id that headsets know it by unless another robot has that id as well.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Iterable
+
+from macs_zenoh.blocks import Contests
+from macs_zenoh.keyexpr import block_of
+from macs_zenoh.messages import ROS, AgentsGone, Metadata, encode_data
+from macs_zenoh.presence import Contested, Presence
+from macs_zenoh.registrations import AgentKey, Task
+from macs_zenoh.wire import encode_message
+
+from .agents import Agents
+from .connection import Connection
+from .leases import Leases
+from .own_keys import OwnKeys
+from .robots import RobotCalls
+
+log = logging.getLogger("macs.gateway")
+
+GATHER_S = 0.2
+"""How long the first news of ids that others have waits for more: a block lost changes them all at once."""
+
+AT_ONCE = 64
+"""How many agents change their id at the same time."""
+
+ANSWER_S = 5.0
+"""How long answers of services are still taken under the old id: as long as existing headsets wait for them."""
+
+
+class Renumbering:
+    """Watches for ids of ours that others have, and for blocks that are no longer ours, and changes ids.
+
+    ``on_change(connection)`` is called just before a connection has another id, ``on_block_left(block)`` when nobody
+    needs what is sent to a former block.
+    """
+
+    def __init__(
+        self,
+        zid: str,
+        presence: Presence,
+        agents: Agents,
+        leases: Leases,
+        robots: RobotCalls,
+        own_keys: OwnKeys,
+        *,
+        on_change: Callable[[Connection], None],
+        on_block_left: Callable[[int], None],
+    ) -> None:
+        self._zid = zid
+        self._presence = presence
+        self._agents = agents
+        self._leases = leases
+        self._robots = robots
+        self._own_keys = own_keys
+        self._on_change = on_change
+        self._on_block_left = on_block_left
+        self._contests: Contests[AgentKey] = Contests(zid, lambda agent: False, leases.has_lease)
+        self._wanted: dict[Connection, None] = {}
+        self._working: asyncio.Task[None] | None = None
+        self._timers: set[asyncio.TimerHandle] = set()
+        self._judging: asyncio.TimerHandle | None = None
+
+    def close(self) -> None:
+        """Change nothing any more."""
+        if self._working is not None:
+            self._working.cancel()
+        for timer in [*self._timers, *([self._judging] if self._judging is not None else [])]:
+            timer.cancel()
+
+    # -- who has to change ---------------------------------------------------------------------------------------
+
+    def contested(self, contested: Contested) -> None:
+        """What others claim of what this session holds."""
+        ours = {agent: others for agent, others in contested.items() if self._agents.find(*agent)}
+        for agent in self._contests.look(ours, time.monotonic()):
+            if self._agents.find(*agent):
+                # the other has left the id to ours, and on robots may have taken back what was registered under it
+                self._robots.repeat(agent)
+        self._judge()
+
+    def _judge(self) -> None:
+        if self._judging is not None:
+            self._judging.cancel()
+            self._judging = None
+        now = time.monotonic()
+        found = [self._agents.find(*verdict.what) for verdict in self._contests.judge(now)]
+        self._want(connection for connection in found if connection is not None)
+        if (deadline := self._contests.next_deadline()) is not None:
+            delay_s = max(0.0, deadline - now) + 0.01
+            self._judging = asyncio.get_running_loop().call_later(delay_s, self._judge)
+
+    def block_lost(self, block: int) -> None:
+        """A block is another gateway's: everybody in it gets an id of another one, except robots."""
+        self._want(c for c in self._agents.online() if c.key[0] != ROS and block_of(c.agent_id) == block)
+        self._later(ANSWER_S, lambda: self._leave_block(block))
+
+    def joined(self, connection: Connection) -> None:
+        """An agent is online; it may have got its id from a block that was lost meanwhile."""
+        if connection.key[0] != ROS and block_of(connection.agent_id) not in self._leases.blocks:
+            self._want([connection])
+
+    def _leave_block(self, block: int) -> None:
+        if block in self._leases.blocks:
+            return  # leased again
+        inside = [agent_id for agent_id in self._agents.ids if block_of(agent_id) == block]
+        if any(self._agents.needs_block(agent_id) for agent_id in inside):
+            self._later(ANSWER_S, lambda: self._leave_block(block))
+        else:
+            self._on_block_left(block)
+
+    # -- the change ----------------------------------------------------------------------------------------------
+
+    def _want(self, connections: Iterable[Connection]) -> None:
+        self._wanted.update(dict.fromkeys(connections))
+        if self._wanted and self._working is None:
+            self._working = asyncio.get_running_loop().create_task(self._work())
+
+    async def _work(self) -> None:
+        try:
+            await asyncio.sleep(GATHER_S)
+            while self._wanted:
+                wanted, self._wanted = sorted(filter(self._must_change, self._wanted), key=lambda c: c.agent_id), {}
+                slow: set[int] = set()  # robots that do not answer: waited for once, not by everybody
+                room = asyncio.Semaphore(AT_ONCE)
+                ids = await self._reserve(len(wanted))
+                await asyncio.gather(
+                    *(self._move(agent, new, slow, room) for agent, new in zip(wanted, ids, strict=True))
+                )
+                if wanted:
+                    log.warning("%d agents here have other ids now: another gateway had given out theirs", len(wanted))
+        finally:
+            self._working = None
+
+    def _must_change(self, connection: Connection) -> bool:
+        """Whether it is still there, and under an id that it cannot keep: it may be moved already for another
+        reason."""
+        kind, agent_id = connection.key
+        if self._agents.find(kind, agent_id) is not connection:
+            return False
+        return connection.key in self._contests or (kind != ROS and block_of(agent_id) not in self._leases.blocks)
+
+    async def _reserve(self, count: int) -> list[int]:
+        """So many free ids of our blocks; more blocks are leased for them if need be."""
+        ids: list[int] = []
+        while len(ids) < count:
+            agent_id = self._leases.free_id(self._agents.ids | self._presence.directory.ids_elsewhere(self._zid))
+            if agent_id is None:
+                await self._leases.more()
+            else:
+                self._agents.reserve(agent_id)
+                ids.append(agent_id)
+        return ids
+
+    async def _move(self, connection: Connection, new_id: int, slow: set[int], room: asyncio.Semaphore) -> None:
+        async with room:
+            try:
+                old = connection.key
+                told = await self._robots.prepare(old, new_id, slow) if old[0] != ROS else []
+                if self._agents.find(*old) is connection:  # it may have left meanwhile
+                    await self._change(connection, new_id, told, slow)
+            finally:
+                self._agents.unreserve(new_id)
+
+    async def _change(self, connection: Connection, new_id: int, told: list[Task], slow: set[int]) -> None:
+        old = connection.key
+        before = str(connection)
+        self._on_change(connection)
+        self._agents.renumber(connection, new_id)
+        self._own_keys.declare(connection)
+        token = self._presence.declare(old[0], new_id, connection.peer.group)
+        old_token = self._agents.replace_token(connection, token)
+        log.info("%s has id %d now", before, new_id)
+        self._later(ANSWER_S, lambda: self._agents.forget_former(old, connection))
+        if old[0] == ROS:
+            _drop_registrants(connection)
+        else:
+            connection.send_call(connection.peer.welcome())
+            connection.flush()
+            await self._robots.rename(old, new_id, told, slow)
+        self._own_keys.undeclare(old)
+        old_token.close()
+
+    def _later(self, delay_s: float, then: Callable[[], None]) -> None:
+        def run() -> None:
+            self._timers.discard(timer)
+            then()
+
+        timer = asyncio.get_running_loop().call_later(delay_s, run)
+        self._timers.add(timer)
+
+
+def _drop_registrants(robot: Connection) -> None:
+    """Who registered on a robot program asked for its old id, which is another robot's now."""
+    if gone := robot.registrants():
+        metadata = Metadata(message_manager=AgentsGone.manager)
+        robot.untell(gone)
+        robot.send_call(encode_message(metadata.encode(), encode_data(AgentsGone(gone))))
+        robot.flush()

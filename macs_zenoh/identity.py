@@ -1,0 +1,193 @@
+"""How an agent comes by its id and keeps it, or gives it up for another. Asyncio.
+
+An id is configured or leased; `blocks` has the rules for what several claim.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import NamedTuple
+
+from . import blocks
+from .blocks import Contests
+from .errors import MacsError, OutOfRange, Unreachable, UsageError
+from .keyexpr import LEASE, type_name
+from .mesh import Mesh, Subscription
+from .presence import Contested, Presence
+
+log = logging.getLogger("macs.agent")
+
+SETTLE_S = 0.3
+"""How long a claimed id waits for somebody else's claim on it to show up."""
+
+AGAIN_S = 5.0
+"""After so long an agent that found no other id looks again."""
+
+
+class _Claim(NamedTuple):
+    """What is declared under one id."""
+
+    id: int
+    declared: tuple[Subscription, ...]
+
+    def close(self) -> None:
+        """Not online under this id any more; what is on its way to it is not received."""
+        for declared in self.declared:
+            declared.close()
+
+
+class Identity:
+    """The id of one agent. ``listen(id)`` subscribes its inbox; ``on_id(old, new)`` hears when it had to change.
+
+    It changes when two parts of a mesh meet that could not see each other, and both had leased the same id.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        presence: Presence,
+        agent_type: int,
+        group: int,
+        *,
+        listen: Callable[[int], Subscription],
+        on_id: Callable[[int, int], None],
+    ) -> None:
+        self._mesh = mesh
+        self._presence = presence
+        self._type = agent_type
+        self._group = group
+        self._listen = listen
+        self._on_id = on_id
+        self._claim: _Claim | None = None
+        self._is_fixed = False
+        self._contests: Contests[tuple[int, int]] = Contests(mesh.zid, lambda key: self._is_fixed)
+        self._timer: asyncio.TimerHandle | None = None
+        self._changing: asyncio.Task[None] | None = None
+
+    def __str__(self) -> str:
+        return f"{type_name(self._type)}/{self._claim.id if self._claim else 0}"
+
+    async def take(self, wanted: int | None) -> int:
+        """Be online under the id wanted, or a free one. Raises UsageError when it is taken, Unreachable when all
+        are."""
+        self._is_fixed = wanted is not None
+        self._claim = await (self._lease() if wanted is None else self._take_fixed(wanted))
+        self.contested(self._presence.contested())
+        return self._claim.id
+
+    def close(self) -> None:
+        """Be offline."""
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._changing is not None:
+            self._changing.cancel()
+        if self._claim is not None:
+            self._claim.close()
+
+    # -- an id of one's own --------------------------------------------------------------------------------------
+
+    async def _take_fixed(self, agent_id: int) -> _Claim:
+        name = f"{type_name(self._type)}/{agent_id}"
+        if not 1 <= agent_id <= 0xFFFF:
+            raise OutOfRange("id", agent_id, 1, 0xFFFF)
+        await self._wait_for_stale(name, (self._type, agent_id))
+        if (self._type, agent_id) in self._presence.directory:
+            raise UsageError(f"{name} is already online; choose another id, or leave it out")
+        claim = await self._settle(agent_id)
+        if claim is None:
+            raise UsageError(f"{name} was taken by somebody else in this moment; choose another id")
+        return claim
+
+    async def _wait_for_stale(self, name: str, key: tuple[int, int]) -> None:
+        """Give the token of an earlier life of this agent the time of a lease to end."""
+        directory = self._presence.directory
+        if key not in directory:
+            return
+        log.info("%s is still online; waiting for it to go", name)
+        deadline = time.monotonic() + self._mesh.settings.lease_ms / 1000 + 1.0
+        while key in directory and time.monotonic() < deadline:
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._presence.change(), deadline - time.monotonic())
+
+    async def _lease(self) -> _Claim:
+        tried: set[int] = set()
+        while True:
+            taken = tried | set(self._presence.directory.ids(self._type))
+            held: set[int] = set()
+            if type_name(self._type) != "ros":
+                leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every())]
+                held = {int(lease["block"]) for lease in leases if lease}
+            agent_id = blocks.free_id(taken, held)
+            if agent_id is None:
+                raise Unreachable("a free id", f"all ids of type {type_name(self._type)} are taken")
+            if (claim := await self._settle(agent_id)) is not None:
+                return claim
+            tried.add(agent_id)
+
+    async def _settle(self, agent_id: int) -> _Claim | None:
+        """Declare presence under an id and see that nobody with an older right to it did the same at once.
+
+        The inbox comes before the token: whoever sees the agent can reach it.
+        """
+        messages = self._listen(agent_id)
+        token = self._presence.declare(self._type, agent_id, self._group)
+        try:
+            await asyncio.sleep(SETTLE_S)
+        except asyncio.CancelledError:
+            _Claim(agent_id, (token, messages)).close()
+            raise
+        claim = _Claim(agent_id, (token, messages))
+        others = [agent.zid for agent in self._presence.directory.claimants(self._type, agent_id)]
+        if blocks.keeps(self._mesh.zid, others):
+            return claim
+        claim.close()
+        return None
+
+    # -- an id that others have as well --------------------------------------------------------------------------
+
+    def contested(self, contested: Contested) -> None:
+        """What others claim of what this session holds."""
+        if self._claim is None:
+            return
+        key = (self._type, self._claim.id)
+        now = time.monotonic()
+        self._contests.look({key: contested[key]} if key in contested else {}, now)
+        self._judge()
+
+    def _judge(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        now = time.monotonic()
+        for verdict in self._contests.judge(now):
+            others = " and ".join(verdict.others)
+            if not verdict.give_way:
+                log.error("%s is also held by session %s: change the id that one of them is given", self, others)
+            elif self._changing is None:
+                self._changing = asyncio.get_running_loop().create_task(self._change(others))
+        if (deadline := self._contests.next_deadline()) is not None:
+            self._timer = asyncio.get_running_loop().call_later(max(0.0, deadline - now) + 0.01, self._judge)
+
+    async def _change(self, others: str) -> None:
+        """Take another id; the old one is given up when the new one is settled."""
+        old = self._claim
+        assert old is not None
+        while True:
+            try:
+                new = await self._lease()
+                break
+            except MacsError as error:
+                log.error("%s is also held by session %s, and there is no other id: %s", self, others, error)
+                await asyncio.sleep(AGAIN_S)
+        log.warning("%s is also held by session %s; from now on this is id %d", self, others, new.id)
+        self._claim = new
+        self._changing = None
+        try:
+            self._on_id(old.id, new.id)
+        finally:
+            old.close()
+        self.contested(self._presence.contested())

@@ -1,0 +1,141 @@
+"""What comes from the mesh: from Zenoh's threads to the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import operator
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from .samples import OnBatch, OnNumbered, Payload
+
+log = logging.getLogger("macs.mesh")
+
+
+class Arrivals:
+    """Samples on their way from Zenoh's threads to the loop: one queue for all subscriptions, so that what one
+    sender sent on several keys is handled in the order in which it came.
+
+    When the loop is behind, the delivering thread waits a moment, then drops: Zenoh must not be held up for long,
+    or other programs' messages wait too.
+    """
+
+    LIMIT = 16_384
+    LARGE_BYTES = 16 << 10
+    LIMIT_BYTES = 128 << 20
+    """Of payloads that are large; the others are bounded by their number."""
+    BATCH = 512
+    PATIENCE_S = 0.1
+
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, wake: Callable[[Callable[[], None]], None], drops: Counter[str]
+    ) -> None:
+        self._drops = drops
+        self._loop = loop
+        self._loop_thread = threading.get_ident()
+        self._wake = wake
+        self._queue: deque[tuple[Callable[[list[Any]], None], tuple[Any, ...]]] = deque()
+        self._waiting = False
+        self._large_bytes = 0
+        self._large_lock = threading.Lock()
+        self._own = threading.local()
+
+    def put(self, publisher: zenoh.Publisher, payload: Payload) -> None:
+        """Publish. Zenoh calls our own subscriptions back within this, and they take the payload as it is."""
+        self._put(publisher, payload, payload)
+
+    def put_here(self, publisher: zenoh.Publisher, payload: Payload) -> None:
+        """Publish to our own subscriptions only: Zenoh finds them, and is given nothing to copy."""
+        self._put(publisher, payload, b"")
+
+    def _put(self, publisher: zenoh.Publisher, payload: Payload, zenohs: Payload) -> None:
+        self._own.payload = payload
+        try:
+            publisher.put(zenohs)
+        except zenoh.ZError as error:  # the session is closed
+            log.debug("put: %s", error)
+        finally:
+            self._own.payload = None
+
+    def receiver(self, on_batch: OnBatch, on_numbered: OnNumbered | None = None) -> Callable[[zenoh.Sample], None]:
+        """What Zenoh calls, in whatever thread, for each sample of one subscription. Samples that their source has
+        numbered go to ``on_numbered``, if it is given."""
+        queue, limit, large, own = self._queue, self.LIMIT, self.LARGE_BYTES, self._own
+
+        def receive(sample: zenoh.Sample) -> None:
+            if len(queue) >= limit and not self._has_room():
+                self._drops["loop_behind"] += 1
+                return
+            payload = getattr(own, "payload", None)
+            if payload is None:
+                payload = sample.payload.to_bytes()
+            if len(payload) > large and not self._has_room_for(len(payload)):
+                self._drops["loop_behind"] += 1
+                return
+            info = sample.source_info if on_numbered is not None else None
+            if info is None or on_numbered is None:
+                queue.append((on_batch, (str(sample.key_expr), payload)))
+            else:
+                source = f"{info.source_id.zid}/{info.source_id.eid}"
+                queue.append((on_numbered, (str(sample.key_expr), payload, source, info.source_sn)))
+            if not self._waiting:
+                self._wake_loop()
+
+        return receive
+
+    def mark(self, on_mark: OnBatch) -> None:
+        """Call ``on_mark`` on the loop after all that has arrived so far. From any thread."""
+        self._queue.append((on_mark, ("", b"")))
+        if not self._waiting:
+            self._wake_loop()
+
+    def _wake_loop(self) -> None:
+        self._waiting = True
+        if threading.get_ident() == self._loop_thread:  # our own sample, inside `put`
+            self._loop.call_soon(self._deliver)
+        else:
+            self._wake(self._deliver)
+
+    def _deliver(self) -> None:
+        self._waiting = False
+        queue = self._queue
+        arrived = [queue.popleft() for _ in range(min(len(queue), self.BATCH))]
+        if queue and not self._waiting:
+            self._waiting = True
+            self._loop.call_soon(self._deliver)
+        freed = sum(len(item[1]) for _, item in arrived if len(item[1]) > self.LARGE_BYTES)
+        if freed:
+            with self._large_lock:
+                self._large_bytes -= freed
+        for on_batch, group in itertools.groupby(arrived, key=operator.itemgetter(0)):
+            try:
+                on_batch([sample for _, sample in group])
+            except Exception:
+                log.exception("handling samples failed")  # ours to mend; other subscriptions get theirs
+
+    def _has_room(self) -> bool:
+        return self._patiently(lambda: len(self._queue) < self.LIMIT)
+
+    def _has_room_for(self, size: int) -> bool:
+        """Take room for a large payload."""
+        if not self._patiently(lambda: self._large_bytes == 0 or self._large_bytes + size <= self.LIMIT_BYTES):
+            return False
+        with self._large_lock:
+            self._large_bytes += size
+        return True
+
+    def _patiently(self, there_is_room: Callable[[], bool]) -> bool:
+        """Wait a moment for room, unless this is the loop's own thread, which would have to make it."""
+        deadline = time.monotonic() + self.PATIENCE_S
+        while not there_is_room():
+            if threading.get_ident() == self._loop_thread or time.monotonic() > deadline:
+                return False
+            time.sleep(0.001)
+        return True

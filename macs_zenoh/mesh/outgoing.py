@@ -1,0 +1,299 @@
+"""What goes out: a declared publisher for each key, limits and priorities, and a thread for what is large."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import zenoh
+import zenoh.ext
+
+from macs_zenoh.config import Priority
+from macs_zenoh.keyexpr import NAMED_ALL, STREAM
+from macs_zenoh.shaping import Shape, Shaper
+
+from .arrivals import Arrivals
+from .samples import Payload, Traffic
+
+log = logging.getLogger("macs.mesh")
+
+
+class _Outlet(NamedTuple):
+    """Where puts with one key go."""
+
+    publisher: zenoh.Publisher
+    shape: Shape | None
+    """The limits on this key, if there are any."""
+    kept: bool = False
+    """Whether it keeps messages for those that miss some."""
+
+
+class _Apart(NamedTuple):
+    """Two publishers for one key: our own subscriptions, and everybody else's."""
+
+    here: zenoh.Publisher
+    away: zenoh.Publisher
+    settled_at: float
+    """When Zenoh surely knows who listens: until then it sends to the router in any case."""
+
+
+class Outgoing:
+    """Everything that one session puts. ``drops`` is the mesh's; ``linked`` is kept by it."""
+
+    PUBLISHERS = 4096
+    LARGE_BYTES = 128 << 10
+    SETTLE_S = 2.0
+
+    HEARTBEAT_S = 0.5
+    """How often a reliable source tells its newest number: so late is the loss of a last message noticed."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        arrivals: Arrivals,
+        shaper: Shaper,
+        drops: Counter[str],
+        *,
+        linked: bool,
+        backlog_bytes: int,
+        from_thread: Callable[[Callable[[], None]], None],
+    ) -> None:
+        self.shaper = shaper
+        self.linked = linked
+        self.drops = drops
+        self._session = session
+        self._arrivals = arrivals
+        self._outlets: dict[Traffic, OrderedDict[str, _Outlet]] = {kind: OrderedDict() for kind in Traffic}
+        self._priorities: dict[str, Priority] = {}
+        self._kept: dict[str, int] = {}
+        self._apart: OrderedDict[str, _Apart] = OrderedDict()
+        self._outlets_lock = threading.Lock()
+        self._on_room: list[Callable[[], None]] = []
+        self._sender = Sender(backlog_bytes, arrivals.put, lambda: from_thread(self._room))
+
+    def link_changed(self, linked: bool) -> None:
+        """A router came or went: who listens is unknown again."""
+        self.linked = linked
+        self._apart.clear()
+
+    def close(self, timeout_s: float) -> None:
+        """Send what is queued, for at most so long."""
+        self._sender.close(timeout_s)
+
+    def put(self, key: str, payload: Payload, traffic: Traffic = Traffic.CALL) -> None:
+        """Publish. From any thread; never waits for more than a full link's ``block_limit_ms``.
+
+        Kept traffic that is large, or that follows a large one, is sent by a thread of its own, so that 20 MiB over
+        a slow link do not hold up the loop; between two agents of this program it is not copied at all.
+
+        What is more than a traffic rule allows is dropped and counted; where `limited`, put each message by itself.
+        """
+        publisher, shape, kept = self._outlets[traffic].get(key) or self._declare(key, traffic)
+        if shape is not None and not self._passes(shape, len(payload)):
+            return
+        if not (self.linked or kept):
+            self.drops["no_route"] += 1
+        if traffic is not Traffic.CALL or (self._sender.idle and len(payload) <= self.LARGE_BYTES):
+            self._arrivals.put(publisher, payload)
+        elif kept:  # one publisher numbers them all
+            if not self._sender.put(publisher, payload):
+                self.drops["backlog"] += 1
+        else:
+            self._put_apart(self._apart.get(key) or self._declare_apart(key), payload)
+
+    def put_unasked(self, key: str, payload: Payload) -> None:
+        """Put without having heard that anybody listens, past all traffic rules: it goes to the router in any case,
+        as from a program that asks nobody. For who tries what a router lets through."""
+        priority, congestion, express = Traffic.CALL.value
+        self._session.put(key, payload, priority=priority, congestion_control=congestion, express=express)
+
+    def limited(self, key: str) -> bool:
+        """Whether a traffic rule may drop some of what is put with this key, so that messages count one by one."""
+        shape = self.shaper.of(key)
+        return shape is not None and shape.limited
+
+    def prioritise(self, key: str, priority: Priority | None) -> None:
+        """Put with this key at a priority of its own, whatever rules say; None: no more. From any thread."""
+        with self._outlets_lock:
+            if self._priorities.get(key) == priority:
+                return
+            self._priorities.pop(key, None)
+            if priority is not None:
+                self._priorities[key] = priority
+                if len(self._priorities) > self.PUBLISHERS:
+                    del self._priorities[next(iter(self._priorities))]
+            for outlets in self._outlets.values():
+                outlets.pop(key, None)
+            self._apart.pop(key, None)
+
+    def keep(self, key: str, samples: int | None) -> bool:
+        """Keep so many samples of a key for receivers that miss some, whatever rules say; None: as rules say. Returns
+        whether any are kept.
+
+        For topic data, and for messages between named agents to all: nothing else is asked for again. From any thread.
+        Receivers must subscribe with ``reliable``.
+        """
+        with self._outlets_lock:
+            if self._kept.get(key) != samples:
+                self._kept.pop(key, None)
+                if samples is not None:
+                    self._kept[key] = samples
+                    if len(self._kept) > self.PUBLISHERS:
+                        del self._kept[next(iter(self._kept))]
+                for outlets in self._outlets.values():
+                    outlets.pop(key, None)
+        return self._keeps(key, self.shaper.of(key)) > 0
+
+    def way(self, key: str, traffic: Traffic) -> tuple[zenoh.Priority, zenoh.CongestionControl, bool]:
+        """How samples with this key travel."""
+        usual, congestion, express = traffic.value
+        shape = self.shaper.of(key)
+        wanted = self._priorities.get(key) or (shape.priority if shape is not None else None)
+        return getattr(zenoh.Priority, wanted.upper()) if wanted else usual, congestion, express
+
+    @property
+    def backlogged(self) -> bool:
+        """Whether so much waits to be sent that callers should slow down; `on_room` tells when it is over."""
+        return self._sender.backlogged
+
+    def on_room(self, callback: Callable[[], None]) -> None:
+        """Call ``callback`` whenever a backlog has gone."""
+        self._on_room.append(callback)
+
+    def _room(self) -> None:
+        for callback in self._on_room:
+            callback()
+
+    def _passes(self, shape: Shape, size: int) -> bool:
+        overrun = shape.judge(size, time.monotonic())
+        if overrun is not None and overrun.first:
+            text = "%s is dropped by a traffic rule: above %s %g of %s (logged once for the rule, counted as %s)"
+            log.warning(text, shape.key, overrun.setting, overrun.limit, overrun.rule, overrun.reason)
+        return overrun is None
+
+    def _put_apart(self, apart: _Apart, payload: Payload) -> None:
+        """Our own subscriptions get the payload as it is, now; the sender copies it for others, if any listen."""
+        self._arrivals.put_here(apart.here, payload)
+        if time.monotonic() > apart.settled_at and not apart.away.matching_status.matching:  # type: ignore[attr-defined]
+            return
+        if not self._sender.put(apart.away, payload):
+            self.drops["backlog"] += 1
+
+    def _declare(self, key: str, traffic: Traffic) -> _Outlet:
+        """A publisher for a key: unlike a bare put, it sends nothing over the link while nobody there listens."""
+        outlets = self._outlets[traffic]
+        shape = self.shaper.of(key)
+        with self._outlets_lock:
+            if key in outlets:  # of two threads the other was faster: one source must number all
+                return outlets[key]
+            keep = self._keeps(key, shape)
+            publisher = self._keeping(key, traffic, keep) if keep else self._publisher(key, traffic)
+            limits = shape if shape is not None and shape.limited else None
+            outlet = outlets[key] = _Outlet(publisher, limits, bool(keep))
+            if len(outlets) > self.PUBLISHERS:
+                outlets.popitem(last=False)  # undeclared when the last put with it is done
+        return outlet
+
+    def _publisher(self, key: str, traffic: Traffic) -> zenoh.Publisher:
+        priority, congestion, express = self.way(key, traffic)
+        return self._session.declare_publisher(key, priority=priority, congestion_control=congestion, express=express)
+
+    def _keeps(self, key: str, shape: Shape | None) -> int:
+        """How many samples to keep of a key; of those that nobody recovers, none."""
+        if STREAM.parse(key) is None and NAMED_ALL.parse(key) is None:
+            return 0
+        return self._kept.get(key) or (shape.reliable if shape is not None else None) or 0
+
+    def _keeping(self, key: str, traffic: Traffic, samples: int) -> Any:
+        """A publisher that numbers samples, keeps the last ones and answers questions for them."""
+        priority, congestion, express = self.way(key, traffic)
+        # an answer that were dropped would be asked for again, so it waits
+        answers = zenoh.ext.RepliesConfig(priority=priority, congestion_control=zenoh.CongestionControl.BLOCK)
+        return zenoh.ext.declare_advanced_publisher(
+            self._session,
+            key,
+            priority=priority,
+            congestion_control=congestion,
+            express=express,
+            cache=zenoh.ext.CacheConfig(samples, replies_config=answers),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=self.HEARTBEAT_S, sporadic_heartbeat=None),
+        )
+
+    def _declare_apart(self, key: str) -> _Apart:
+        priority, congestion, express = self.way(key, Traffic.CALL)
+        here, away = (
+            self._session.declare_publisher(
+                key, priority=priority, congestion_control=congestion, express=express, allowed_destination=where
+            )
+            for where in (zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE)
+        )
+        with self._outlets_lock:
+            apart = self._apart[key] = _Apart(here, away, time.monotonic() + self.SETTLE_S)
+            if len(self._apart) > self.PUBLISHERS:
+                self._apart.popitem(last=False)
+        return apart
+
+
+class Sender:
+    """A thread that puts what may take long, in order. It starts with the first such payload."""
+
+    def __init__(
+        self, limit_bytes: int, put: Callable[[zenoh.Publisher, Payload], None], on_room: Callable[[], None]
+    ) -> None:
+        self._put = put
+        self.backlogged = False
+        self._limit_bytes = limit_bytes
+        self._on_room = on_room
+        self._bytes = 0
+        self._queue: deque[tuple[zenoh.Publisher, Payload]] = deque()
+        self._wake = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self._closing = False
+
+    @property
+    def idle(self) -> bool:
+        """Nothing is waiting or being sent."""
+        return self._bytes == 0
+
+    def put(self, publisher: zenoh.Publisher, payload: Payload) -> bool:
+        """Queue it; False when that would be more than the limit (one payload may always wait)."""
+        with self._wake:
+            if self._closing or (self._bytes and self._bytes + len(payload) > self._limit_bytes):
+                return False
+            self._bytes += len(payload)
+            self.backlogged = self._bytes > self._limit_bytes // 4
+            self._queue.append((publisher, payload))
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="macs-sender", daemon=True)
+                self._thread.start()
+            self._wake.notify()
+        return True
+
+    def close(self, timeout_s: float) -> None:
+        """Send what is queued, for at most ``timeout_s``, and end."""
+        with self._wake:
+            self._closing = True
+            self._wake.notify()
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                while not self._queue:
+                    if self._closing:
+                        return
+                    self._wake.wait()
+                publisher, payload = self._queue.popleft()
+            self._put(publisher, payload)
+            with self._wake:
+                self._bytes -= len(payload)
+                relieved = self.backlogged and self._bytes < self._limit_bytes // 8
+                if relieved:
+                    self.backlogged = False
+            if relieved:
+                self._on_room()

@@ -1,0 +1,164 @@
+"""A subscription that recovers what it missed, from sources that keep it. See `macs_zenoh.recovery`."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+
+import zenoh
+
+from macs_zenoh.recovery import Ask, Recovery
+
+from .arrivals import Arrivals
+from .samples import SOURCES, Numbered, OnBatch, OnMiss, OnNumbered, Sample, Subscription
+
+log = logging.getLogger("macs.mesh")
+
+
+class Recovered:
+    """A subscription that asks reliable sources for what it missed. On the loop."""
+
+    ASK_S = 3.0
+    """How long a question may take; what it has brought until then stays."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        arrivals: Arrivals,
+        key: str,
+        on_batch: OnBatch,
+        on_miss: OnMiss,
+        *,
+        linked: bool,
+        on_close: Callable[[Recovered], None],
+    ) -> None:
+        self._session = session
+        self._arrivals = arrivals
+        self._loop = asyncio.get_running_loop()
+        self._linked = linked
+        self._on_close = on_close
+        self._key = key
+        self._on_batch = on_batch
+        self._on_miss = on_miss
+        self._recovery = Recovery()
+        self._timer: asyncio.TimerHandle | None = None
+        self._closed = False
+        self._on_numbered = self._numbered
+        self._on_heartbeat = self._heartbeat
+
+    def declare(self) -> Subscription:
+        """Subscribe, and learn how far those sources are that exist."""
+        session, arrivals = self._session, self._arrivals
+        samples = zenoh.handlers.Callback(arrivals.receiver(self._on_batch, self._on_numbered), indirect=False)
+        heartbeats = zenoh.handlers.Callback(arrivals.receiver(self._on_heartbeat), indirect=False)
+        declared = Subscription(
+            self,
+            session.declare_subscriber(self._key, samples),
+            session.declare_subscriber(f"{self._key}/{SOURCES}", heartbeats),
+        )
+        self._look_for_sources()
+        return declared
+
+    def undeclare(self) -> None:
+        """Ask nothing any more."""
+        self._closed = True
+        self._on_close(self)
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def link_changed(self, linked: bool) -> None:
+        """The way to the sources was lost or is there again."""
+        self._linked = linked
+        self._recovery.restart(time.monotonic())
+        if linked and not self._recovery.settled:
+            self._look_for_sources()
+        self._go_on([])
+
+    def _look_for_sources(self) -> None:
+        """Ask every source for its newest number, so that only what it sends from now on is wanted."""
+        linked = self._linked
+
+        def known(batch: list[Numbered]) -> None:
+            for key, _, source, number in batch:
+                self._recovery.known(source, key, number, time.monotonic())
+
+        def ended(_: list[Sample]) -> None:
+            if linked and self._linked:  # else once there is a router
+                self._recovery.settled = True
+
+        self._get(f"{self._key}/{SOURCES}?_max=1", known, ended)
+
+    def _numbered(self, batch: list[Numbered]) -> None:
+        now = time.monotonic()
+        recovery, freed = self._recovery, []
+        for key, payload, source, number in batch:
+            freed += recovery.sample(source, number, (key, payload), now)
+        self._go_on(freed)
+
+    def _heartbeat(self, batch: list[Sample]) -> None:
+        now = time.monotonic()
+        for key, payload in batch:
+            data_key, _, source = key.removesuffix("/_").rpartition(f"/{SOURCES.removesuffix('**')}")
+            if data_key and len(payload) == 4:
+                self._recovery.heartbeat(source, data_key, int.from_bytes(payload, "little"), now)
+        self._go_on([])
+
+    def _go_on(self, freed: list[Sample]) -> None:
+        """Pass on what is in turn, ask for what is missing."""
+        for key, count in self._recovery.misses():
+            self._on_miss(key, count)
+        if self._closed:
+            return
+        now = time.monotonic()
+        for ask in self._recovery.asks(now):
+            self._ask(ask)
+        deadline = self._recovery.next_deadline()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if deadline < math.inf:
+            self._timer = self._loop.call_later(max(0.0, deadline - now), self._go_on, [])
+        if freed:
+            self._on_batch(freed)
+
+    def _ask(self, ask: Ask) -> None:
+        def replied(batch: list[Numbered]) -> None:
+            now = time.monotonic()
+            freed: list[Sample] = []
+            for key, payload, _, number in batch:
+                freed += self._recovery.reply(ask, number, (key, payload), now)
+            self._go_on(freed)
+
+        def ended(_: list[Sample]) -> None:
+            self._go_on(self._recovery.ended(ask, time.monotonic()))
+
+        source = f"{SOURCES.removesuffix('**')}{ask.source}/**"
+        self._get(f"{ask.key}/{source}?_sn={ask.numbers}", replied, ended)
+
+    def _get(self, selector: str, on_replies: OnNumbered, on_end: OnBatch) -> None:
+        arrivals = self._arrivals
+        receive = arrivals.receiver(_ignore, on_replies)
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                receive(reply.ok)
+
+        try:
+            self._session.get(
+                selector,
+                zenoh.handlers.Callback(on_reply, partial(arrivals.mark, on_end), indirect=False),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+                timeout=self.ASK_S,
+            )
+        except zenoh.ZError as error:  # the session is closed
+            log.debug("get: %s", error)
+
+
+def _ignore(_: list[Sample]) -> None:
+    """Replies that nobody has numbered."""

@@ -1,0 +1,74 @@
+"""What goes over the mesh and how, and what is declared on it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Awaitable, Callable
+from enum import Enum
+from typing import Any
+
+import zenoh
+
+log = logging.getLogger("macs.mesh")
+
+Payload = bytes | bytearray
+
+
+class Traffic(Enum):
+    """How a sample travels: Zenoh priority, what happens when a link is full, and whether it may wait for others."""
+
+    COMMAND = (zenoh.Priority.REAL_TIME, zenoh.CongestionControl.DROP, True)
+    """Commands to robots: first in line, never waits, the next one replaces a lost one."""
+    CALL = (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK, True)
+    """Services, management, messages between agents: kept, in order."""
+    STREAM = (zenoh.Priority.DATA, zenoh.CongestionControl.DROP, False)
+    """Topic data: dropped when a link is full."""
+    PROBE = (zenoh.Priority.BACKGROUND, zenoh.CongestionControl.BLOCK, False)
+    """Measurements: after everything else."""
+
+    __hash__ = object.__hash__  # Enum's own is a Python call, and each put needs it
+
+
+Sample = tuple[str, Payload]
+"""What a subscription receives: key and payload. Not to be changed: others may have the same payload."""
+
+OnBatch = Callable[[list[Sample]], None]
+OnMiss = Callable[[str, int], None]
+Handler = Callable[[str, bytes], Awaitable[bytes]]
+
+Numbered = tuple[str, Payload, str, int]
+"""Key, payload, source and number of a sample that its source keeps."""
+OnNumbered = Callable[[list[Numbered]], None]
+
+
+class Subscription:
+    """Something declared on the mesh, until `close`. Keep it: Zenoh undeclares what nobody refers to."""
+
+    def __init__(self, *declared: Any) -> None:
+        self._declared = declared
+
+    def close(self) -> None:
+        """Undeclare it. Closing twice, or after the mesh, is allowed."""
+        declared, self._declared = self._declared, ()
+        for entity in declared:
+            try:
+                entity.undeclare()
+            except zenoh.ZError as error:
+                log.debug("undeclare: %s", error)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it has not been closed here."""
+        return bool(self._declared)
+
+    def become(self, other: Subscription) -> None:
+        """Undeclare this and be ``other`` from now on, for whoever holds this."""
+        self.close()
+        self._declared, other._declared = other._declared, ()
+
+
+SOURCES = "@adv/pub/**"
+"""Behind a key: its reliable sources, as Zenoh's advanced publishers name them (``@adv/pub/{zid}/{entity}/_``)."""
+
+Token = Subscription
+"""A liveliness token: it lives until `close`, or until its process is gone."""

@@ -1,0 +1,419 @@
+"""The Zenoh session: a program's place on the mesh."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from types import TracebackType
+
+import msgspec
+import zenoh
+
+from macs_zenoh import ping
+from macs_zenoh.config import MeshSettings, TrafficRule
+from macs_zenoh.errors import CallTimeout, ConfigError, MacsError, NotServed, OutOfRange, Refused, Unreachable
+from macs_zenoh.keyexpr import PING
+from macs_zenoh.shaping import Shaper
+
+from .arrivals import Arrivals
+from .opening import first_line, insert, zenoh_config
+from .outgoing import Outgoing
+from .recovered import Recovered
+from .samples import Handler, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
+
+log = logging.getLogger("macs.mesh")
+
+
+class Mesh:
+    """One program's place on the mesh. Made by `open`; an async context manager.
+
+    ``drops`` counts, by name, what was lost here: ``no_route`` (put while no router was connected), ``backlog``
+    (more waiting to be sent than ``backlog_bytes``), ``loop_behind`` (samples came faster than they were handled),
+    ``over_size``, ``over_rate`` and ``over_budget`` (more than a traffic rule allows), ``missed`` (what a reliable
+    source did not have any more, or did not send, when it was asked).
+    """
+
+    PUBLISHERS = Outgoing.PUBLISHERS
+    LARGE_BYTES = Outgoing.LARGE_BYTES
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        settings: MeshSettings,
+        traffic: Sequence[TrafficRule] = (),
+        backlog_bytes: int = 64 << 20,
+    ) -> None:
+        self.settings = settings
+        self.drops: Counter[str] = Counter()
+        self.shaper = Shaper(traffic, self.drops)
+        self.zid = str(session.zid())
+        self._session = session
+        self._loop = asyncio.get_running_loop()
+        self._arrivals = Arrivals(self._loop, self._from_thread, self.drops)
+        self._missed: set[str] = set()
+        self._recovered: set[Recovered] = set()
+        self._needs_router = settings.mode == "client"
+        self.linked = not self._needs_router
+        """Whether a router is connected now; always true for a router."""
+        self._outgoing = outgoing = Outgoing(
+            session,
+            self._arrivals,
+            self.shaper,
+            self.drops,
+            linked=self.linked,
+            backlog_bytes=backlog_bytes,
+            from_thread=self._from_thread,
+        )
+        # what is put goes straight there: a gateway does it for every message
+        self.put, self.put_unasked = outgoing.put, outgoing.put_unasked
+        self.limited, self.prioritise, self.keep = outgoing.limited, outgoing.prioritise, outgoing.keep
+        self.on_room = outgoing.on_room
+        self._routers: set[str] = set()
+        self._on_link: list[Callable[[bool], None]] = []
+        self._tasks: set[asyncio.Task[None]] = set()
+        # links, not transports, and directly: Zenoh tells of a lost link before it tells that everybody behind it
+        # left, and of the lost transport only after that
+        on_link = zenoh.handlers.Callback(self._link_changed, indirect=False)
+        self._links = session.info.declare_link_events_listener(on_link, history=True)
+
+    @classmethod
+    async def open(
+        cls,
+        settings: MeshSettings,
+        *,
+        traffic: Sequence[TrafficRule] = (),
+        on_waiting: Callable[[str], None] | None = None,
+    ) -> Mesh:
+        """Join the mesh. A client waits for its first router as long as it takes; ``on_waiting`` hears of it once.
+        The ``traffic`` rules hold for what is put and asked here.
+
+        Raises ConfigError when Zenoh does not accept the configuration, Unreachable when a router cannot listen.
+        """
+        zenoh.init_log_from_env_or("error")  # RUST_LOG, as with Zenoh's own tools
+        waiting = False
+        while True:
+            config = zenoh_config(settings)
+            try:
+                return cls(await asyncio.to_thread(zenoh.open, config), settings, traffic)
+            except zenoh.ZError as error:
+                problem = first_line(error)
+                if settings.mode != "client":
+                    raise Unreachable(", ".join(settings.listen) or "the mesh", problem) from error
+                if not problem.startswith("Unable to connect"):
+                    raise ConfigError("zenoh configuration", problem) from error
+                if not waiting:
+                    waiting = True
+                    (on_waiting or _log_waiting)(", ".join(settings.routers) or "a router")
+                await asyncio.sleep(settings.retry_max_ms / 1000)
+
+    @classmethod
+    async def open_once(cls, settings: MeshSettings, *, timeout_s: float) -> Mesh:
+        """Join the mesh as a client with one attempt, for who wants to know why it fails.
+
+        Raises Unreachable with Zenoh's reason, ConfigError.
+        """
+        zenoh.init_log_from_env_or("off")  # what goes wrong is in the error
+        config = zenoh_config(settings)
+        insert(config, "connect/timeout_ms", str(round(timeout_s * 1000)))
+        opening = asyncio.ensure_future(asyncio.to_thread(zenoh.open, config))
+        try:
+            return cls(await asyncio.shield(opening), settings)
+        except zenoh.ZError as error:
+            raise Unreachable(", ".join(settings.routers) or "a router", first_line(error)) from error
+        except asyncio.CancelledError:
+            opening.add_done_callback(_close_late)
+            raise
+
+    @property
+    def backlogged(self) -> bool:
+        """Whether so much waits to be sent that callers should slow down; `on_room` tells when it is over."""
+        return self._outgoing.backlogged
+
+    async def __aenter__(self) -> Mesh:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Leave the mesh: what was put is sent first, tokens end. A process must not exit without it."""
+        for task in self._tasks:
+            task.cancel()
+        closing = asyncio.ensure_future(asyncio.to_thread(self._close))
+        cancelled = False
+        while not closing.done():
+            try:
+                await asyncio.shield(closing)
+            except asyncio.CancelledError:  # a second signal: a process that exits with an open session hangs
+                cancelled = True
+        if cancelled:
+            raise asyncio.CancelledError
+
+    def _close(self) -> None:
+        self._outgoing.close(timeout_s=1.0)
+        self._session.close()  # type: ignore[no-untyped-call]
+        if self.drops:
+            log.info("lost in all: %s", ", ".join(f"{name} {count}" for name, count in sorted(self.drops.items())))
+        for line in self.shaper.report():
+            log.info("%s", line)
+
+    # -- links ---------------------------------------------------------------------------------------------------
+
+    @property
+    def routers(self) -> list[str]:
+        """Zenoh ids of the routers connected now."""
+        return sorted(self._routers)
+
+    def on_link(self, callback: Callable[[bool], None]) -> None:
+        """Call ``callback(up)`` whenever the connection to the routers is lost or back."""
+        self._on_link.append(callback)
+
+    def _link_changed(self, event: zenoh.LinkEvent) -> None:
+        self._from_thread(self._set_link, str(event.link.zid), event.kind == zenoh.SampleKind.PUT)
+
+    def _set_link(self, zid: str, up: bool) -> None:
+        before = self.linked
+        (self._routers.add if up else self._routers.discard)(zid)
+        self.linked = bool(self._routers) or not self._needs_router
+        if before != self.linked:
+            log.info("router %s", "connected" if self.linked else "lost; reconnecting")
+        self._outgoing.link_changed(self.linked)
+        for recovered in list(self._recovered):
+            recovered.link_changed(self.linked)
+        if up and before:
+            return
+        # losing one router of several shakes what we know about others just as losing the only one does
+        for state in [False, True] if not up and self.linked else [up]:
+            for callback in self._on_link:
+                callback(state)
+
+    # -- publish and subscribe -----------------------------------------------------------------------------------
+
+    def subscribe(
+        self, key: str, on_batch: OnBatch, *, reliable: bool = False, on_miss: OnMiss | None = None
+    ) -> Subscription:
+        """Receive samples in batches. What one sender put is received in its order, over all subscriptions of this
+        mesh, as long as it was put with one kind of traffic.
+
+        ``reliable``: what a source keeps (`keep`) is received in order and once, also through outages. Samples that
+        it has no more are counted as ``missed``, and ``on_miss(key, count)`` hears of them. What sources do not keep
+        is received as without it.
+        """
+        if reliable:
+            recovered = Recovered(
+                self._session,
+                self._arrivals,
+                key,
+                on_batch,
+                partial(self._lost, on_miss),
+                linked=self.linked,
+                on_close=self._recovered.discard,
+            )
+            self._recovered.add(recovered)
+            return recovered.declare()
+        callback = zenoh.handlers.Callback(self._arrivals.receiver(on_batch), indirect=False)
+        return Subscription(self._session.declare_subscriber(key, callback))
+
+    def _lost(self, on_miss: OnMiss | None, key: str, count: int) -> None:
+        self.drops["missed"] += count
+        if key not in self._missed and len(self._missed) < self.PUBLISHERS:
+            self._missed.add(key)
+            text = "%s: %d lost, which the source has no more, or does not send again (logged once, counted as missed)"
+            log.warning(text, key, count)
+        if on_miss is not None:
+            on_miss(key, count)
+
+    def watch_stamps(self, key: str, on_stamp: Callable[[float, str], None]) -> Subscription:
+        """Call ``on_stamp(wall clock in s, zid)`` for every sample with a timestamp: our programs put none on theirs,
+        so it is the first router's."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            if (stamp := sample.timestamp) is not None:
+                self._from_thread(on_stamp, stamp.get_time().timestamp(), str(stamp.get_id()))
+
+        return Subscription(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+
+    # -- calls ---------------------------------------------------------------------------------------------------
+
+    async def query(self, key: str, payload: Payload, *, timeout_s: float, traffic: Traffic = Traffic.CALL) -> bytes:
+        """Ask whoever serves ``key`` and return the first answer, which travels as the question does.
+
+        Raises Refused when the answer is a refusal, NotServed, Unreachable, CallTimeout; OutOfRange when
+        it is larger than a traffic rule allows: of what a rule limits, only the size holds for queries.
+        """
+        shape = self.shaper.of(key)
+        if shape is not None and (overrun := shape.too_large(len(payload))) is not None:
+            raise OutOfRange(f"size of {key}", len(payload), 0, int(overrun.limit))
+        done: asyncio.Future[bytes] = self._loop.create_future()
+
+        def settle(answer: bytes | None, error: MacsError | None) -> None:
+            if done.done():
+                return
+            if error is not None:
+                done.set_exception(error)
+            elif answer is not None:
+                done.set_result(answer)
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self._from_thread(settle, reply.ok.payload.to_bytes(), None)
+            elif reply.err is not None:
+                problem = _problem(key, reply.err.payload.to_bytes(), timeout_s)
+                self._from_thread(settle, None, problem)
+
+        def on_end() -> None:
+            self._from_thread(settle, None, NotServed(key))
+
+        priority, congestion, express = self._outgoing.way(key, traffic)
+        self._session.get(
+            key,
+            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
+            payload=payload,
+            timeout=timeout_s,
+            priority=priority,
+            congestion_control=congestion,
+            express=express,
+        )
+        return await done
+
+    async def ask_all(self, key: str, *, timeout_s: float) -> list[tuple[str, bytes]]:
+        """Ask everybody who serves a key, as the routers' admin space (``@/*/router``), and return every answer with
+        its own key. Refusals are left out, and who is not allowed to ask gets none: Zenoh does not say."""
+        answers: list[tuple[str, bytes]] = []
+        ended = asyncio.Event()
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                answers.append((str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+
+        def on_end() -> None:
+            self._from_thread(ended.set)
+
+        self._session.get(
+            key,
+            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
+            target=zenoh.QueryTarget.ALL,
+            timeout=timeout_s,
+        )
+        await ended.wait()
+        return answers
+
+    def serve(self, key: str, handler: Handler) -> Subscription:
+        """Answer queries on ``key`` with ``await handler(key, payload)``; raise Refused in it to refuse."""
+
+        async def answer(query: zenoh.Query) -> None:
+            with query:
+                name = str(query.key_expr)
+                payload = query.payload.to_bytes() if query.payload is not None else b""
+                try:
+                    query.reply(query.key_expr, await handler(name, payload))
+                except Refused as refusal:
+                    query.reply_err(msgspec.json.encode({"refused": refusal.reason}))
+                except MacsError as error:
+                    query.reply_err(msgspec.json.encode({"refused": str(error)}))
+                except Exception:
+                    log.exception("call %s failed", name)
+                    query.reply_err(msgspec.json.encode({"failed": "internal error, see the log there"}))
+
+        def spawn(query: zenoh.Query) -> None:
+            task = self._loop.create_task(answer(query))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+        def on_query(query: zenoh.Query) -> None:
+            self._from_thread(spawn, query)
+
+        return Subscription(
+            self._session.declare_queryable(key, zenoh.handlers.Callback(on_query, indirect=False), complete=True)
+        )
+
+    def answer_pings(self) -> Subscription:
+        """Let `macs doctor` measure the way to this program, and learn its clock and version."""
+        macs, wheel = _version("macs-zenoh"), _version("eclipse-zenoh")
+
+        async def answer(key: str, payload: bytes) -> bytes:
+            said = ping.pong(self.settings, now_s=time.time(), macs=macs, zenoh=wheel, drops=dict(self.drops))
+            return ping.encode(said, payload)
+
+        return self.serve(PING.of(zid=self.zid), answer)
+
+    # -- presence ------------------------------------------------------------------------------------------------
+
+    def declare_token(self, key: str) -> Token:
+        """Be there: ``key`` exists on the mesh until the token is closed or this process is gone."""
+        return Token(self._session.liveliness().declare_token(key))
+
+    def watch_tokens(self, key: str, on_change: Callable[[str, bool], None]) -> Subscription:
+        """Call ``on_change(key, alive)`` for every token that exists, comes or goes."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            self._from_thread(on_change, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        return Subscription(
+            self._session.liveliness().declare_subscriber(
+                key, zenoh.handlers.Callback(receive, indirect=False), history=True
+            )
+        )
+
+    async def tokens(self, key: str, *, timeout_s: float = 2.0) -> list[str]:
+        """The tokens that exist now, as the routers know them."""
+        found: list[str] = []
+        ended = asyncio.Event()
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                found.append(str(reply.ok.key_expr))
+
+        def on_end() -> None:
+            self._from_thread(ended.set)
+
+        self._session.liveliness().get(
+            key, zenoh.handlers.Callback(on_reply, on_end, indirect=False), timeout=timeout_s
+        )
+        await ended.wait()
+        return sorted(found)
+
+    # -- threads -------------------------------------------------------------------------------------------------
+
+    def _from_thread(self, callback: Callable[..., object], *args: object) -> None:
+        try:
+            self._loop.call_soon_threadsafe(callback, *args)
+        except RuntimeError:  # the loop is closed: the program is ending and nobody waits for this
+            log.debug("the event loop has ended")
+
+
+def _problem(key: str, payload: bytes, timeout_s: float) -> MacsError:
+    """What an error reply means: ours is JSON, Zenoh's own is the word ``Timeout``."""
+    if payload == b"Timeout":
+        return CallTimeout(key, timeout_s)
+    try:
+        answer = msgspec.json.decode(payload, type=dict[str, str])
+    except msgspec.DecodeError:
+        return Unreachable(key, payload.decode(errors="replace")[:200])
+    if "refused" in answer:
+        return Refused(answer["refused"])
+    return Unreachable(key, answer.get("failed", "unknown failure"))
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def _close_late(opening: asyncio.Future[zenoh.Session]) -> None:
+    """Close a session that nobody waits for any more."""
+    if not opening.cancelled() and opening.exception() is None:
+        opening.result().close()  # type: ignore[no-untyped-call]
+
+
+def _log_waiting(target: str) -> None:
+    log.warning("no router at %s yet; waiting for it", target)
