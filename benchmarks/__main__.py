@@ -6,6 +6,7 @@ Exit code 0: measured (missed targets are marked in the table); 1: something was
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import platform
@@ -17,9 +18,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from .cases import CASES, Plan
+from . import awareness, cases, robot_speed
 from .figures import Figure, table
+from .plan import Plan
 from .processes import ProgramFailed, Stage
+
+WITH_ROS = {**robot_speed.CASES, **awareness.CASES}
+CASES = {**cases.CASES, **WITH_ROS}
 
 
 def main() -> int:
@@ -31,7 +36,7 @@ def main() -> int:
     failed: list[str] = []
     warnings: list[str] = []
     with tempfile.TemporaryDirectory() as profiles:
-        for name in args.cases or CASES:
+        for name in args.cases or _possible():
             began = time.monotonic()
             with Stage(Path(profiles) if args.profile else None) as stage:
                 try:
@@ -60,9 +65,10 @@ def main() -> int:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.splitlines()[0])
-    cases = "; ".join(f"{name}: {(case.__doc__ or '').splitlines()[0]}" for name, case in CASES.items())
-    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"what to measure (default: all). {cases}")
-    parser.add_argument("--quick", action="store_true", help="3 rounds with a quarter of the messages")
+    what = "; ".join(f"{name}: {(case.__doc__ or '').splitlines()[0]}" for name, case in CASES.items())
+    what = what.replace("%", "%%")  # argparse would fill something in
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"what to measure (default: all). {what}")
+    parser.add_argument("--quick", action="store_true", help="3 rounds with a quarter of the messages or the time")
     parser.add_argument("--rounds", type=int, default=5, metavar="N", help="rounds of each case (default: 5)")
     parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
     parser.add_argument("--profile", choices=["gateway"], help="run gateways under cProfile and print where time goes")
@@ -73,6 +79,14 @@ def _arguments() -> argparse.Namespace:
     if args.rounds < 1:
         parser.error("--rounds must be at least 1")
     return args
+
+
+def _possible() -> list[str]:
+    """Every case, without those for which this Python has no ROS."""
+    if importlib.util.find_spec("rclpy") is not None:
+        return list(CASES)
+    print(f"no rclpy: {', '.join(WITH_ROS)} are left out", file=sys.stderr)
+    return list(cases.CASES)
 
 
 def _text(report: dict[str, Any], figures: list[Figure], *, profiled: bool) -> str:

@@ -1,16 +1,15 @@
-"""Robot to robot, measured: ``python -m benchmarks.awareness [--quick] [--json]``.
+"""Robot to robot: messages of collective awareness, there and back, and what an uninvolved robot's link carries.
 
 ``hop``: there and back between modules of two robots in ROS domains of their own, gateway to gateway over one router,
 against what such a way is made of: raw Zenoh there and back, and a ROS topic there and back on either robot. Target:
 at most twice that. ``quiet``: 20 robots all send to one; how much of that data an uninvolved robot's link carries,
 whose modules take the same type; none is allowed. On the plain topic it carries all of it.
 
-The same file is the workers' program: ``module``, ``gateway``, ``senders``, ``plain``.
+``python -m benchmarks.awareness KIND ...`` is the workers' program: ``module``, ``gateway``, ``senders``, ``plain``.
 """
 
 from __future__ import annotations
 
-import argparse
 import array
 import asyncio
 import json
@@ -19,14 +18,16 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AsyncExitStack
+from functools import partial
 from statistics import median
 from typing import Any
 
-from .figures import Figure, table
+from .figures import Figure
 from .link import CountingLink
-from .processes import Program, ProgramFailed, Stage
+from .plan import Case, Plan, in_turn
+from .processes import Program, Stage
 from .worker import say, serve
 
 SIZE = 1024
@@ -45,8 +46,9 @@ class DownLink(CountingLink):
         super()._pump(source, target, not counted)
 
 
-def hop(stage: Stage, rounds: int, count: int) -> list[Figure]:
-    """Module to module and back, in turn with its parts; medians of each round, in µs."""
+def hop(stage: Stage, plan: Plan) -> Iterator[Figure]:
+    """From a module to another robot's module and back, against raw Zenoh and a ROS topic on either robot."""
+    count = max(100, int(300 * plan.scale))
     router = stage.router()
     domain = 101 + os.getpid() % 40
     for number in (0, 1):
@@ -65,23 +67,27 @@ def hop(stage: Stage, rounds: int, count: int) -> list[Figure]:
     raw_near.ask("ping", size=SIZE, count=20)
 
     def middle(worker: Program, **arguments: object) -> float:
-        return median(worker.ask("ping", size=SIZE, count=count, **arguments)["times"]) * 1e6
+        return float(median(worker.ask("ping", size=SIZE, count=count, **arguments)["times"])) * 1e6
 
-    ways: dict[str, list[float]] = {"robot": [], "zenoh": [], "ros": []}
-    for _ in range(rounds):
-        ways["robot"].append(middle(near, incoming="/bench_in", outgoing="/gateway_out", agent="drone1", kind="bench"))
-        ways["zenoh"].append(middle(raw_near))
-        ways["ros"].append(middle(ros_near, incoming="/pong", outgoing="/ping", agent="", kind=""))
+    ways = in_turn(
+        plan.rounds,
+        {
+            "robot": partial(
+                middle, near, incoming="/bench_in", outgoing="/gateway_out", agent="drone1", kind="bench"
+            ),
+            "zenoh": partial(middle, raw_near),
+            "ros": partial(middle, ros_near, incoming="/pong", outgoing="/ping", agent="", kind=""),
+        },
+    )
     parts = [zenoh + 2 * ros for zenoh, ros in zip(ways["zenoh"], ways["ros"], strict=True)]
-    return [
-        Figure("module to module and back, p50", ways["robot"], parts, "Zenoh + 2 x ROS topic", "us", at_most=2.0),
-        Figure("  of that: ROS topic and back", ways["ros"], ways["robot"], "the whole", "us"),
-        Figure("  of that: raw Zenoh and back", ways["zenoh"], ways["robot"], "the whole", "us"),
-    ]
+    yield Figure("module to module and back, p50", ways["robot"], parts, "Zenoh + 2 x ROS topic", "us", at_most=2.0)
+    yield Figure("  of that: ROS topic and back", ways["ros"], ways["robot"], "the whole", "us")
+    yield Figure("  of that: raw Zenoh and back", ways["zenoh"], ways["robot"], "the whole", "us")
 
 
-def quiet(stage: Stage, rounds: int, count: int) -> list[Figure]:
-    """Bytes on an uninvolved robot's link while all others send to one of them."""
+def quiet(stage: Stage, plan: Plan) -> Iterator[Figure]:
+    """Bytes on an uninvolved robot's link while 20 others all send to one of them."""
+    count = max(20, int(100 * plan.scale))
     router = stage.router()
     link = DownLink(router)
     domain = 141 + os.getpid() % 40
@@ -91,7 +97,7 @@ def quiet(stage: Stage, rounds: int, count: int) -> list[Figure]:
     senders, _ = stage.worker("awareness", "senders", router, ROBOTS)
     plain, _ = stage.worker("awareness", "plain", domain + 1)
     mesh, topic, data = [], [], []
-    for _ in range(rounds):
+    for _ in range(plan.rounds):
         time.sleep(SETTLE_S)
         before = link.sent
         sent = senders.ask("send", count=count, size=SIZE)["bytes"]
@@ -102,28 +108,12 @@ def quiet(stage: Stage, rounds: int, count: int) -> list[Figure]:
     link.close()
     # less than one message in all: what is left is Zenoh's keep-alive
     bound = SIZE / median(data)
-    return [
-        Figure(f"uninvolved robot's link, {ROBOTS} to 1", mesh, data, "bytes of data sent", "B", at_most=bound),
-        Figure("  the same on the plain topic", topic, data, "bytes of data sent", "B"),
-    ]
+    yield Figure(f"uninvolved robot's link, {ROBOTS} to 1", mesh, data, "bytes of data sent", "B", at_most=bound)
+    yield Figure("  the same on the plain topic", topic, data, "bytes of data sent", "B")
 
 
-def main() -> int:
-    """Run both and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.awareness", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="3 rounds with fewer messages")
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
-    args = parser.parse_args()
-    figures: list[Figure] = []
-    try:
-        for case, count in ((hop, 100 if args.quick else 300), (quiet, 20 if args.quick else 100)):
-            with Stage() as stage:
-                figures += case(stage, 3 if args.quick else 5, count)
-    except ProgramFailed as error:
-        print(error, file=sys.stderr)
-        return 1
-    print(json.dumps([figure.as_json() for figure in figures]) if args.json else table(figures))
-    return 0
+CASES: dict[str, Case] = {"awareness": hop, "awareness-quiet": quiet}
+"""What needs rclpy and as2_ca_msgs, by its name on the command line."""
 
 
 # -- workers ---------------------------------------------------------------------------------------------------------
@@ -310,4 +300,4 @@ def work(kind: str, *arguments: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(work(*sys.argv[1:]) if sys.argv[1:2] and not sys.argv[1].startswith("-") else main())
+    sys.exit(work(*sys.argv[1:]))

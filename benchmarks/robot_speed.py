@@ -1,29 +1,39 @@
-"""What a robot agent costs against plain rclpy, in one run: ``python -m benchmarks.robot_speed [--quick] [--json]``.
+"""What a robot agent costs against plain rclpy, in one run.
 
 Plain: a publisher and a raw subscription in two processes. Ours: the same publisher → robot agent → router → gateway
-→ TCP headset, and back; each a process of its own. Both run in turn, medians of all rounds.
-
-Exit code 0: measured; 1: something did not work.
+→ TCP headset, and back; each a process of its own. The targets leave the plain way some room: so many ms are added to
+what it took in the same round.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import sys
 import time
-from collections.abc import Callable
-from statistics import median
-from typing import Any
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
-from .processes import Program, ProgramFailed, Stage
+from .figures import Figure
+from .plan import KIB, Case, Plan, Run, in_turn
+from .processes import Program, Stage
 
-KIB = 1 << 10
 IMAGE = 900_000
 QUIET_S = 2.0
 RATES = (500, 1000, 1500, 2000, 2500, 3000, 3500, 4000, 5000, 6000)
 IDLE_S = 10.0
+
+
+class Room(NamedTuple):
+    """What the way through a robot agent may take: so much of what plain rclpy takes, and so many ms more."""
+
+    factor: float
+    ms: float
+
+    def __str__(self) -> str:
+        return f"{'' if self.factor == 1 else f'x {self.factor:g} '}+ {self.ms:g} ms"
+
+
+Ways = Sequence[str]
 
 
 class Site:
@@ -72,21 +82,24 @@ class Site:
         }[path]
 
 
-def in_turn(site: Site, paths: list[str], rounds: int, size: int, hz: float, seconds: float) -> dict[str, Any]:
-    """Each path once, then each once more …: medians, and what was lost in all."""
-    runs: dict[str, list[dict[str, Any]]] = {path: [] for path in paths}
-    for _ in range(rounds):
-        for path in paths:
-            runs[path].append(site.run(path, size, hz, seconds))
-    return {
-        path: {
-            "p50_ms": median(run["p50_ms"] for run in of_path),
-            "p99_ms": median(run["p99_ms"] for run in of_path),
-            "lost": sum(run["lost"] for run in of_path),
-            "sent": sum(run["sent"] for run in of_path),
-        }
-        for path, of_path in runs.items()
-    }
+def latencies(
+    site: Site, plan: Plan, what: str, size: int, hz: float, seconds: float, *, rounds: int, room: Room, ways: Ways
+) -> Iterator[Figure]:
+    """The median on each way, against the plain one with its room."""
+
+    def run(path: str) -> Run:
+        def once() -> float:
+            figures = site.run(path, size, hz, seconds)
+            plan.arrived(f"robot, {path}, {what}", figures["sent"], figures["got"])
+            return float(figures["p50_ms"])
+
+        return once
+
+    values = in_turn(rounds, {path: run(path) for path in ("plain", *ways)})
+    baseline = [room.factor * plain + room.ms for plain in values["plain"]]
+    for path in ways:
+        yield Figure(f"ROS {path}, {what}, p50", values[path], baseline, f"rclpy {room}", "ms", at_most=1.0)
+    yield Figure(f"plain rclpy, {what}, p50", values["plain"], baseline, "the same with room", "ms")
 
 
 def highest_rate(site: Site, path: str, seconds: float) -> float:
@@ -117,68 +130,46 @@ def idle(agent: Program) -> dict[str, float]:
     return {"cpu_percent": 100 * (used_s() - before) / IDLE_S, "mb": pages * os.sysconf("SC_PAGE_SIZE") / 1e6}
 
 
-def measure(site: Site, args: argparse.Namespace) -> dict[str, Any]:
-    """Every case."""
-    rounds, seconds = (2, 3.0) if args.quick else (3, 20.0)
-    cases: dict[str, Callable[[], Any]] = {
-        "idle": lambda: idle(site.agent),
-        "1 KiB, 100 Hz": lambda: in_turn(site, ["plain", "to headset", "to topic", "to five"], rounds, KIB, 100, 3),
-        "rate at 1 KiB": lambda: {path: highest_rate(site, path, 2.0) for path in ("plain", "to headset", "to topic")},
-        "64 KiB, 200 Hz": lambda: in_turn(site, ["plain", "to headset", "to topic"], 1, 64 * KIB, 200, seconds),
-        "0.9 MB, 30 Hz": lambda: in_turn(site, ["plain", "to headset", "to topic"], 1, IMAGE, 30, seconds),
-    }
-    chosen = args.cases or list(cases)
-    report = {}
-    for name in chosen:
-        report[name] = cases[name]()
-        print(f"{name}: {json.dumps(report[name])}", file=sys.stderr)
-    return report
+# -- cases ---------------------------------------------------------------------------------------------------------
 
 
-def table(report: dict[str, Any]) -> str:
-    """Lines of figure, ours, plain, target."""
-    lines = [f"{'figure':<34}{'ours':>10}{'plain':>10}  target"]
-
-    def line(name: str, ours: float, plain: float, target: str, met: bool) -> None:
-        lines.append(f"{name:<34}{ours:>10.2f}{plain:>10.2f}  {target:<28}{'ok' if met else 'MISSED'}")
-
-    for name, case in report.items():
-        if name == "idle":
-            line("idle, % of a core", case["cpu_percent"], 0, "< 2", case["cpu_percent"] < 2)
-            line("idle, MB", case["mb"], 0, "<= 90", case["mb"] <= 90)
-            continue
-        for path in [path for path in case if path != "plain"]:
-            if name.startswith("rate"):
-                ours, plain = case[path], case["plain"]
-                line(f"{name} {path}, msg/s", ours, plain, ">= 90 % of plain", ours >= 0.9 * plain)
-                continue
-            ours, plain = case[path]["p50_ms"], case["plain"]["p50_ms"]
-            limit = plain + 0.6 if name.startswith("1 KiB") else 1.2 * plain + 1
-            line(f"{name} {path}, p50 ms", ours, plain, f"<= {limit:.2f}", ours <= limit)
-            lost = case[path]["lost"]
-            line(f"{name} {path}, lost", lost, case["plain"]["lost"], f"0 of {case[path]['sent']}", lost == 0)
-    return "\n".join(lines)
+def robot(stage: Stage, plan: Plan) -> Iterator[Figure]:
+    """A ROS topic of 1 KiB at 100 Hz to one headset and to five, and a headset's commands, against plain rclpy."""
+    ways = ("to headset", "to topic", "to five")
+    yield from latencies(
+        Site(stage), plan, "1 KiB, 100 Hz", KIB, 100, 3, rounds=plan.rounds, room=Room(1, 0.6), ways=ways
+    )
 
 
-def main() -> int:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.robot_speed", description=__doc__.splitlines()[0])
-    parser.add_argument("cases", nargs="*", help="1 KiB, 100 Hz; rate at 1 KiB; ... (default: all)")
-    parser.add_argument("--quick", action="store_true", help="3 s instead of 20")
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args()
-    load = os.getloadavg()[0]
-    with Stage() as stage:
-        try:
-            report = measure(Site(stage), args)
-        except ProgramFailed as error:
-            print(error, file=sys.stderr)
-            return 1
-    report_text = json.dumps(report, indent=1) if args.json else table(report)
-    print(report_text)
-    print(f"{os.cpu_count()} CPUs, load {load:.2f} before, {os.getloadavg()[0]:.2f} after", file=sys.stderr)
-    return 0
+def robot_large(stage: Stage, plan: Plan) -> Iterator[Figure]:
+    """64 KiB at 200 Hz and 0.9 MB at 30 Hz through a robot agent, 20 s each (5 s if quick), against plain rclpy."""
+    site, seconds = Site(stage), 20 * plan.scale
+    for what, size, hz in (("64 KiB, 200 Hz", 64 * KIB, 200), ("0.9 MB, 30 Hz", IMAGE, 30)):
+        ways = ("to headset", "to topic")
+        yield from latencies(site, plan, what, size, hz, seconds, rounds=1, room=Room(1.2, 1), ways=ways)
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def robot_rate(stage: Stage, plan: Plan) -> Iterator[Figure]:
+    """The highest rate of 1 KiB through a robot agent of which at most 1 % is lost, against plain rclpy."""
+    site = Site(stage)
+    rounds = max(1, plan.rounds // 2)
+    paths = ("plain", "to headset", "to topic")
+    values = in_turn(rounds, {path: partial(highest_rate, site, path, 2.0) for path in paths})
+    for path in paths[1:]:
+        yield Figure(f"ROS {path}, 1 KiB, rate", values[path], values["plain"], "rclpy", "msg/s", at_least=0.9)
+
+
+def robot_idle(stage: Stage, plan: Plan) -> Iterator[Figure]:
+    """What a robot agent needs while nothing is sent."""
+    used = idle(Site(stage).agent)
+    yield Figure("idle robot agent, CPU", [used["cpu_percent"]], [2.0], "limit", "% of a core", at_most=1.0)
+    yield Figure("idle robot agent, memory", [used["mb"]], [90.0], "limit", "MB", at_most=1.0)
+
+
+CASES: dict[str, Case] = {
+    "robot": robot,
+    "robot-large": robot_large,
+    "robot-rate": robot_rate,
+    "robot-idle": robot_idle,
+}
+"""What needs rclpy, by its name on the command line."""

@@ -8,7 +8,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -29,12 +29,14 @@ def free_port() -> int:
 class Program:
     """``macs VERB ...`` in a process of its own, ready when the block is entered, gone when it is left."""
 
-    def __init__(self, *argv: str, env: Mapping[str, str] | None = None) -> None:
+    def __init__(self, *argv: str, env: Mapping[str, str] | None = None, within: Sequence[str] = ()) -> None:
+        """``within`` comes before the command, as ``ip netns exec site``."""
         self.argv = argv
         self.ready = ""
         """What it said when it was ready, e.g. ``gateway on 127.0.0.1:7000``."""
         self.log: list[str] = []
         self._env = {**os.environ, **(env or {})}
+        self._within = within
         self._process: asyncio.subprocess.Process
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -50,6 +52,7 @@ class Program:
     async def start(self) -> None:
         """Start it and wait until it says that it is ready."""
         self._process = await asyncio.create_subprocess_exec(
+            *self._within,
             sys.executable,
             "-m",
             "bridge",
@@ -99,11 +102,17 @@ class Program:
             self.log.append(line.decode(errors="replace").rstrip())
 
 
-async def macs(*argv: str) -> Any:
-    """Run ``macs ...`` to its end and return its stdout as JSON. Fails unless it exits with 0."""
+async def ended(*argv: str) -> tuple[int | None, str, str]:
+    """Run ``macs ...`` to its end: exit code, stdout, stderr."""
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "bridge", *argv, cwd=ROOT, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
     )
     out, errors = await asyncio.wait_for(process.communicate(), START_S)
-    assert process.returncode == 0, errors.decode()
+    return process.returncode, out.decode(), errors.decode()
+
+
+async def macs(*argv: str) -> Any:
+    """Run ``macs ...`` to its end and return its stdout as JSON. Fails unless it exits with 0."""
+    code, out, errors = await ended(*argv)
+    assert code == 0, errors
     return json.loads(out)

@@ -12,7 +12,21 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 
-from bridge.cli import agent, awareness, gateway, headset, interfaces, keys, ls, options, router, up
+from bridge.cli import (
+    agent,
+    awareness,
+    doctor,
+    gateway,
+    headset,
+    interfaces,
+    keys,
+    ls,
+    options,
+    router,
+    security,
+    stop,
+    up,
+)
 from macs_zenoh.errors import ConfigError, MacsError, UsageError
 
 VERBS = {
@@ -23,6 +37,9 @@ VERBS = {
     "headset": headset,
     "awareness": awareness,
     "ls": ls,
+    "stop": stop,
+    "doctor": doctor,
+    "security": security,
     "keys": keys,
     "interfaces": interfaces,
 }
@@ -64,10 +81,21 @@ def build_parser() -> argparse.ArgumentParser:
             description=module.__doc__,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        options.add_log_options(verb)
+        options.add_log_options(verb, getattr(module, "VERBOSE", "log more"))
         module.add_arguments(verb)
         verb.set_defaults(run=module.run)
     return parser
+
+
+def program() -> int:
+    """The process ``macs``: `main`, with stdout kept for data."""
+    # Zenoh writes its log to descriptor 1, in the middle of whatever reads our output as JSON or waits for a line
+    stdout = sys.stdout
+    own = os.dup(stdout.fileno())
+    os.dup2(sys.stderr.fileno(), stdout.fileno())
+    buffering = 1 if stdout.line_buffering else -1
+    sys.stdout = open(own, "w", encoding=stdout.encoding, errors=stdout.errors, buffering=buffering)  # noqa: SIM115, PTH123
+    return main()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,12 +1,16 @@
 """List the agents that are online: robots and headsets, whichever gateway they are behind.
 
-A headset's session is its gateway's, so headsets with one session share a gateway.
-Exit code 1 when no router answers.
+A headset's session is its gateway's, so headsets with one session share a gateway. Robots are asked for their state:
+STATE says which are stopped, who has control of which topic, and ? for a robot that should answer and does not.
+-v adds, for each robot: the emergency stop, who has registered what, control and dead-man of each topic, what was
+lost, and what it offers. Exit code 1 when no router answers.
 
 examples:
   macs ls
-  macs ls -e tcp/192.168.1.10:7447
-  macs ls --json | jq '.[] | select(.type == "ros").id'"""
+  macs ls -v -e tcp/192.168.1.10:7447
+  macs ls --json | jq '.[] | select(.type == "ros").id'
+  macs ls --json | jq '.[] | select(.status.stopped) | {id, by: .status.stop.by}'
+  macs ls -v --json | jq '.[] | {id, topics: .offers.publishers}'"""
 
 from __future__ import annotations
 
@@ -14,56 +18,83 @@ import argparse
 import asyncio
 import json
 import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
-from bridge.cli import options, running
-from macs_zenoh.config import MeshSettings
-from macs_zenoh.directory import AgentInfo, Directory
-from macs_zenoh.errors import Unreachable
-from macs_zenoh.keyexpr import NAME, PRESENCE
-from macs_zenoh.named import Named, Names
+from bridge.cli import options, robots, running
+from bridge.cli.robots import Node, Offers, Operator, Status
+from macs_zenoh.directory import AgentInfo
+from macs_zenoh.errors import MacsError, NotServed, Unreachable
+from macs_zenoh.messages import ROS
+from macs_zenoh.named import Named
 
-SUMMARY = "who is online"
+SUMMARY = "who is online, and what robots are doing"
+VERBOSE = "all about each robot"
+
+ANSWER_S = 1.0
+"""How long robots may take to tell their state; without -v nobody wants to wait for one that is stuck."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a robot said of itself: as it was, for programs, and as it is read here.
+
+    ``problem`` is why it said nothing, empty for one that has nothing to say, as robots behind a gateway.
+    """
+
+    problem: str = ""
+    status: Status | None = None
+    offers: Offers | None = None
+    raw_status: dict[str, Any] | None = None
+    raw_offers: dict[str, Any] | None = None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="for programs: a list of {type, id, group, zid, name}")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="for programs: a list of {type, id, group, zid, name}; robots also {status, problem}, with -v {offers}",
+    )
     parser.add_argument(
         "--timeout", type=float, default=3.0, metavar="S", help="how long to wait for a router (default: 3)"
     )
+    robots.add_as_option(parser)
     options.add_mesh_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     settings = options.settings(args).mesh
+    answer_s = args.timeout if args.verbose else min(ANSWER_S, args.timeout)
 
     async def show() -> int:
-        agents, names = await online(settings, timeout_s=args.timeout)
-        sys.stdout.write((_json(agents, names) if args.json else _table(agents, names)) + "\n")
+        async with robots.operator(settings, args.caller, timeout_s=args.timeout) as operator:
+            agents, names = await operator.online(), await operator.names()
+            ids = [agent.id for agent in agents if agent.type == ROS]
+            asked = (_ask(operator, robot, answer_s, offers=args.verbose) for robot in ids)
+            told = dict(zip(ids, await asyncio.gather(*asked), strict=True))
+        sys.stdout.write((_json if args.json else _text)(agents, names, told, args.verbose) + "\n")
         return 0
 
     return running.until_stopped(show)
 
 
-async def online(settings: MeshSettings, *, timeout_s: float) -> tuple[list[AgentInfo], list[Named]]:
-    """Everybody on the mesh, and the names by which some are reached, seen by a session that joins nothing.
-
-    Raises Unreachable without a router.
-    """
-    from macs_zenoh.mesh import Mesh
-
+async def _ask(operator: Operator, robot: int, timeout_s: float, *, offers: bool) -> Told:
+    told = Told()
     try:
-        mesh = await asyncio.wait_for(Mesh.open(settings, on_waiting=lambda target: None), timeout_s)
-    except asyncio.TimeoutError:
-        target = ", ".join(settings.routers) or "a router"
-        raise Unreachable(target, f"no Zenoh router answered within {timeout_s:g} s") from None
-    async with mesh:
-        directory, names = Directory(), Names()
-        for key in await mesh.tokens(PRESENCE.every(), timeout_s=timeout_s):
-            directory.token(key, True, 0.0)
-        for key in await mesh.tokens(NAME.every(), timeout_s=timeout_s):
-            names.token(key, True)
-        return list(directory), list(names)
+        raw, status = robots.read(await operator.ask(robot, "status", timeout_s=timeout_s), Status)
+        told = Told(status=status, raw_status=raw)
+        if offers:
+            raw, offered = robots.read(await operator.ask(robot, "offers", timeout_s=timeout_s), Offers)
+            told = replace(told, offers=offered, raw_offers=raw)
+    except NotServed:
+        pass
+    except MacsError as error:
+        told = replace(told, problem=error.why if isinstance(error, Unreachable) else str(error))
+    return told
+
+
+# -- for programs ----------------------------------------------------------------------------------------------------
 
 
 def _rows(agents: list[AgentInfo], names: list[Named]) -> list[dict[str, Any]]:
@@ -81,19 +112,105 @@ def _rows(agents: list[AgentInfo], names: list[Named]) -> list[dict[str, Any]]:
     ]
 
 
-def _json(agents: list[AgentInfo], names: list[Named]) -> str:
-    return json.dumps(_rows(agents, names))
+def _json(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], verbose: bool) -> str:
+    rows = _rows(agents, names)
+    for row in rows:
+        if row["type"] == "ros" and (robot := told.get(row["id"])) is not None:
+            row["status"], row["problem"] = robot.raw_status, robot.problem
+            if verbose:
+                row["offers"] = robot.raw_offers
+    return json.dumps(rows)
 
 
-def _table(agents: list[AgentInfo], names: list[Named]) -> str:
+# -- for people ------------------------------------------------------------------------------------------------------
+
+
+def _text(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], verbose: bool) -> str:
     rows = _rows(agents, names)
     if not rows:
         return "nobody is online"
-    width = max(len("SESSION"), *(len(row["zid"]) for row in rows))
-    lines = [("TYPE", "ID", "GROUP", "SESSION", "NAME")]
+    states = [_state(told.get(row["id"])) if row["type"] == "ros" else "" for row in rows]
+    if any(states):
+        states = [state or "-" for state in states]
+    lines = [("TYPE", "ID", "GROUP", "SESSION", "NAME", "STATE" if any(states) else "")]
     lines += [
-        (row["type"], str(row["id"] or "-"), str(row["group"] or "-"), row["zid"], row["name"] or "-") for row in rows
+        (row["type"], str(row["id"] or "-"), str(row["group"] or "-"), row["zid"], row["name"] or "-", state)
+        for row, state in zip(rows, states, strict=True)
     ]
-    return "\n".join(
-        f"{kind:<8}{number:>6}{group:>7}  {zid:<{width}}  {name}" for kind, number, group, zid, name in lines
-    )
+    session, name = (max(len(line[column]) for line in lines) for column in (3, 4))
+    shown = [
+        f"{line[0]:<8}{line[1]:>6}{line[2]:>7}  {line[3]:<{session}}  {line[4]:<{name}}  {line[5]}" for line in lines
+    ]
+    if verbose:
+        for robot, what in told.items():
+            shown += ["", f"robot {robot}", *(f"  {line}" for line in _details(what))]
+    return "\n".join(robots.printable(line.rstrip()) for line in shown)
+
+
+def _state(robot: Told | None) -> str:
+    """What somebody has to know before commanding it; empty when there is nothing."""
+    if robot is None or robot.status is None:
+        return "?" if robot is not None and robot.problem else ""
+    stopped = [f"stopped by {robot.status.stop.by}"] if robot.status.stopped else []
+    controls = [(node.name, node.control.holder) for node in robot.status.nodes if node.control is not None]
+    return ", ".join(stopped + [f"{topic}: {holder}" for topic, holder in controls if holder])
+
+
+def _details(robot: Told) -> list[str]:
+    status = robot.status
+    if status is None:
+        silent = "is no `macs agent`: it tells nothing of itself"
+        return [f"does not answer: {robot.problem}" if robot.problem else silent]
+    lines = [f"ROS node        {status.ros_node}", f"emergency stop  {_stop(status)}"]
+    # the stop has a node of its own, which concerns people only when somebody has registered it
+    nodes = [node for node in status.nodes if node.role != "emergency stop" or node.registrants]
+    lines += _block("registered", [(node.role, node.name, node.type, _registrants(node)) for node in nodes])
+    lines += _block("safety", [row for node in nodes for row in _safety(node)])
+    lines += _block("lost", [(name, str(count)) for name, count in sorted(status.drops.items())])
+    if robot.offers is None:
+        return [*lines, f"offers          ? {robot.problem}"]
+    return lines + _block("offers", list(_offered(robot.offers)))
+
+
+def _stop(status: Status) -> str:
+    if not any(node.role == "emergency stop" for node in status.nodes):
+        return "none"
+    before = f", {status.stop.times} in all" if status.stop.times else ""
+    if not status.stopped:
+        return f"off{before}"
+    return f"by {status.stop.by}, {status.stop.seconds:.0f} s ago{before}"
+
+
+def _registrants(node: Node) -> str:
+    busy = [f"{node.open_calls} open calls"] if node.open_calls else []
+    running = sum(not goal.finished for goal in node.goals)
+    busy += [f"{running} goals running"] if running else []
+    return ", ".join([*node.registrants, *busy]) or "-"
+
+
+def _safety(node: Node) -> Iterator[tuple[str, ...]]:
+    if node.control is not None:
+        held = node.control
+        free = "free" if held.holder is None else f"for {held.seconds_held:.0f} s, free in {held.seconds_left:.1f} s"
+        yield ("control", node.name, held.holder or "-", free)
+    if node.deadman is not None:
+        guard = node.deadman
+        trips = f"trips: {guard.trips}, last: {guard.last}" if guard.trips else "trips: none"
+        yield ("dead-man", node.name, guard.commander or "-", trips)
+
+
+def _offered(offers: Offers) -> Iterator[tuple[str, ...]]:
+    for what, named in (("publishes", offers.publishers), ("subscribes", offers.subscribers)):
+        for topic, of_type in named.items():
+            yield (what, topic, of_type, ", ".join(offers.qos.get(topic, {}).values()).replace("_", " "))
+    for what, named in (("service", offers.services), ("action", offers.actions)):
+        for name, of_type in named.items():
+            yield (what, name, of_type)
+
+
+def _block(heading: str, rows: list[tuple[str, ...]]) -> list[str]:
+    """A heading with rows in columns below it; nothing for no rows."""
+    columns = max((len(row) for row in rows), default=0)
+    widths = [max(len(row[i]) for row in rows if len(row) > i) for i in range(columns)]
+    lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=False)).rstrip() for row in rows]
+    return [heading, *(f"  {line}" for line in lines)] if lines else []

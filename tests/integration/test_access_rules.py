@@ -5,17 +5,20 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import macs_zenoh
+from bridge.cli.robots import Caller, operator
 from macs_zenoh import awareness, named
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Unreachable
 from macs_zenoh.keyexpr import NAMED, PRESENCE, STREAM
 from macs_zenoh.mesh import Mesh
+from macs_zenoh.messages import OPERATOR
 
 RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
 USERS = ("robot-7", "gateway-1", "observer")
@@ -154,3 +157,28 @@ async def test_an_observer_sees_who_is_online(as_user: Callable[[str], MeshSetti
     ):
         keys = await mesh.tokens(PRESENCE.every())
     assert [fields["id"] for key in keys if (fields := PRESENCE.parse(key))] == [7]
+
+
+async def test_an_observer_asks_robots_and_stops_none(as_user: Callable[[str], MeshSettings]) -> None:
+    """The observer hears a robot's state as operator/0; its stop does not arrive, under whichever name."""
+    heard = []
+
+    async def answer(call: macs_zenoh.Call) -> bytes:
+        heard.append(call.verb)
+        return b"{}"
+
+    async with (
+        macs_zenoh.join("ros", id=7, settings=as_user("robot-7")) as robot,
+        operator(as_user("observer"), Caller(OPERATOR, 0), timeout_s=5) as nobody,
+        operator(as_user("observer"), Caller(OPERATOR, 5), timeout_s=5) as somebody,
+    ):
+        for verb in ("status", "offers", "stop"):
+            robot.serve(verb, answer)
+        while not heard:  # until the router knows who serves
+            with suppress(Unreachable):
+                assert await nobody.ask(7, "status", timeout_s=1) == b"{}"
+        assert await nobody.ask(7, "offers", timeout_s=5) == b"{}"
+        for asker, verb in ((nobody, "stop"), (somebody, "stop"), (somebody, "status")):
+            with pytest.raises(Unreachable):
+                await asker.ask(7, verb, timeout_s=0.5)
+        assert heard == ["status", "offers"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import signal
 import sys
 
@@ -11,21 +12,12 @@ import pytest
 
 import macs_zenoh
 from bridge.headset.client import Headset
-from tests.programs import ROOT, Program, free_port, macs
+from tests.programs import ROOT, Program, ended, free_port, macs
 
 
 @pytest.fixture
 def endpoint() -> str:
     return f"tcp/127.0.0.1:{free_port()}"
-
-
-async def ended(*argv: str) -> tuple[int | None, str, str]:
-    """Run ``macs ...`` to its end: exit code, stdout, stderr."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "bridge", *argv, cwd=ROOT, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
-    )
-    out, errors = await asyncio.wait_for(process.communicate(), 20)
-    return process.returncode, out.decode(), errors.decode()
 
 
 async def test_ls_lists_robots_and_headsets(endpoint: str) -> None:
@@ -165,3 +157,21 @@ async def test_keys_as_a_program() -> None:
     code, out, _ = await ended("keys", "--json")
     assert code == 0
     assert json.loads(out)
+
+
+async def test_zenohs_log_stays_out_of_the_data(endpoint: str) -> None:
+    """With Zenoh's log on, which goes to descriptor 1, the ready line is the first and JSON is JSON."""
+    logging = {"RUST_LOG": "zenoh=debug"}
+    async with Program("router", "-l", endpoint, env=logging) as router:
+        assert router.ready == f"router on {endpoint}"
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            *("-m", "bridge", "ls", "--json", "-e", endpoint),
+            cwd=ROOT,
+            env={**os.environ, **logging},
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        out, errors = await asyncio.wait_for(process.communicate(), 20)
+        assert json.loads(out) == []
+        assert b"DEBUG" in errors

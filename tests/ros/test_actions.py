@@ -17,6 +17,7 @@ from ros_peer import Peer, adding, until
 from bridge.headset.actions import ABORTED, CANCELED, SUCCEEDED, ActionClient, Goal
 from bridge.headset.frames import NodeSpec
 from bridge.headset.nodes import Incoming
+from bridge.ros.actions import ACCEPTED, EXECUTING
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
@@ -33,13 +34,13 @@ COUNT = "macs_test_msgs/Count"
 class Counter:
     """An action server: counts to ``to``, one per ``step_s``; refuses negative goals."""
 
-    def __init__(self, peer: Peer, action: Any) -> None:
+    def __init__(self, peer: Peer, action: Any, name: str = "/count") -> None:
         self._action = action
         self._peer = peer
         self.server = ActionServer(
             peer.session.node,
             action,
-            "/count",
+            name,
             self._execute,
             goal_callback=lambda goal: GoalResponse.REJECT if goal.to < 0 else GoalResponse.ACCEPT,
             cancel_callback=lambda goal: CancelResponse.ACCEPT,
@@ -207,6 +208,41 @@ async def test_a_successor_of_the_group_finds_the_goal(site: SimpleNamespace) ->
         break
     await mine.cancel()
     assert (await mine.result(5)).status == CANCELED
+
+
+async def test_goals_end_with_their_headset_where_a_rule_says_so(site: SimpleNamespace) -> None:
+    """With cancel_on_leave a headset's goals are canceled when it leaves, also one not yet accepted; others' go on."""
+    counter = await site.peer.session.run(lambda: Counter(site.peer, site.action, "/other"))
+    for registrant in (5, 6):
+        await site.nodes.add(adding("/other", COUNT, node_type=NodeType.ACTION, registrant=registrant))
+    spec = NodeSpec(NodeType.ACTION, "/other", COUNT)
+    five, six = ActionClient(site.five, spec), ActionClient(site.six, spec)
+    elsewhere = await site.five.client.send_goal(7, site.goal(1000))
+    site.five.client, site.six.client = five, six
+    ended, stays = await five.send_goal(7, site.goal(1000)), await six.send_goal(7, site.goal(1000))
+    late = asyncio.create_task(five.send_goal(7, site.goal(1000)))
+    node = site.nodes.get(NodeType.ACTION, "nd__other")
+    await until(lambda: len(node.status()["goals"]) == 3)
+    site.nodes.forget(Registrant(2, 5))
+
+    def states(of: Any) -> dict[str, int]:
+        return {goal["goal"]: goal["status"] for goal in of.status()["goals"]}
+
+    await until(lambda: list(states(node).values()).count(CANCELED) == 2)
+    assert states(node)[ended.id.hex()] == CANCELED
+    assert states(node)[stays.id.hex()] in (ACCEPTED, EXECUTING)
+    assert states(site.nodes.get(NodeType.ACTION, "nd__count"))[elsewhere.id.hex()] in (ACCEPTED, EXECUTING)
+    await stays.cancel()
+    assert (await stays.result(5)).status == CANCELED
+    late.cancel()
+    await site.peer.session.run(counter.server.destroy)
+
+
+async def test_another_type_is_refused(site: SimpleNamespace) -> None:
+    """Who registers an action as what it is not, hears which type it has."""
+    site.nodes.forget(Registrant(2, 5))
+    with pytest.raises(Refused, match="/count has type macs_test_msgs/action/Count on this robot, not"):
+        await site.nodes.add(adding("/count", "example_interfaces/Fibonacci", node_type=NodeType.ACTION))
 
 
 async def test_an_unknown_goal_is_told(site: SimpleNamespace) -> None:

@@ -21,7 +21,7 @@ from bridge.ros.requests import STATUS
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings
 from macs_zenoh.errors import Refused
-from macs_zenoh.keyexpr import STREAM
+from macs_zenoh.keyexpr import PRESENCE, STREAM
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.messages import (
     Functionality,
@@ -65,11 +65,11 @@ async def headset(router: str, robot: RobotAgent) -> AsyncIterator[Agent]:
 
 
 class Streams:
-    """Everything that robot 7 streams, as an agent on the mesh gets it."""
+    """Everything that a robot streams, as an agent on the mesh gets it."""
 
-    def __init__(self, agent: Agent) -> None:
+    def __init__(self, agent: Agent, robot: int = ROBOT) -> None:
         self.frames: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue()
-        self._subscription = agent.mesh.subscribe(STREAM.every(type=1, id=ROBOT), self._take)
+        self._subscription = agent.mesh.subscribe(STREAM.every(type=1, id=robot), self._take)
 
     def _take(self, batch: list[Sample]) -> None:
         for key, payload in batch:
@@ -118,6 +118,31 @@ async def test_a_command_reaches_a_ros_topic(robot: RobotAgent, headset: Agent, 
     assert not robot.nodes.drops
 
 
+async def test_a_robot_whose_id_another_has_takes_a_free_one(router: str, domain: int, peer: Peer) -> None:
+    """A robot that was given no id gives way to another one of the same id: it goes on under a new one, without what
+    was registered under the old one, and an emergency stop still holds."""
+    settings = Settings(mesh=MeshSettings(connect=[router]), robot=RobotSettings(stop_topic="/stop"))
+    async with (
+        open_robot(settings, domain_id=domain) as robot,
+        macs_zenoh.join("unity", id=5, connect=[router]) as headset,
+    ):
+        await until(lambda: (1, 1) in headset.directory)
+        await headset.call("ros", 1, "add_node", encode(adding("/chatter")))
+        await headset.call("ros", 1, "stop", b"true")
+        other = headset.mesh.declare_token(PRESENCE.of(type=1, id=1, group=0, zid="0"))
+        await until(lambda: (1, 2) in headset.directory and robot.agent.id == 2)
+        status = json.loads(await headset.call("ros", 2, "status"))
+        assert status["stopped"]
+        assert "/chatter" not in [node["name"] for node in status["nodes"]]
+        await headset.call("ros", 2, "add_node", encode(adding("/chatter")))
+        streams = Streams(headset, 2)
+        publisher = await peer.publisher(String, "/chatter", matched=1)
+        key, payload = await streams.after(lambda: publisher.publish(String(data="hello")))
+        assert key == STREAM.of(type=1, id=2, node="nd__chatter")
+        assert Metadata.decode(parse_frame(payload).metadata).sender_agent_id == 2
+        other.close()
+
+
 async def test_a_best_effort_topic_is_streamed(robot: RobotAgent, headset: Agent, peer: Peer) -> None:
     """A sensor's topic arrives end to end."""
     streams = Streams(headset)
@@ -159,6 +184,17 @@ async def test_removing_ends_the_subscription(robot: RobotAgent, headset: Agent,
     await peer.sees("/chatter", subscriptions=1)
     await headset.call("ros", ROBOT, "remove_node", encode(removing("/chatter")))
     await peer.sees("/chatter", subscriptions=0)
+
+
+async def test_nobody_registers_for_another(robot: RobotAgent, headset: Agent, peer: Peer) -> None:
+    """A caller adds and removes nodes for itself only: its key says who it is, whatever the message says."""
+    with pytest.raises(Refused, match="unity/5 cannot register or remove nodes for unity/9"):
+        await headset.call("ros", ROBOT, "add_node", encode(adding("/chatter", registrant=9)))
+    assert len(robot.nodes) == 0
+    await headset.call("ros", ROBOT, "add_node", encode(adding("/chatter")))
+    with pytest.raises(Refused, match="unity/5 cannot"):
+        await headset.call("ros", ROBOT, "remove_node", encode(removing("/chatter", registrant=9)))
+    assert len(robot.nodes) == 1
 
 
 async def test_a_headset_that_vanishes_is_forgotten(robot: RobotAgent, router: str, peer: Peer) -> None:

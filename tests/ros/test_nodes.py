@@ -356,14 +356,14 @@ async def test_a_topic_of_another_type_is_refused(nodes: InterfaceNodes, peer: P
     """A topic that other nodes use with another type is refused, naming the type it carries."""
     await peer.publisher(Twist, "/t")
     await _knows(nodes, "/t", publishers=1)
-    with pytest.raises(Refused, match="/t carries geometry_msgs/msg/Twist on this robot, not std_msgs/msg/String"):
+    with pytest.raises(Refused, match="/t has type geometry_msgs/msg/Twist on this robot, not std_msgs/msg/String"):
         await nodes.add(adding("/t", node_type=node_type))
 
 
 async def test_the_other_node_on_a_topic_must_have_its_type(nodes: InterfaceNodes) -> None:
     """A subscriber and a publisher node on one topic have one type."""
     await nodes.add(adding("/t"))
-    with pytest.raises(Refused, match="/t carries std_msgs/msg/String on this robot"):
+    with pytest.raises(Refused, match="/t has type std_msgs/msg/String on this robot"):
         await nodes.add(adding("/t", "geometry_msgs/Twist", node_type=NodeType.PUBLISHER))
     await nodes.add(adding("/t", node_type=NodeType.PUBLISHER))
 

@@ -15,6 +15,7 @@ from bridge.ros.agent import open_robot
 from bridge.ros.session import RosSession
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings
 from macs_zenoh.errors import ConfigError
+from tests.programs import Program, free_port
 
 CONFIG = Path(__file__).parents[2] / "config"
 BASE = Settings(mesh=MeshSettings(connect=["tcp/10.0.0.9:1"]), robot=RobotSettings(id=4, group=2))
@@ -67,11 +68,33 @@ def test_the_launch_file_starts_what_exists() -> None:
     assert {"macs", "agent", "--settings", "--ros-args"} <= words
 
 
+async def test_the_command_of_the_launch_file_starts_a_robot(domain: int, tmp_path: Path) -> None:
+    """With the defaults of its arguments, besides where router and settings are, the agent is robot 1.
+
+    ROS's launch is not on PyPI, so what it would put together is put together here, from the file's own expression.
+    """
+    tree = ast.parse((CONFIG / "robot.launch.py").read_text())
+    (arguments,) = [node for node in ast.walk(tree) if isinstance(node, ast.Assign)][:1]
+    (command,) = [node.value for node in ast.walk(tree) if isinstance(node, ast.keyword) and node.arg == "cmd"]
+    port, settings = free_port(), tmp_path / "macs.toml"
+    settings.touch()
+    values = {name: default for name, (default, _) in ast.literal_eval(arguments.value).items()}
+    values |= {"router_port": str(port), "settings": str(settings)}
+    words = eval(compile(ast.Expression(command), "cmd", "eval"), {"value": values.__getitem__})
+    argv = [word if isinstance(word, str) else "".join(word) for word in words]
+    assert argv[0] == "macs"
+    async with (
+        Program("router", "-l", f"tcp/127.0.0.1:{port}"),
+        Program(*argv[1:], env={"ROS_DOMAIN_ID": str(domain)}) as robot,
+    ):
+        assert robot.ready == "robot 1"
+
+
 def test_the_unit_starts_what_exists(capsys: pytest.CaptureFixture[str]) -> None:
     """Its command is a verb with options that there are."""
     unit = configparser.ConfigParser(strict=False, interpolation=None)
     unit.optionxform = str  # type: ignore[assignment, method-assign]
-    unit.read(CONFIG / "macs-robot.service")
+    unit.read(CONFIG / "systemd" / "macs-robot.service")
     shell = shlex.split(unit["Service"]["ExecStart"])[2].replace("$$", "$")
     command = shlex.split(shell.rpartition("exec ")[2])[1:]
     with pytest.raises(SystemExit):

@@ -42,6 +42,20 @@ def test_control_goes_to_the_first_and_expires() -> None:
     assert held.holder(8) is None
 
 
+def test_how_long_control_is_held_and_left() -> None:
+    """The time since it was taken runs on with each command, and begins anew with a new holder."""
+    held = Control(hold_s=3)
+    assert (held.seconds_held(0), held.seconds_left(0)) == (0, 0)
+    held.take("a", 1)
+    held.take("a", 3)
+    assert (held.seconds_held(4), held.seconds_left(4)) == (3, 2)
+    held.give("a", "b", 5)
+    assert (held.seconds_held(6), held.seconds_left(6)) == (1, 2)
+    assert held.seconds_held(9) == 0
+    held.take("a", 10)
+    assert held.seconds_held(11) == 1
+
+
 def test_control_is_handed_over_and_released() -> None:
     """Only the holder can give it, to anybody, or give it up."""
     held = Control(hold_s=3)

@@ -190,7 +190,7 @@ async def test_a_service_of_another_type_is_refused(nodes: InterfaceNodes, peer:
     """A service that exists with another type cannot be registered, and the reason names its type."""
     await serve(peer, "/set", said)
     await until(lambda: nodes.robot.session.node.count_services("/set") == 1)
-    with pytest.raises(Refused, match="/set is a std_srvs/srv/SetBool on this robot, not a std_srvs/srv/Trigger"):
+    with pytest.raises(Refused, match="/set has type std_srvs/srv/SetBool on this robot, not std_srvs/srv/Trigger"):
         await nodes.add(adding("/set", "std_srvs/Trigger", node_type=3))
 
 

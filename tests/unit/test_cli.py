@@ -56,6 +56,12 @@ def test_help_of_a_verb_has_examples(verb: str, capsys: pytest.CaptureFixture[st
         ["gateway", "-e", "10.0.0.1:7447"],
         ["router", "--cfg", "mode"],
         ["ls", "--settings", "/nowhere/macs.toml"],
+        ["ls", "--as", "nobody"],
+        ["ls", "--as", "operator/70000"],
+        ["stop", "0"],
+        ["stop", "--group", "all"],
+        ["stop", "7", "--all"],
+        ["stop", "--release"],
     ],
     ids=" ".join,
 )

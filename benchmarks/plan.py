@@ -1,0 +1,55 @@
+"""How much is measured, in which order, and what was lost meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from .figures import Figure
+from .processes import Stage
+
+KIB = 1 << 10
+MIB = 1 << 20
+
+QUIET_S = 3.0
+"""Nothing came for so long: what is missing by then is lost."""
+
+Run = Callable[[], float]
+"""One measurement: its rate per second, or its time."""
+
+
+@dataclass
+class Plan:
+    """How much is measured. ``delivered`` and ``lost`` count messages over everything that was counted."""
+
+    rounds: int = 5
+    scale: float = 1.0
+    delivered: int = 0
+    lost: int = 0
+    lost_where: list[str] = field(default_factory=list)
+
+    def count(self, size: int, fan_out: int = 1) -> int:
+        """How many messages of a size make one measurement: about half a second, at least 8."""
+        wanted = min(60_000, 400 * MIB // max(1, size)) // (2 if fan_out > 1 else 1) / fan_out**0.5
+        return max(8, int(wanted * self.scale))
+
+    def arrived(self, where: str, expected: int, got: int) -> bool:
+        """Note what arrived of what was sent; True when that is all. A round that lost something counts as nothing."""
+        self.delivered += got
+        if got != expected:
+            self.lost += expected - got
+            self.lost_where.append(f"{where}: {expected - got} of {expected}")
+        return got == expected
+
+
+def in_turn(rounds: int, runs: dict[str, Run]) -> dict[str, list[float]]:
+    """Every run once, then every run once more, and so on: what the machine does meanwhile meets all of them."""
+    values: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(rounds):
+        for name, run in runs.items():
+            values[name].append(run())
+    return values
+
+
+Case = Callable[[Stage, Plan], Iterator[Figure]]
+"""One thing that is measured. The first line of its docstring says what."""

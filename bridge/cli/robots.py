@@ -1,0 +1,192 @@
+"""Robots as an operator sees them: who is online, and what each one answers to a call.
+
+The session joins nothing: its calls come from ``operator/0``, who has no presence and no inbox. ``--as`` names
+somebody else, where robots or a router's access rules want to know who it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import msgspec
+from msgspec import Struct
+
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.directory import AgentInfo, Directory
+from macs_zenoh.errors import Unreachable, UsageError
+from macs_zenoh.keyexpr import NAME, PRESENCE, type_name, type_number
+from macs_zenoh.messages import OPERATOR, ROS, Metadata
+from macs_zenoh.named import Named, Names
+from macs_zenoh.routing import call
+from macs_zenoh.wire import Layout
+
+if TYPE_CHECKING:
+    from macs_zenoh.mesh import Mesh
+
+_T = TypeVar("_T")
+
+
+class Caller(NamedTuple):
+    """As whom robots are asked."""
+
+    type: int
+    id: int
+
+    def __str__(self) -> str:
+        return f"{type_name(self.type)}/{self.id}"
+
+
+class Control(Struct, frozen=True):
+    """Who commands a topic."""
+
+    holder: str | None = None
+    seconds_held: float = 0
+    seconds_left: float = 0
+
+
+class DeadMan(Struct, frozen=True):
+    """What happens when commands stop, and how often it has."""
+
+    silence_s: float | None = None
+    commander: str | None = None
+    trips: int = 0
+    last: str = ""
+
+
+class Goal(Struct, frozen=True):
+    """A goal that an action works on, or whose result waits."""
+
+    owner: str
+    finished: bool = False
+
+
+class Node(Struct, frozen=True):
+    """An interface node and what is going on there."""
+
+    role: str
+    name: str
+    type: str
+    registrants: list[str] = []
+    control: Control | None = None
+    deadman: DeadMan | None = None
+    open_calls: int = 0
+    goals: list[Goal] = []
+
+
+class Stop(Struct, frozen=True):
+    """The emergency stop."""
+
+    by: str = ""
+    seconds: float = 0
+    times: int = 0
+
+
+class Status(Struct, frozen=True):
+    """What a robot says of itself (verb ``status``, docs/robot.md)."""
+
+    ros_node: str
+    stopped: bool
+    stop: Stop
+    nodes: list[Node]
+    drops: dict[str, int] = {}
+
+
+class Offers(Struct, frozen=True):
+    """What a robot offers (verb ``offers``): name -> type."""
+
+    subscribers: dict[str, str] = {}
+    publishers: dict[str, str] = {}
+    services: dict[str, str] = {}
+    actions: dict[str, str] = {}
+    qos: dict[str, dict[str, str]] = {}
+
+
+def add_as_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--as",
+        dest="caller",
+        type=caller,
+        default=Caller(OPERATOR, 0),
+        metavar="TYPE/ID",
+        help="ask robots as this agent, as operator/5 or unity/5 (default: operator/0, who is nobody in particular)",
+    )
+
+
+def caller(text: str) -> Caller:
+    """Read ``operator``, ``operator/5``. Raises argparse.ArgumentTypeError."""
+    kind, slash, number = text.partition("/")
+    try:
+        found = Caller(type_number(kind), int(number) if slash else 0)
+    except (UsageError, ValueError):
+        found = Caller(0, -1)
+    if not 0 <= found.id <= 0xFFFF:
+        raise argparse.ArgumentTypeError(f"{text!r} is no agent, as in operator/5")
+    return found
+
+
+class Operator:
+    """Looks at the mesh and calls robots. Made by `operator`."""
+
+    def __init__(self, mesh: Mesh, caller: Caller, timeout_s: float) -> None:
+        self._mesh = mesh
+        self._caller = caller
+        self._timeout_s = timeout_s
+        self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
+
+    async def online(self) -> list[AgentInfo]:
+        """Everybody on the mesh, by type and id; who has an id that another session has as well is listed, too."""
+        directory = Directory()
+        for key in await self._mesh.tokens(PRESENCE.every(), timeout_s=self._timeout_s):
+            directory.token(key, True, 0.0)
+        return directory.claims()
+
+    async def names(self) -> list[Named]:
+        """The names by which some are reached, also those that two have."""
+        names = Names()
+        for key in await self._mesh.tokens(NAME.every(), timeout_s=self._timeout_s):
+            names.token(key, True)
+        return names.claims()
+
+    async def ask(self, robot: int, verb: str, data: bytes = b"", *, timeout_s: float, urgent: bool = False) -> bytes:
+        """What a robot answers. ``urgent``: at the priority of commands.
+
+        Raises Refused with its reason, Unreachable when nobody there serves the verb, CallTimeout.
+        """
+        from macs_zenoh.mesh import Traffic
+
+        key, frame = call((ROS, robot), verb, self._caller, data, Metadata(*self._caller), self._layout)
+        traffic = Traffic.COMMAND if urgent else Traffic.CALL
+        return await self._mesh.query(key, frame, timeout_s=timeout_s, traffic=traffic)
+
+
+@asynccontextmanager
+async def operator(settings: MeshSettings, caller: Caller, *, timeout_s: float) -> AsyncIterator[Operator]:
+    """An operator's session until the end of the block. Raises Unreachable when no router answers in time."""
+    from macs_zenoh.mesh import Mesh
+
+    try:
+        mesh = await asyncio.wait_for(Mesh.open(settings, on_waiting=lambda target: None), timeout_s)
+    except asyncio.TimeoutError:
+        target = ", ".join(settings.routers) or "a router"
+        raise Unreachable(target, f"no Zenoh router answered within {timeout_s:g} s") from None
+    async with mesh:
+        yield Operator(mesh, caller, timeout_s)
+
+
+def read(answer: bytes, kind: type[_T]) -> tuple[dict[str, Any], _T]:
+    """A robot's answer as it is, and as far as it is known here. Raises Unreachable: it makes no sense."""
+    try:
+        document = json.loads(answer)
+        return document, msgspec.convert(document, kind)
+    except (ValueError, RecursionError, msgspec.ValidationError) as error:
+        raise Unreachable("the robot", f"its answer makes no sense: {error}") from error
+
+
+def printable(text: str) -> str:
+    """What another program said, without what moves a terminal's cursor."""
+    return "".join(character if character.isprintable() else "?" for character in text)

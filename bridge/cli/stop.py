@@ -1,0 +1,153 @@
+"""Stop robots: every one that is online, or those named. --release lets them go on.
+
+The emergency stop of a robot is latched: commands and goals are refused until it is released, and what each topic is
+given at a stop is in the robot's settings (docs/robot.md). The call is repeated until the robot says that it holds.
+Robots may allow it only to some (stop_allow, release_allow): name yourself with --as.
+
+Exit code 0 when every robot has confirmed; 1 when one has not, or none is online; 130 after Ctrl-C. A program
+that has to start first, and a network in between, do not replace the button on the robot.
+
+examples:
+  macs stop                                       every robot that is online
+  macs stop 7 8 -e tcp/192.168.1.10:7447          these two, whether they can be seen or not
+  macs stop --group 3 --as operator/5             every robot of group 3
+  macs stop 7 --release
+  macs stop --all --release"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import sys
+from dataclasses import asdict, dataclass
+
+from bridge.cli import options, robots, running
+from bridge.cli.robots import Operator, Status
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.errors import CallTimeout, Refused, Unreachable, UsageError
+from macs_zenoh.messages import ROS
+
+SUMMARY = "stop robots, and release them"
+
+FIRST_S = 0.5
+"""How long the first attempt waits for its answer; each further one waits twice as long."""
+RETRY_S = 0.05
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of it on one robot. ``stopped``: what the robot says, None when it has said nothing."""
+
+    id: int
+    done: bool
+    stopped: bool | None = None
+    by: str = ""
+    problem: str = ""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("robots", nargs="*", type=_robot, metavar="ROBOT", help="id of a robot (default: all)")
+    parser.add_argument("--group", action="append", type=_group, default=[], metavar="G", help="robots of this group")
+    parser.add_argument("--all", action="store_true", help="every robot that is online; --release wants it said")
+    parser.add_argument("--release", action="store_true", help="end the stop")
+    parser.add_argument("--json", action="store_true", help="for programs: a list of {id, done, stopped, by, problem}")
+    parser.add_argument(
+        "--timeout", type=float, default=5.0, metavar="S", help="for a router, then for the robots (default: 5)"
+    )
+    robots.add_as_option(parser)
+    options.add_mesh_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    settings = options.settings(args).mesh
+    named = bool(args.robots or args.group)
+    if named and args.all:
+        raise UsageError("robots and groups, or --all, not both")
+    if args.release and not named and not args.all:
+        raise UsageError("say which robots shall go on, or --all")
+
+    async def work() -> int:
+        try:
+            return await _stop(settings, args)
+        except asyncio.CancelledError:
+            return INTERRUPTED  # whoever waits for this must not take it for a confirmation
+
+    return running.until_stopped(work)
+
+
+async def _stop(settings: MeshSettings, args: argparse.Namespace) -> int:
+    outcomes = []
+    async with robots.operator(settings, args.caller, timeout_s=args.timeout) as operator:
+        ids = await _chosen(operator, args)
+        for coming in asyncio.as_completed([_settle(operator, robot, args) for robot in sorted(ids)]):
+            outcome = await coming
+            outcomes.append(outcome)
+            if not args.json:
+                sys.stdout.write(_line(outcome, release=args.release) + "\n")
+                sys.stdout.flush()
+    if args.json:
+        ordered = sorted(outcomes, key=lambda outcome: outcome.id)
+        sys.stdout.write(json.dumps([asdict(outcome) for outcome in ordered]) + "\n")
+    elif not outcomes:
+        sys.stdout.write("no such robot is online\n")
+    return 0 if outcomes and all(outcome.done for outcome in outcomes) else 1
+
+
+async def _chosen(operator: Operator, args: argparse.Namespace) -> set[int]:
+    """Robots named by id are asked in any case: they may be there although nobody can see them."""
+    if args.robots and not args.group:
+        return set(args.robots)
+    groups = set(args.group)
+    online = [agent for agent in await operator.online() if agent.type == ROS]
+    return {*args.robots, *(agent.id for agent in online if not groups or agent.group in groups)}
+
+
+async def _settle(operator: Operator, robot: int, args: argparse.Namespace) -> Outcome:
+    """Ask one robot until it says that it is as it was told to be."""
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + args.timeout
+    wanted, patience_s, outcome = not args.release, FIRST_S, Outcome(robot, False)
+    while (left_s := deadline - loop.time()) > 0:
+        try:
+            answer = await operator.ask(
+                robot, "stop", b"true" if wanted else b"false", timeout_s=min(patience_s, left_s), urgent=True
+            )
+            _, status = robots.read(answer, Status)
+        except Refused as refusal:
+            return Outcome(robot, False, problem=refusal.reason)
+        except CallTimeout:
+            outcome = Outcome(robot, False, problem=f"no answer within {args.timeout:g} s")
+            patience_s *= 2
+            continue
+        except Unreachable as error:
+            outcome = Outcome(robot, False, problem=error.why)
+        else:
+            if status.stopped is wanted:
+                return Outcome(robot, True, status.stopped, status.stop.by)
+            outcome = Outcome(robot, False, status.stopped, status.stop.by, "it has not done what it was told")
+        await asyncio.sleep(RETRY_S)
+    return outcome
+
+
+def _line(outcome: Outcome, *, release: bool) -> str:
+    what = "released" if release else "stopped"
+    if not outcome.done:
+        return robots.printable(f"robot {outcome.id} is NOT {what}: {outcome.problem}")
+    return robots.printable(f"robot {outcome.id} is {what}" + ("" if release else f", by {outcome.by}"))
+
+
+def _robot(text: str) -> int:
+    return _bounded(text, 0xFFFF)
+
+
+def _group(text: str) -> int:
+    return _bounded(text, 0xFF)
+
+
+def _bounded(text: str, high: int) -> int:
+    number = int(text) if text.isascii() and text.isdigit() else 0
+    if not 1 <= number <= high:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number from 1 to {high}")
+    return number
