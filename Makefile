@@ -1,5 +1,6 @@
 # make run    a headset, a mesh and a robot on this machine, without hardware
 # make test   every test;  make lint   ruff and mypy;  make bench   the speed ratios;  make clean
+# make zenohd the router that the tests of networks and deployments run against, built by cargo (minutes, once)
 #
 # Needs python3 (3.10 or newer) with venv, and network access the first time. Everything goes into .venv.
 # make run ARGS="--port 7100", make test ARGS="tests/unit -k wire", make PYTHON=python3.12 run
@@ -14,9 +15,9 @@ STAMP  := $(VENV)/.installed
 
 # ROS comes from PyPI where it is offered, unless a ROS installation is sourced: that one has the robot's own types.
 ifeq ($(shell uname -sm)$(ROS_DISTRO),Linux x86_64)
-EXTRAS ?= ros,headset,dev
+EXTRAS ?= ros,headset,security,dev
 else
-EXTRAS ?= headset,dev
+EXTRAS ?= headset,security,dev
 endif
 # What a ROS installation needs besides its own path (yaml, numpy) is among the system's packages.
 VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)
@@ -25,7 +26,7 @@ VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)
 INTERFACES := $(if $(findstring ros,$(EXTRAS)),$(VENV)/.interfaces)
 
 .DEFAULT_GOAL := help
-.PHONY: help run install test lint format bench clean
+.PHONY: help run install test lint format bench zenohd clean
 
 help:
 	@sed -n '/^$$/q; s/^# \{0,1\}//p' Makefile
@@ -69,6 +70,17 @@ format: install
 
 bench: install
 	@$(BIN)/python -m benchmarks $(ARGS)
+
+# The version of the wheel in use, so that both ends of a test are the same Zenoh. Cargo puts it into its own bin, where
+# the tests find it; without it they use the router inside the wheel.
+zenohd: install
+	@version=$$($(BIN)/python -c 'from importlib.metadata import version; print(version("eclipse-zenoh"))'); \
+	for zenohd in zenohd "$${CARGO_HOME:-$$HOME/.cargo}/bin/zenohd"; do \
+	  if "$$zenohd" --version 2>/dev/null | grep -F "zenohd v$$version " >/dev/null; then exit 0; fi; done; \
+	if ! command -v cargo >/dev/null; then \
+	  echo "zenohd $$version is not here and there is no cargo to build it (https://rustup.rs); nothing done"; exit 0; fi; \
+	echo "building zenohd $$version with cargo; this takes some minutes, once"; \
+	cargo install zenohd --version "$$version" --locked --debug --quiet
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,161 @@
+"""Make a mesh secure from a plan, and see that it is.
+
+`generate` reads a plan (YAML: who exists, who may command, see, call or message whom) and writes a directory for each
+node: its certificate and key, a router's whole configuration, a client's settings. Run again, it keeps what is good,
+renews certificates with less than a third of their life left, and names what is in the plan no more.
+
+`check` proves by trying, against running routers, that each may do what the plan says and nothing else.
+docs/security.md has the plan's fields and what to do when something is stolen.
+
+examples:
+  macs security generate site.yaml --into pki
+  macs security generate site.yaml --into pki --at /etc/macs       where the files will be on their machines
+  macs security generate site.yaml --into pki --renew robot-7
+  macs security check site.yaml --dir pki
+  macs security check site.yaml --dir pki -e tls/10.0.0.5:7447 --json"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bridge.cli import running
+
+if TYPE_CHECKING:
+    from bridge.security.check import Result
+    from bridge.security.generate import Report
+
+SUMMARY = "certificates and access rules from a plan, and whether they hold"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    verbs = parser.add_subparsers(dest="what", metavar="WHAT", required=True)
+    generate = verbs.add_parser(
+        "generate", help="write certificates, rules and settings", description=_generate.__doc__
+    )
+    generate.add_argument("plan", metavar="PLAN", help="the plan (YAML), as config/security/site.yaml")
+    generate.add_argument("--into", required=True, metavar="DIR", help="directory for everything, with the authority")
+    generate.add_argument(
+        "--at", metavar="PATH", help="where nodes' directories will be on their machines, as /etc/macs"
+    )
+    generate.add_argument(
+        "--renew", metavar="NAME", action="append", default=[], help="make this certificate anew; `all`; repeat"
+    )
+    generate.add_argument("--new-ca", action="store_true", help="a new authority: all certificates so far end")
+    generate.add_argument("--json", action="store_true", help="for programs")
+    check = verbs.add_parser("check", help="try everything on running routers", description=_check.__doc__)
+    check.add_argument("plan", metavar="PLAN", help="the plan (YAML)")
+    check.add_argument("--dir", required=True, metavar="DIR", help="what `generate` wrote")
+    check.add_argument(
+        "-e", "--connect", metavar="ENDPOINT", action="append", help="routers to try; default: those of the plan"
+    )
+    check.add_argument("--json", action="store_true", help="for programs: every attempt, expected and seen")
+    check.add_argument("--all", action="store_true", help="show what is as planned as well")
+    check.add_argument(
+        "--timeout", type=float, default=5.0, metavar="S", help="how long to wait for a router (default: 5)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    return _generate(args) if args.what == "generate" else _check(args)
+
+
+def _generate(args: argparse.Namespace) -> int:
+    """Write what follows from a plan. Exit code 2: the plan or the directory cannot be used."""
+    import datetime as dt
+
+    from bridge.security import plan
+    from bridge.security.generate import generate
+
+    report = generate(
+        plan.load(args.plan),
+        Path(args.into),
+        dt.datetime.now(dt.timezone.utc),
+        at=args.at,
+        renew=args.renew,
+        new_authority=args.new_ca,
+    )
+    sys.stdout.write((_as_json(report) if args.json else _as_text(report)) + "\n")
+    return 0
+
+
+def _as_text(report: Report) -> str:
+    made = [one for one in report.issued if one.why]
+    kept = len(report.issued) - len(made)
+    first = min(one.until for one in report.issued)
+    lines = []
+    if report.authority.why:
+        lines.append(f"authority: {report.authority.why}, until {report.authority.until:%Y-%m-%d}")
+    lines += [f"{one.name}: certificate made, {one.why}, until {one.until:%Y-%m-%d}" for one in made]
+    for name, until in report.left_over:
+        lines.append(
+            f"{name}: not in the plan any more. Its certificate lasts until {until:%Y-%m-%d} and is good for nothing"
+            " as soon as the routers run with these files"
+        )
+    if report.routers_changed:
+        lines.append(f"start again: {', '.join(report.routers_changed)}")
+    lines.append(
+        f"{report.into}: {len(made)} certificates made, {kept} kept, {len(report.written)} files written;"
+        f" the first certificate ends on {first:%Y-%m-%d}"
+    )
+    return "\n".join(lines)
+
+
+def _as_json(report: Report) -> str:
+    return json.dumps(
+        {
+            "into": str(report.into),
+            "authority": {"made": report.authority.why, "until": report.authority.until.isoformat()},
+            "certificates": [
+                {"name": one.name, "made": one.why, "until": one.until.isoformat()} for one in report.issued
+            ],
+            "written": [str(path) for path in report.written],
+            "restart": report.routers_changed,
+            "left_over": [{"name": name, "until": until.isoformat()} for name, until in report.left_over],
+        }
+    )
+
+
+def _check(args: argparse.Namespace) -> int:
+    """Try what each node may and may not, with its own certificate, on routers that run.
+
+    Exit code 0: everything is as planned; 1: something is not, or a router does not answer; 2: the plan or the
+    directory cannot be used.
+    """
+    from bridge.security import plan
+    from bridge.security.check import check
+
+    read = plan.load(args.plan)
+    if not args.verbose:
+        logging.getLogger("macs.mesh").setLevel(logging.WARNING)  # of each of many sessions
+
+    def progress(done: int, of: int) -> None:
+        if sys.stderr.isatty():
+            sys.stderr.write(f"\r{done} of {of} attempts\033[K" + ("\n" if done == of else ""))
+            sys.stderr.flush()
+
+    async def work() -> int:
+        results = await check(read, Path(args.dir), args.connect, timeout_s=args.timeout, progress=progress)
+        wrong = [result for result in results if not result.as_planned]
+        if args.json:
+            sys.stdout.write(json.dumps([result.as_dict() for result in results]) + "\n")
+        else:
+            for result in results if args.all else wrong:
+                sys.stdout.write(_line(result) + "\n")
+            sys.stdout.write(f"{len(results)} attempts, {len(results) - len(wrong)} as planned, {len(wrong)} not\n")
+        return 1 if wrong or not results else 0
+
+    return running.until_stopped(work)
+
+
+def _line(result: Result) -> str:
+    verdict = "ok   " if result.as_planned else "WRONG"
+    expected = "permitted" if result.permitted else "forbidden"
+    seen = "permitted" if result.seen else "forbidden"
+    return f"{verdict} {result.router}: {result.what}: {expected}, {seen} seen" + (
+        f" ({result.key})" if result.key else ""
+    )

@@ -1,0 +1,464 @@
+"""What each node of a plan may put, declare, ask and answer: the rules of a router's access control. Pure.
+
+Zenoh allows a message when its key is included in the key expression of a rule, for each session that it passes:
+``ingress`` on its way into the router, ``egress`` on its way out. So each node gets
+
+* what it may say, and as whom: the source is the end of each key, and only its own is allowed. That is decided where
+  the message enters the mesh;
+* what it may hear: its own inbox, group, streams, calls. For what goes to several (groups, everybody) the senders are
+  listed, so that a message reaches only those of the receivers that its sender may reach;
+* whom it may see: the presence of those with whom it has to do.
+
+Every key is made by `macs_zenoh.keyexpr`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+from bridge.security.plan import Client, Gateway, Operator, Plan, Robot, Router, kind_of
+from macs_zenoh.keyexpr import (
+    BLOCK_SIZE,
+    BROADCAST,
+    CALL,
+    GROUP,
+    KEYS,
+    LAST,
+    LEASE,
+    NAME,
+    NAMED,
+    NAMED_ALL,
+    PING,
+    PRESENCE,
+    STREAM,
+    UNICAST,
+    WANTED,
+    FieldValue,
+    Key,
+    block_of,
+)
+from macs_zenoh.messages import OPERATOR, ROS, UNITY
+
+TYPES = {"robots": ROS, "gateways": UNITY, "operators": OPERATOR}
+
+INGRESS, EGRESS = "ingress", "egress"
+
+MESSAGES = (
+    "put",
+    "delete",
+    "declare_subscriber",
+    "query",
+    "declare_queryable",
+    "reply",
+    "liveliness_token",
+    "declare_liveliness_subscriber",
+    "liveliness_query",
+)
+"""All that Zenoh's access control knows."""
+
+ADMIN = ("@/*/router", "@/*/router/**")
+"""The admin space of routers, read only: versions, sessions, links."""
+
+NOBODY = 254
+"""The agent type as which `macs doctor` tries, with an operator's certificate, whether tokens are seen."""
+
+RECOVERY = "@adv/**"
+"""Behind a key: what the source of reliable messages and their receivers say about messages that were lost."""
+
+Fields = dict[str, FieldValue]
+
+
+class Rule(NamedTuple):
+    """One rule for one node."""
+
+    what: str
+    """For people: ``robot-7 speaks``."""
+    messages: tuple[str, ...]
+    flows: tuple[str, ...]
+    keys: tuple[str, ...]
+
+
+def rules(plan: Plan, client: Client) -> list[Rule]:
+    """Everything that a client may."""
+    said = _Said(plan, client)
+    heard = _Heard(plan, client)
+    seen = list(_tokens_seen(plan, client))
+    found = [
+        Rule("is present", ("liveliness_token",), (INGRESS,), _keys(_own_tokens(plan, client))),
+        Rule("speaks", ("put",), (INGRESS,), _keys(said.puts())),
+        Rule("asks", ("query",), (INGRESS,), _keys([*said.queries(), *heard.recoveries_asked()])),
+        Rule("learns who listens to it", ("declare_subscriber",), (EGRESS,), _keys(said.listeners())),
+        Rule(
+            "learns who answers it", ("declare_queryable",), (EGRESS,), _keys([*said.answerers(), *heard.recovered()])
+        ),
+        Rule("is answered", ("reply",), (EGRESS,), _keys([*said.replies(), *heard.recovered()])),
+        Rule("subscribes", ("declare_subscriber",), (INGRESS,), _keys(heard.subscriptions())),
+        Rule("hears", ("put",), (EGRESS,), _keys(heard.puts())),
+        Rule("answers", ("declare_queryable", "reply"), (INGRESS,), _keys([*heard.queryables(), *said.kept()])),
+        Rule("is asked", ("query",), (EGRESS,), _keys([*heard.queryables(), *said.kept_asked()])),
+        Rule(
+            "watches presence",
+            ("declare_liveliness_subscriber", "liveliness_query"),
+            (INGRESS,),
+            _keys(_watched(client)),
+        ),
+        Rule("sees who is there", ("liveliness_token",), (EGRESS,), _keys(seen)),
+    ]
+    return [_in(plan.namespace, rule) for rule in found if rule.keys]
+
+
+def link_rules(plan: Plan) -> list[Rule]:
+    """Everything that one router may send another: what is forbidden to a client is stopped at the client's router."""
+    roots = dict.fromkeys(key.template.partition("/")[0] + "/**" for key in KEYS.values())
+    keys = _keys([*_with_recovery(roots), *ADMIN])
+    return [_in(plan.namespace, Rule("carries everything", MESSAGES, (INGRESS, EGRESS), keys))]
+
+
+def linked(plan: Plan, router: Router) -> list[Router]:
+    """The routers that this one has a link with, whoever dials."""
+    return [
+        other
+        for other in plan.routers
+        if other is not router and (other.name in router.links or router.name in other.links)
+    ]
+
+
+# -- who is who in keys ------------------------------------------------------------------------------------------
+
+
+def headset_ids(gateway: Gateway) -> list[int]:
+    """The ids that a gateway with blocks may give out."""
+    return [i for block in gateway.blocks for i in range(max(1, block * BLOCK_SIZE), (block + 1) * BLOCK_SIZE)]
+
+
+def agents(client: Client) -> list[Fields]:
+    """Whom a client speaks for, as fields of `PRESENCE`; without an id: every agent of the type."""
+    if isinstance(client, Robot):
+        return [{"type": ROS, "id": client.id}]
+    if isinstance(client, Operator):
+        return [{"type": OPERATOR, "id": client.id or 0}]
+    return [{"type": UNITY, "id": number} for number in headset_ids(client)] or [{"type": UNITY}]
+
+
+def senders(client: Client) -> list[Fields]:
+    """The same as the end of a key."""
+    return [{f"from_{name}": value for name, value in agent.items()} for agent in agents(client)]
+
+
+def inboxes(client: Client) -> list[Fields]:
+    """The same as fields of `UNICAST`: a block instead of all its ids. Nobody can write to an operator without id."""
+    if isinstance(client, Operator) and client.id is None:
+        return []
+    if isinstance(client, Gateway):
+        return [{"type": UNITY, "block": block} for block in client.blocks] or [{"type": UNITY}]
+    return [{**agent, "block": block_of(int(agent["id"]))} for agent in agents(client)]
+
+
+# -- who may what ------------------------------------------------------------------------------------------------
+
+
+def reaches(plan: Plan, sender: Client, receiver: Client) -> bool:
+    """Whether one may send to the other by id, by group and with everybody.
+
+    To a robot that is commanding it. Others also hear those whom they may command, see or call, since these answer.
+    """
+    if not inboxes(receiver):
+        return False
+    if plan.may(sender, "command", receiver) or isinstance(receiver, Robot):
+        return plan.may(sender, "command", receiver)
+    return plan.may(sender, "message", receiver) or any(
+        plan.may(receiver, right, sender) for right in ("command", "see", "call")
+    )
+
+
+def converse(plan: Plan, one: Client, other: Client) -> bool:
+    """Whether one of two named robots may send to the other by name, so that both need to know of each other."""
+    return plan.may(one, "message", other) or plan.may(other, "message", one)
+
+
+def called(client: Client) -> str | None:
+    """A client's name in collective awareness."""
+    return client.called if isinstance(client, Robot) else None
+
+
+def _names(plan: Plan, client: Client, holds: Callable[[Client, Client], bool]) -> list[str]:
+    """The names of the named robots for which something holds with a named client; none for one without a name."""
+    others = [robot for robot in plan.robots if robot is not client and called(client) is not None]
+    return [robot.called for robot in others if robot.called is not None and holds(client, robot)]
+
+
+def _by_kind(plan: Plan, client: Client, holds: Callable[[Client], bool]) -> Iterator[tuple[str, list[Client], bool]]:
+    """The others for whom something holds, by kind, with whether they are all of that kind."""
+    lists: dict[str, Sequence[Client]] = {
+        "robots": plan.robots,
+        "gateways": plan.gateways,
+        "operators": plan.operators,
+    }
+    for kind, everyone in lists.items():
+        others = [other for other in everyone if other is not client]
+        chosen = [other for other in others if holds(other)]
+        if chosen:
+            yield kind, chosen, len(chosen) == len(others)
+
+
+def _collapsed(
+    plan: Plan, client: Client, holds: Callable[[Client], bool], fields: Callable[[Client], list[Fields]]
+) -> list[Fields]:
+    """Fields for the others for whom something holds: only the type where it holds for all of a kind."""
+    found: list[Fields] = []
+    for kind, chosen, complete in _by_kind(plan, client, holds):
+        each = [fields_of_one for other in chosen for fields_of_one in fields(other)]
+        if each and complete:
+            each = [{"from_type" if fields is senders else "type": TYPES[kind]}]
+        found += each
+    return found
+
+
+# -- saying ------------------------------------------------------------------------------------------------------
+
+
+class _Said:
+    """What a client may say, and what it must know to say it: a publisher here is quiet until it knows who listens."""
+
+    def __init__(self, plan: Plan, client: Client) -> None:
+        self._plan = plan
+        self._client = client
+        self._as = senders(client)
+        self._name = called(client)
+        reached = _collapsed(plan, client, lambda other: reaches(plan, client, other), inboxes)
+        self._inboxes = [*([] if {"type": TYPES[kind_of(client)]} in reached else inboxes(client)), *reached]
+        self._groups = list(self._group_targets())
+        self._broadcasts = bool(reached) or isinstance(client, Gateway)
+        self._friends = _names(plan, client, lambda me, robot: plan.may(me, "message", robot))
+
+    def _group_targets(self) -> Iterator[Fields]:
+        plan, client = self._plan, self._client
+        for kind, chosen, complete in _by_kind(plan, client, lambda other: reaches(plan, client, other)):
+            if kind == "gateways":
+                yield {"type": UNITY}  # headsets choose their groups themselves
+            elif kind == "robots" and complete:
+                yield {"type": ROS}
+            elif kind == "robots":
+                for group in sorted({robot.group for robot in chosen if isinstance(robot, Robot) and robot.group}):
+                    yield {"type": ROS, "group": group}
+        if isinstance(client, Gateway):
+            yield {"type": UNITY}
+
+    def puts(self) -> Iterator[str]:
+        for sender in self._as:
+            yield from _every(UNICAST, self._inboxes, sender)
+            yield from _every(GROUP, self._groups, sender)
+            if self._broadcasts:
+                yield BROADCAST.every(**sender)
+        if isinstance(self._client, Operator):
+            yield PING.every()
+        if self._name is not None:
+            yield from (NAMED.every(name=name, from_name=self._name) for name in self._friends)
+        yield from self.kept()
+
+    def queries(self) -> Iterator[str]:
+        for sender in self._as:
+            yield from _every(CALL, self._callees(), sender)
+        if self._name is not None:
+            for name in self._friends:
+                yield NAMED.every(name=name, from_name=self._name)
+                yield LAST.every(name=name, from_name=self._name)
+        if isinstance(self._client, Operator):
+            yield PING.every()
+            yield from ADMIN
+
+    def _callees(self) -> list[Fields]:
+        plan, client = self._plan, self._client
+        by_verbs: dict[tuple[str, ...] | None, list[Client]] = {}
+        others: list[Client] = [*plan.robots, *plan.operators]
+        for other in others:
+            verbs = plan.verbs(client, other)
+            if other is not client and verbs != []:
+                by_verbs.setdefault(tuple(verbs) if verbs is not None else None, []).append(other)
+        found: list[Fields] = []
+        for some, chosen in by_verbs.items():
+            callees = _collapsed(plan, client, chosen.__contains__, agents)
+            found += [{**callee, "verb": verb} for callee in callees for verb in some] if some else callees
+        return found
+
+    def listeners(self) -> Iterator[str]:
+        """Keys of the subscriptions of those to whom it may send, as wide as these may declare them."""
+        yield from _every(UNICAST, self._inboxes)
+        yield from _every(GROUP, self._groups)
+        if self._broadcasts:
+            yield BROADCAST.every()
+        if isinstance(self._client, Operator):
+            yield PING.every()
+        yield from (NAMED.every(name=name) for name in self._friends)
+        yield from self._kept(by=None)
+
+    def kept(self) -> Iterator[str]:
+        """What it sends to all who want it, and may keep for those that missed some of it."""
+        return self._kept(by=self._name)
+
+    def kept_asked(self) -> Iterator[str]:
+        """Keys of questions for what was missed: who missed it asks everybody who sends such messages."""
+        return (key for key in self._kept(by=None) if key.endswith(RECOVERY))
+
+    def _kept(self, by: str | None) -> Iterator[str]:
+        if isinstance(self._client, Robot):
+            yield from _with_recovery([STREAM.every(type=ROS, id=self._client.id)])
+        if self._friends:
+            yield from _with_recovery([NAMED_ALL.every(from_name=by) if by is not None else NAMED_ALL.every()])
+
+    def answerers(self) -> Iterator[str]:
+        yield from _every(CALL, self._callees())
+        for name in self._friends:
+            yield NAMED.every(name=name)
+            yield LAST.every(name=name)
+        if isinstance(self._client, Operator):
+            yield PING.every()
+
+    def replies(self) -> Iterator[str]:
+        """Answers go to who asked, and to nobody else, so the type of the asking agent is enough."""
+        if self._callees():
+            yield CALL.every(from_type=self._as[0]["from_type"])
+        if self._name is not None and self._friends:
+            yield NAMED.every(from_name=self._name)
+            yield LAST.every(from_name=self._name)
+        if isinstance(self._client, Operator):
+            yield PING.every()
+            yield from ADMIN
+
+
+# -- hearing -----------------------------------------------------------------------------------------------------
+
+
+class _Heard:
+    """What a client may hear, and what it declares for it."""
+
+    def __init__(self, plan: Plan, client: Client) -> None:
+        self._plan = plan
+        self._client = client
+        self._name = called(client)
+        self._senders = _collapsed(plan, client, lambda other: reaches(plan, other, client), senders)
+        self._streams = _collapsed(
+            plan, client, lambda other: isinstance(other, Robot) and plan.may(client, "see", other), agents
+        )
+        self._group: Fields | None = None
+        if isinstance(client, Robot):
+            self._group = {"group": client.group, "type": ROS} if client.group else None
+        elif isinstance(client, Gateway):
+            self._group = {"type": UNITY}
+        self._friends = _names(plan, client, lambda me, robot: plan.may(robot, "message", me))
+
+    def subscriptions(self) -> Iterator[str]:
+        yield from _every(UNICAST, inboxes(self._client))
+        if self._group is not None:
+            yield GROUP.every(**self._group)
+        yield BROADCAST.every()  # what agents subscribe to; of what goes there, they get what is allowed below
+        yield from _with_recovery(_every(STREAM, self._streams))
+        if isinstance(self._client, Operator):
+            yield PING.every()
+        if self._name is not None:
+            yield NAMED.every(name=self._name)
+            yield from _with_recovery([NAMED_ALL.every()])
+
+    def puts(self) -> Iterator[str]:
+        yield from _every(UNICAST, inboxes(self._client))
+        for sender in self._senders:
+            if self._group is not None:
+                yield GROUP.every(**self._group, **sender)
+            yield BROADCAST.every(**sender)
+        if isinstance(self._client, Gateway):  # headsets behind another worker of this gateway
+            for sender in senders(self._client):
+                yield GROUP.every(type=UNITY, **sender)
+                yield BROADCAST.every(**sender)
+        if isinstance(self._client, Operator):
+            yield PING.every()
+        if self._name is not None:
+            yield NAMED.every(name=self._name)
+        yield from self.recovered()
+
+    def recovered(self) -> Iterator[str]:
+        """What it hears and, where the source keeps it, may ask for again."""
+        yield from _with_recovery(_every(STREAM, self._streams))
+        yield from _with_recovery(NAMED_ALL.every(from_name=name) for name in self._friends)
+
+    def recoveries_asked(self) -> Iterator[str]:
+        """Keys of its questions for what it missed."""
+        found = [*_every(STREAM, self._streams), *([NAMED_ALL.every()] if self._friends else [])]
+        return (key for key in _with_recovery(found) if key.endswith(RECOVERY))
+
+    def queryables(self) -> Iterator[str]:
+        if not isinstance(self._client, Gateway):
+            yield from _every(CALL, agents(self._client))
+        if self._name is not None:
+            yield NAMED.every(name=self._name)
+            yield LAST.every(name=self._name)
+        yield PING.every()
+
+
+# -- presence ----------------------------------------------------------------------------------------------------
+
+
+def _own_tokens(plan: Plan, client: Client) -> Iterator[str]:
+    for agent in agents(client):
+        yield PRESENCE.every(**agent, **({"group": client.group} if isinstance(client, Robot) else {}))
+    if isinstance(client, Operator):
+        yield PRESENCE.every(type=NOBODY)
+    if isinstance(client, Gateway):
+        yield from (LEASE.every(block=block) for block in client.blocks)
+        if not client.blocks:
+            yield LEASE.every()
+    if isinstance(client, Robot) and client.called is not None:
+        yield NAME.every(name=client.called, type=ROS, id=client.id)
+        yield WANTED.every(name=client.called)
+
+
+def _watched(client: Client) -> Iterator[str]:
+    """What a client's programs watch; of that it sees what `_tokens_seen` says."""
+    yield PRESENCE.every()
+    if not isinstance(client, Robot):
+        yield LEASE.every()
+    if isinstance(client, Operator) or called(client) is not None:
+        yield NAME.every()
+        yield WANTED.every()
+
+
+def _tokens_seen(plan: Plan, client: Client) -> Iterator[str]:
+    if isinstance(client, Operator):
+        yield from (key.every() for key in (PRESENCE, LEASE, NAME, WANTED))
+        return
+    yield from _every(PRESENCE, agents(client))
+    yield from _every(PRESENCE, _collapsed(plan, client, lambda other: plan.related(client, other), agents))
+    if isinstance(client, Gateway):
+        yield LEASE.every()
+    if (name := called(client)) is not None:
+        for one in [name, *_names(plan, client, lambda me, robot: converse(plan, me, robot))]:
+            yield NAME.every(name=one)
+            yield WANTED.every(name=one)
+
+
+# -- keys --------------------------------------------------------------------------------------------------------
+
+
+def _every(key: Key, targets: Iterable[Fields], sender: Fields | None = None) -> Iterator[str]:
+    return (key.every(**target, **(sender or {})) for target in targets)
+
+
+def _with_recovery(keys: Iterable[str]) -> Iterator[str]:
+    for key in keys:
+        yield key
+        yield f"{key}/{RECOVERY}"
+
+
+def _keys(keys: Iterable[str]) -> tuple[str, ...]:
+    """The keys, each once, without those that another one covers."""
+    once = dict.fromkeys(keys)
+    trees = {key.removesuffix("**") for key in once if key.endswith("/**")}
+    covered = {key for key in once for tree in trees if key.startswith(tree) and key != f"{tree}**" and "@" not in key}
+    return tuple(key for key in once if key not in covered)
+
+
+def _in(namespace: str | None, rule: Rule) -> Rule:
+    """A rule as the router sees its keys: the namespace is before each. Not before those of the routers themselves."""
+    if namespace is None:
+        return rule
+    return rule._replace(keys=tuple(key if key.startswith("@") else f"{namespace}/{key}" for key in rule.keys))

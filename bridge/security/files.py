@@ -1,0 +1,363 @@
+"""The files of a plan's nodes: a router's configuration (JSON5) and a client's settings (TOML). Pure."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgspec
+
+from bridge.security import access
+from bridge.security.access import Rule
+from bridge.security.plan import Client, Gateway, Plan, Robot, Router
+from macs_zenoh.config import MeshSettings, TrafficRule, changed
+
+WIDTH = 119
+
+WHY = {
+    "mode": "a router: gateways, robots and operators are its clients",
+    "listen/endpoints": "TLS only",
+    "connect/endpoints": "routers that this one dials",
+    "connect/timeout_ms": "go on trying as long as it takes",
+    "connect/exit_on_failure": "a router whose neighbour is away still serves its own side",
+    "connect/retry": "soon (Zenoh: 1 s to 4 s), but not at once: a link that is back within 0.1 s may stay dead",
+    "scouting/multicast/enabled": "a mesh is what its endpoints say",
+    "scouting/delay": "nothing to wait for without scouting",
+    "transport/unicast/open_timeout": "ms until the next attempt, where a host does not even refuse (Zenoh: 10 s)",
+    "transport/shared_memory/enabled": "implicit shared memory bypasses limits and can drop silently",
+    "transport/link/tx/lease": "a host that stops has left after so many ms (Zenoh: 10 s)",
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": (
+        "µs that stream data waits for room (Zenoh: 1 ms)"
+    ),
+    "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": (
+        "the same for the fragments of a big message: without it they vanish"
+    ),
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": (
+        "µs until a link that takes nothing is closed, so that it does not hold up the others (Zenoh: 5 s)"
+    ),
+    "transport/link/tx/queue/size": "batches of 64 KiB per priority and link (Zenoh: 2; above 16 it panics)",
+    "transport/link/protocols": "nothing that is not encrypted",
+    "transport/link/tls/root_ca_certificate": "who signs the certificates of this mesh, and no other",
+    "transport/link/tls/enable_mtls": "who dials shows a certificate as well",
+    "transport/link/tls/verify_name_on_connect": "a router must be who it was dialled as",
+    "transport/link/tls/close_link_on_expiration": "an expired certificate ends the link, not only the next one",
+    "adminspace": "`macs doctor` reads versions and links there; who may is below",
+    "metadata": "this router's name, for the doctor",
+}
+"""Why a value is what it is, by its path in Zenoh's configuration."""
+
+
+def certificate_paths(directory: str) -> dict[str, str]:
+    """Where Zenoh finds a node's certificate, by Zenoh's path: for dialling and, in a router, for listening."""
+    return {
+        "root_ca_certificate": f"{directory}/ca.pem",
+        "connect_private_key": f"{directory}/key.pem",
+        "connect_certificate": f"{directory}/cert.pem",
+    }
+
+
+def client_overrides(directory: str) -> list[str]:
+    """TLS of who dials, as `MeshSettings.overrides`."""
+    tls: dict[str, str | bool] = {
+        **certificate_paths(directory),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+    return [f"transport/link/tls/{name}:{json.dumps(value)}" for name, value in tls.items()]
+
+
+# -- a router ----------------------------------------------------------------------------------------------------
+
+
+def router_json5(plan: Plan, router: Router, directory: str) -> str:
+    """The whole configuration of a router, for ``zenohd -c`` and ``macs router -c``.
+
+    ``directory`` is where its certificate will be on its machine.
+    """
+    others = {other.name: other for other in plan.routers}
+    mesh = changed(
+        plan.mesh,
+        mode="router",
+        listen=router.listen,
+        connect=[endpoint for name in router.links for endpoint in others[name].dialled],
+    )
+    tree: dict[str, Any] = {}
+    for path, json5, _ in mesh.zenoh():
+        _put(tree, path, json.loads(json5))
+    tls: dict[str, str | bool] = {
+        **certificate_paths(directory),
+        "listen_private_key": f"{directory}/key.pem",
+        "listen_certificate": f"{directory}/cert.pem",
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+    for name, value in tls.items():
+        _put(tree, f"transport/link/tls/{name}", value)
+    protocols = sorted(
+        {endpoint.partition("/")[0] for one in plan.routers for endpoint in (*one.listen, *one.dialled)}
+    )
+    _put(tree, "transport/link/protocols", protocols)
+    tree["adminspace"] = {"enabled": True, "permissions": {"read": True, "write": False}}
+    tree["metadata"] = {"name": router.name}
+    body = [*_members(tree, "", 1), "", *_access(plan, router), *_traffic(plan)]
+    return "\n".join(
+        [
+            f"// Router {router.name}, made by `macs security generate` from a plan. Change the plan, not this file.",
+            f"//   zenohd -c router.json5   or   macs router -c router.json5; its certificate is in {directory}",
+            "{",
+            *body,
+            "}",
+            "",
+        ]
+    )
+
+
+def _put(tree: dict[str, Any], path: str, value: object) -> None:
+    *parents, last = path.split("/")
+    for parent in parents:
+        tree = tree.setdefault(parent, {})
+    tree[last] = value
+
+
+def _members(tree: dict[str, Any], path: str, depth: int) -> Iterator[str]:
+    """The members of an object, one line each, with a comment where there is a reason to give."""
+    indent = "  " * depth
+    for name, value in tree.items():
+        here = f"{path}/{name}" if path else name
+        if here in WHY:
+            yield f"{indent}// {WHY[here]}"
+        if isinstance(value, dict) and any(
+            isinstance(each, dict) or f"{here}/{k}" in WHY for k, each in value.items()
+        ):
+            yield f"{indent}{name}: {{"
+            yield from _members(value, here, depth + 1)
+            yield f"{indent}}},"
+        else:
+            yield f"{indent}{name}: {_inline(value)},"
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{name}: {_inline(each)}" for name, each in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_inline, value)) + "]"
+    return json.dumps(value)
+
+
+# -- access control ----------------------------------------------------------------------------------------------
+
+
+def _access(plan: Plan, router: Router) -> Iterator[str]:
+    by_node = [(client.name, access.rules(plan, client)) for client in plan.clients]
+    by_node += [(other.name, access.link_rules(plan)) for other in access.linked(plan, router)]
+    yield "  // Who may what. A certificate's common name says who somebody is; what no rule allows is dropped."
+    yield "  // `ingress` is on the way into this router, `egress` on the way out of it."
+    yield "  access_control: {"
+    yield "    enabled: true,"
+    yield '    default_permission: "deny",'
+    yield "    rules: ["
+    for name, rules in by_node:
+        yield f"      // {_summary(plan, name)}"
+        for rule in rules:
+            yield from _rule(name, rule)
+    yield "    ],"
+    yield "    subjects: ["
+    yield from (f"      {{ id: {json.dumps(name)}, cert_common_names: [{json.dumps(name)}] }}," for name, _ in by_node)
+    yield "    ],"
+    yield "    policies: ["
+    for name, rules in by_node:
+        yield "      {"
+        yield f"        subjects: [{json.dumps(name)}],"
+        yield from _listed("rules", [json.dumps(_id(name, rule)) for rule in rules], 8)
+        yield "      },"
+    yield "    ],"
+    yield "  },"
+
+
+def _id(name: str, rule: Rule) -> str:
+    return f"{name} {rule.what}"
+
+
+def _rule(name: str, rule: Rule) -> Iterator[str]:
+    yield "      {"
+    yield f"        id: {json.dumps(_id(name, rule))},"
+    yield '        permission: "allow",'
+    yield from _listed("messages", [json.dumps(message) for message in rule.messages], 8)
+    yield f"        flows: {json.dumps(rule.flows)},"
+    yield from _listed("key_exprs", [json.dumps(key) for key in rule.keys], 8)
+    yield "      },"
+
+
+def _summary(plan: Plan, name: str) -> str:
+    node = plan.node(name)
+    if isinstance(node, Router):
+        return f"{name}: a router, which has held its own clients to these rules"
+    if isinstance(node, Robot):
+        group = f", group {node.group}" if node.group else ""
+        return f"{name}: robot {node.id}{group}" + (f", called {node.called}" if node.called is not None else "")
+    if isinstance(node, Gateway):
+        of = f"block {', '.join(map(str, node.blocks))}" if node.blocks else "any block"
+        return f"{name}: a gateway, which speaks for the headsets of {of}"
+    return f"{name}: an operator, operator/{node.id or 0}"
+
+
+def _listed(name: str, words: Sequence[str], indent: int, end: str = ",") -> Iterator[str]:
+    """``name: ["as", "many", "on", "a", "line", "as", "fit"],``"""
+    spaces = " " * indent
+    line = f"{spaces}{name}: [{', '.join(words)}]{end}"
+    if len(line) <= WIDTH:
+        yield line
+        return
+    yield f"{spaces}{name}: ["
+    line = f"{spaces}  "
+    for word in words:
+        if len(line) + len(word) + 1 > WIDTH:
+            yield line.rstrip()
+            line = f"{spaces}  "
+        line += f"{word}, "
+    yield line.rstrip()
+    yield f"{spaces}]{end}"
+
+
+# -- traffic -----------------------------------------------------------------------------------------------------
+
+
+GUARD = 2.0
+"""A router lets so many times a rule's rate pass: what the rule says is done where messages enter the mesh, and a
+message that was a little late there must not be lost here."""
+
+
+def _traffic(plan: Plan) -> Iterator[str]:
+    """The plan's traffic rules as Zenoh has them, against programs that do not keep them."""
+    if not plan.traffic:
+        return
+    yield ""
+    yield "  // Traffic rules of the plan. Programs apply them where messages enter the mesh; the router stops what"
+    yield "  // comes from a program that does not."
+    yield from _downsampling(plan)
+    yield from _low_pass(plan)
+    yield from _priorities(plan)
+
+
+def _downsampling(plan: Plan) -> Iterator[str]:
+    rates: dict[str, float] = {}
+    for rule in plan.traffic:
+        if rule.max_hz is None:
+            continue
+        keys = [] if rule.reliable is not None else _exact(plan, rule)
+        if not keys:
+            yield f"  // max_hz of {rule.match} is left to the programs: Zenoh counts all keys of a rule as one"
+        for key in keys:
+            rates.setdefault(key, rule.max_hz)
+    if rates:
+        yield f"  // {GUARD:g} times max_hz: what was a little late at its source is not lost here"
+        yield '  downsampling: [{ id: "max_hz", messages: ["put"], flows: ["ingress"], rules: ['
+        for key, rate in rates.items():
+            yield f"    {{ key_expr: {json.dumps(_inside(plan, key))}, freq: {GUARD * rate:g} }},"
+        yield "  ] }],"
+
+
+def _exact(plan: Plan, rule: TrafficRule) -> list[str]:
+    """The keys of a rule, where they are those of one topic: of one robot, or of each of the plan's."""
+    if "*" not in rule.match:
+        return [rule.match]
+    begin, any_robot, topic = rule.match.partition("/ros/*/")
+    if not any_robot or "*" in begin + topic:
+        return []
+    return [f"{begin}/ros/{robot.id}/{topic}" for robot in plan.robots]
+
+
+def _low_pass(plan: Plan) -> Iterator[str]:
+    largest = 0
+    entries = []
+    for number, rule in enumerate(plan.traffic):
+        if rule.max_bytes is not None:
+            # of several rules that fit, Zenoh takes the smallest limit and programs the first: so none is smaller
+            largest = max(largest, rule.max_bytes)
+            keys = json.dumps([_inside(plan, rule.match)])
+            entries.append(
+                f'    {{ id: "max_bytes {number}", messages: ["put", "query"], flows: ["ingress"], key_exprs: {keys},'
+                f" size_limit: {largest} }},"
+            )
+    if entries:
+        yield "  low_pass_filter: ["
+        yield from entries
+        yield "  ],"
+
+
+def _priorities(plan: Plan) -> Iterator[str]:
+    entries = [
+        f'    {{ id: "priority {number}", messages: ["put", "query"], flows: ["ingress"],'
+        f" key_exprs: {json.dumps([_inside(plan, rule.match)])},"
+        f" overwrite: {{ priority: {json.dumps(rule.priority)} }} }},"
+        for number, rule in enumerate(plan.traffic)
+        if rule.priority is not None
+    ]
+    if entries:
+        yield "  // the last one that fits wins here, the first one in the plan"
+        yield "  qos: { network: ["
+        yield from reversed(entries)
+        yield "  ] },"
+
+
+def _inside(plan: Plan, key: str) -> str:
+    return f"{plan.namespace}/{key}" if plan.namespace is not None else key
+
+
+# -- a client ----------------------------------------------------------------------------------------------------
+
+
+def settings_toml(plan: Plan, client: Client, directory: str) -> str:
+    """The settings of a client's programs. ``directory`` is where its certificate will be on its machine."""
+    lines = [
+        f"# Settings of {client.name}, made by `macs security generate` from a plan. Change the plan, not this file.",
+        f"#   {_command(client, directory)}",
+        "",
+        "[mesh]",
+        f"connect = {json.dumps(plan.endpoints(client))}",
+        *([f"namespace = {json.dumps(plan.namespace)}"] if plan.namespace is not None else []),
+        *_links(plan.mesh),
+        "# Who this is: the certificate. Whom it trusts: routers with a certificate of the same authority.",
+        "overrides = [",
+        *(f"  {_toml(override)}," for override in client_overrides(directory)),
+        "]",
+    ]
+    lines += _sections(client)
+    for rule in plan.traffic:
+        lines += ["", "[[traffic]]"]
+        given = msgspec.structs.asdict(rule)
+        lines += [f"{name} = {json.dumps(value)}" for name, value in given.items() if value is not None]
+    return "\n".join([*lines, ""])
+
+
+def _links(mesh: MeshSettings) -> Iterator[str]:
+    """What leaves the defaults on every link."""
+    for name, default in msgspec.structs.asdict(MeshSettings()).items():
+        value = getattr(mesh, name)
+        if value != default:
+            yield f"{name} = {json.dumps(value)}"
+
+
+def _command(client: Client, directory: str) -> str:
+    verb = "agent" if isinstance(client, Robot) else "gateway" if isinstance(client, Gateway) else "ls"
+    return f"macs {verb} --settings {directory}/macs.toml"
+
+
+def _sections(client: Client) -> list[str]:
+    if isinstance(client, Gateway) and client.blocks:
+        return ["", "[gateway]", "# the certificate is good for these only", f"blocks = {json.dumps(client.blocks)}"]
+    if not isinstance(client, Robot):
+        return []
+    lines = ["", "[robot]", f"id = {client.id}", f"group = {client.group}"]
+    if client.called is not None:
+        name = json.dumps(client.called, ensure_ascii=False)
+        lines += ["", "[awareness]", f"name = {name}", f"id = {client.id}", "beside = true"]
+    return lines
+
+
+def _toml(text: str) -> str:
+    """A string as TOML writes it, without escapes where that is possible."""
+    return f"'{text}'" if "'" not in text and text.isprintable() else json.dumps(text)
