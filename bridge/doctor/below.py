@@ -1,0 +1,167 @@
+"""Below Zenoh: whether an endpoint's host answers, and what is wrong with TLS. Zenoh itself only says that it timed
+out. Blocking; `look` calls it in threads."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from .facts import Certificate, Reach, Tls, TlsProblem
+
+ALERT_S = 0.3
+"""With TLS 1.3 a server refuses the client's certificate after the handshake: how much longer than that to listen."""
+
+_VERIFY_CODES: dict[int, TlsProblem] = {
+    9: "not_yet_valid",
+    10: "expired",
+    18: "unknown_ca",
+    19: "unknown_ca",
+    20: "unknown_ca",
+    21: "unknown_ca",
+    62: "wrong_name",
+    64: "wrong_name",
+}
+"""OpenSSL's X509_V_ERR_* numbers."""
+
+
+def host_and_port(endpoint: str) -> tuple[str, int] | None:
+    """Where an endpoint like ``tls/[::1]:7447#iface=eth0`` is; None for those without host and port."""
+    address = endpoint.partition("/")[2].partition("#")[0].partition("?")[0]
+    host, _, port = address.rpartition(":")
+    return (host.strip("[]"), int(port)) if host and port.isascii() and port.isdigit() else None
+
+
+def tls_settings(endpoint: str, zenoh: Mapping[str, Any]) -> dict[str, Any]:
+    """The TLS settings of an endpoint: Zenoh's ``transport/link/tls``, and what the endpoint itself says after #."""
+    own = dict(part.partition("=")[::2] for part in endpoint.partition("#")[2].split(";") if part)
+    return {**{name: value for name, value in zenoh.items() if value is not None}, **own}
+
+
+def reach(host: str, port: int, timeout_s: float) -> tuple[Reach, str]:
+    """Whether a TCP connection opens there."""
+    try:
+        socket.create_connection((host, port), timeout_s).close()
+    except ConnectionRefusedError as error:
+        return "refused", str(error)
+    except TimeoutError:
+        return "silent", f"no answer within {timeout_s:g} s"
+    except socket.gaierror as error:
+        return "unknown_host", error.strerror or str(error)
+    except OSError as error:
+        return "unreachable", error.strerror or str(error)
+    return "ok", ""
+
+
+def speaks_tls(host: str, port: int, timeout_s: float) -> bool:
+    """Whether a TLS handshake gets an answer there, whatever the certificate."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    try:
+        with socket.create_connection((host, port), timeout_s) as plain, context.wrap_socket(plain):
+            return True
+    except ssl.SSLError as error:
+        return "ALERT" in (error.reason or "")
+    except OSError:
+        return False
+
+
+def tls(host: str, port: int, settings: Mapping[str, Any], timeout_s: float) -> Tls:
+    """A handshake with the certificates that Zenoh would use, and what is wrong with it."""
+    try:
+        context = _context(settings)
+    except (OSError, ssl.SSLError) as error:
+        return Tls(problem="own_files", detail=_words(error))
+    try:
+        with socket.create_connection((host, port), timeout_s) as plain:
+            began = time.monotonic()
+            with context.wrap_socket(plain, server_hostname=host) as secure:
+                found = secure.getpeercert() or {}
+                # a refusal of our certificate comes only now, one way later
+                secure.settimeout(ALERT_S + 2 * (time.monotonic() - began))
+                if (problem := _refusal(secure)) is not None:
+                    return problem
+                return Tls(certificate=_certificate(found))
+    except ssl.SSLCertVerificationError as error:
+        return Tls(problem=_VERIFY_CODES.get(error.verify_code, "failed"), detail=error.verify_message)
+    except ssl.SSLError as error:
+        return Tls(problem=_alert(error), detail=_words(error))
+    except TimeoutError:
+        return Tls(problem="no_tls", detail="no answer to the TLS handshake")
+    except OSError as error:
+        return Tls(problem="no_tls", detail=f"the connection was closed: {error.strerror or error}")
+
+
+def _context(settings: Mapping[str, Any]) -> ssl.SSLContext:
+    context = ssl.create_default_context(cafile=settings.get("root_ca_certificate"))
+    # stricter than Zenoh, from Python 3.13 on
+    context.verify_flags &= ~getattr(ssl, "VERIFY_X509_STRICT", 0)
+    context.check_hostname = settings.get("verify_name_on_connect") not in (False, "false")
+    if presents_certificate(settings):
+        context.load_cert_chain(settings["connect_certificate"], settings.get("connect_private_key"))
+    return context
+
+
+def presents_certificate(settings: Mapping[str, Any]) -> bool:
+    """Whether a client shows its certificate: only with ``enable_mtls``."""
+    return settings.get("enable_mtls") in (True, "true") and bool(settings.get("connect_certificate"))
+
+
+def _refusal(secure: ssl.SSLSocket) -> Tls | None:
+    try:
+        secure.recv(1)
+    except TimeoutError:
+        return None  # it waits for what Zenoh would say
+    except ssl.SSLError as error:
+        return Tls(problem=_alert(error), detail=_words(error))
+    except OSError as error:
+        return Tls(problem="client_certificate_refused", detail=error.strerror or str(error))
+    return None
+
+
+def _alert(error: ssl.SSLError) -> TlsProblem:
+    reason = error.reason or ""
+    if "CERTIFICATE_REQUIRED" in reason or "HANDSHAKE_FAILURE" in reason:
+        return "client_certificate_missing"
+    if "ALERT" in reason and ("CERTIFICATE" in reason or "UNKNOWN_CA" in reason or "DECRYPT" in reason):
+        return "client_certificate_refused"
+    if "WRONG_VERSION_NUMBER" in reason or "UNEXPECTED_EOF" in reason or "RECORD_LAYER" in reason:
+        return "no_tls"
+    return "failed"
+
+
+def _words(error: OSError) -> str:
+    if isinstance(error, ssl.SSLError):
+        return (error.reason or str(error)).lower().replace("_", " ")
+    return f"{error.filename}: {error.strerror}" if error.filename else str(error)
+
+
+def _certificate(found: Mapping[str, Any]) -> Certificate | None:
+    if "notAfter" not in found:
+        return None
+    names = {name: value for part in found.get("subject", ()) for name, value in part}
+    return Certificate(subject=names.get("commonName", ""), ends_s=float(ssl.cert_time_to_seconds(found["notAfter"])))
+
+
+def certificates(settings: Mapping[str, Any]) -> list[Certificate]:
+    """Those in our own files: the one we show, and the CA. None without the library that reads them."""
+    try:
+        from cryptography import x509
+    except ImportError:
+        return []
+    found = []
+    for field in ("connect_certificate", "root_ca_certificate"):
+        path = settings.get(field)
+        try:
+            read = x509.load_pem_x509_certificates(Path(path).read_bytes()) if path else []
+        except (OSError, ValueError):
+            continue  # the handshake says what is wrong with them
+        for certificate in read:
+            name = certificate.subject.rfc4514_string()
+            ends_s = certificate.not_valid_after_utc.timestamp()
+            found.append(Certificate(subject=f"{Path(path or '').name} ({name})", ends_s=ends_s))
+    return found

@@ -1,0 +1,541 @@
+"""What the facts mean: each finding has an id, a severity, where it is, what was seen and what to do. Pure.
+
+The table of all of them is in `kinds`.
+"""
+
+from __future__ import annotations
+
+import re
+import statistics
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+from macs_zenoh.keyexpr import LEASE, NAME, PRESENCE, block_of, type_name
+from macs_zenoh.messages import UNITY
+
+from .facts import Certificate, Clock, Endpoint, Facts, Program, RouterInfo, Way
+from .kinds import ERROR, GROUPS, KINDS, NOTE, OK, WARNING, Severity
+
+CLOCK_S = 0.1
+"""A clock that is further off makes sensor times and latencies misleading."""
+CERTIFICATE_S = 14 * 86_400.0
+LEASE_MS = (1_000, 10_000)
+"""Below, a busy Wi-Fi looks like a lost host; above, a lost host is online for longer than an operator waits."""
+QUEUE_BATCHES = 16
+"""With more, Zenoh panics at the first link (1.10)."""
+BATCH_BYTES = 65_535
+CLOSE_US = 5_000_000
+"""Zenoh's own, which slow links need."""
+SLOW_MS = 150.0
+
+
+class Finding(NamedTuple):
+    """One thing that was found."""
+
+    id: str
+    severity: Severity
+    where: str
+    text: str
+    todo: str
+
+    @property
+    def group(self) -> str:
+        """The part of the report that it belongs to."""
+        return KINDS[self.id].group
+
+
+def found(finding: str, where: str = "", *, severity: Severity | None = None, **values: object) -> Finding:
+    """A finding of a kind, filled in."""
+    kind = KINDS[finding]
+    return Finding(
+        finding,
+        kind.severity if severity is None else severity,
+        where,
+        kind.text.format(**values),
+        kind.todo.format(**values),
+    )
+
+
+def judge(facts: Facts) -> list[Finding]:
+    """Everything that the facts show, worst first within each group."""
+    everything = [
+        *_routers(facts),
+        *_linked(facts),
+        *_versions(facts),
+        *_sessions(facts),
+        *_tls(facts),
+        *_access(facts),
+        *_mesh(facts),
+        *_programs(facts),
+        *_settings(facts),
+    ]
+    unique = list(dict.fromkeys(everything))
+    return sorted(unique, key=lambda finding: (GROUPS.index(finding.group), -finding.severity))
+
+
+def worst(findings: Iterable[Finding]) -> Severity:
+    """The severity of the whole."""
+    return max((finding.severity for finding in findings), default=OK)
+
+
+# -- routers -----------------------------------------------------------------------------------------------------
+
+
+def _routers(facts: Facts) -> Iterator[Finding]:
+    if not facts.endpoints:
+        yield found("no_endpoint")
+    some_answer = any(endpoint.router for endpoint in facts.endpoints)
+    for endpoint in facts.endpoints:
+        where = endpoint.endpoint
+        if endpoint.router:
+            yield found(
+                "router_ok",
+                where,
+                version=_version_of(endpoint),
+                round_trip=_round_trip(endpoint.way),
+                throughput=_throughput_words(endpoint.way, crossings=4),
+            )
+            if not endpoint.routers:
+                yield found("admin_hidden", where)
+            if _median_ms(endpoint.way) > SLOW_MS:
+                yield found("slow", where, round_trip=_round_trip(endpoint.way))
+            yield from _way(endpoint.way, where, crossings=4)
+        elif endpoint.reach not in ("ok", "untried"):
+            # programs use the others meanwhile
+            severity = WARNING if some_answer else ERROR
+            yield found(endpoint.reach, where, severity=severity, detail=endpoint.reach_detail)
+        elif endpoint.speaks_tls:
+            yield found("speaks_tls", where)
+        elif endpoint.tls is None or not endpoint.tls.problem:
+            yield found("session_refused", where, detail=_plain(endpoint.problem))
+
+
+def _version_of(endpoint: Endpoint) -> str:
+    versions = [_short(info.version) for info in endpoint.routers if info.zid == endpoint.router]
+    return f"Zenoh {versions[0]}" if versions else "a Zenoh router"
+
+
+def _short(version: str) -> str:
+    """``1.10.2`` out of ``v1.10.2-release built with rustc …``."""
+    match = re.match(r"v?(\d+\.\d+\.\d+)", version)
+    return match[1] if match else version
+
+
+def _plain(problem: str) -> str:
+    """Zenoh's ``Unable to connect to any of [Single(tcp/…)]. Timeout!`` in short."""
+    return problem.rpartition("]. ")[2].rstrip("!.").lower() or "no reason given"
+
+
+def _linked(facts: Facts) -> Iterator[Finding]:
+    """Routers that do not see each other: by their own account, or because tokens do not pass."""
+    there = [endpoint for endpoint in facts.endpoints if endpoint.router]
+    for number, one in enumerate(there):
+        for other in there[number + 1 :]:
+            if one.router != other.router and _apart(one, other):
+                yield found("split", one.endpoint, other=other.endpoint)
+    for endpoint in there:
+        for info in endpoint.routers:
+            if info.zid == endpoint.router and info.routers:
+                dead = {session.zid for session in info.sessions if session.whatami == "router"} - set(info.routers)
+                yield from (found("link_dead", endpoint.endpoint, other=zid[:8]) for zid in sorted(dead))
+
+
+def _apart(one: Endpoint, other: Endpoint) -> bool:
+    linked = next((info.routers for info in one.routers if info.zid == one.router), [])
+    if linked:
+        return other.router not in linked
+    if one.rights.seen and other.rights.seen:
+        return other.endpoint not in one.meets and one.endpoint not in other.meets
+    return False
+
+
+def _versions(facts: Facts) -> Iterator[Finding]:
+    versions: dict[str, list[str]] = defaultdict(list)
+    for info in _all_routers(facts):
+        versions[_short(info.version)].append(f"router {info.zid[:8]}")
+    for program in facts.programs:
+        if program.pong is not None and program.pong.zenoh:
+            versions[program.pong.zenoh].append(_name(program))
+    if facts.own.zenoh:
+        versions[facts.own.zenoh].append("here")
+    if len(versions) > 1:
+        minors = {version.rpartition(".")[0] for version in versions}
+        severity = WARNING if len(minors) > 1 else NOTE
+        yield found("versions_differ", severity=severity, versions=_listed_versions(versions))
+
+
+def _listed_versions(versions: dict[str, list[str]]) -> str:
+    return "; ".join(f"{version} ({_some(who)})" for version, who in sorted(versions.items()))
+
+
+def _sessions(facts: Facts) -> Iterator[Finding]:
+    names = {program.zid: _name(program) for program in facts.programs}
+    for info in _all_routers(facts):
+        where = f"router {info.zid[:8]}"
+        peers = [_session_name(s.zid, s.address, names) for s in info.sessions if s.whatami == "peer"]
+        if len(peers) > 1:
+            yield found("peers", where, count=len(peers), who=_some(peers))
+        elif peers:
+            yield found("peer", where, who=peers[0])
+        if shared := [_session_name(s.zid, s.address, names) for s in info.sessions if s.shared_memory]:
+            yield found("session_shared_memory", where, who=_some(shared))
+
+
+def _session_name(zid: str, address: str, names: dict[str, str]) -> str:
+    return f"{names.get(zid) or zid[:8]} at {address.partition('/')[2] or '?'}"
+
+
+def _all_routers(facts: Facts) -> list[RouterInfo]:
+    return list({info.zid: info for endpoint in facts.endpoints for info in endpoint.routers}.values())
+
+
+# -- TLS ---------------------------------------------------------------------------------------------------------
+
+
+def _tls(facts: Facts) -> Iterator[Finding]:
+    shown = _setting(facts, "transport/link/tls/enable_mtls") is True
+    has_certificate = bool(_setting(facts, "transport/link/tls/connect_certificate"))
+    for endpoint in facts.endpoints:
+        if endpoint.tls is None:
+            continue
+        if endpoint.tls.problem and not endpoint.router:
+            hint = ": enable_mtls is not set" if has_certificate and not shown else ""
+            detail = endpoint.tls.detail or "no reason given"
+            yield found(f"tls_{endpoint.tls.problem}", endpoint.endpoint, detail=detail, hint=hint)
+        if endpoint.tls.certificate is not None:
+            yield from _ends(endpoint.tls.certificate, endpoint.endpoint, "the router's certificate", facts.at_s)
+    if has_certificate and not shown:
+        yield found("mtls_off")
+    for certificate in facts.own.certificates:
+        yield from _ends(certificate, "", certificate.subject, facts.at_s)
+
+
+def _ends(certificate: Certificate, where: str, subject: str, now_s: float) -> Iterator[Finding]:
+    left_s = certificate.ends_s - now_s
+    if left_s <= 0:
+        yield found("certificate_expired", where, subject=subject)
+    elif left_s < CERTIFICATE_S:
+        yield found("certificate_ends", where, subject=subject, days=int(left_s // 86_400))
+
+
+# -- access ------------------------------------------------------------------------------------------------------
+
+
+def _access(facts: Facts) -> Iterator[Finding]:
+    who = facts.own.who or "this program"
+    for endpoint in facts.endpoints:
+        if endpoint.router:
+            denied = list(_denied(facts, endpoint, who))
+            yield from denied
+            tried = _tried(endpoint, any(program.called for program in facts.programs))
+            if tried and not any(finding.severity >= WARNING for finding in denied):
+                yield found("access_ok", endpoint.endpoint, who=who, tried=tried)
+
+
+def _denied(facts: Facts, endpoint: Endpoint, who: str) -> Iterator[Finding]:
+    rights, where = endpoint.rights, endpoint.endpoint
+    kind, _, number = facts.own.who.partition("/")
+    inbox = f"macs/to/unity/{number}/**" if kind == "gateway" else f"macs/to/{kind}/{_block(number)}/{number}/**"
+    presence = "macs/live/unity/**" if kind == "gateway" else f"macs/live/{kind}/{number}/**"
+    if rights.sees is None and rights.seen is False:
+        yield found("presence_unread", where)
+    if rights.seen is False and kind not in ("", "operator"):
+        yield found("presence_denied", where, who=who, key=presence)
+    if rights.watches is False:
+        yield found("presence_unwatched", where)
+    if rights.leases is False:
+        yield found("lease_denied", where, who=who, key=f"macs/block/{number}/*")
+    if rights.hears is False:
+        yield found("inbox_denied", where, who=who, key=inbox)
+    if rights.pings is False:
+        yield found("ping_denied", where)
+    if endpoint is next(one for one in facts.endpoints if one.router):  # through which calls were made
+        for program in facts.programs:
+            if program.called is False:
+                yield found("call_denied", where, agent=program.agents[0], who=who)
+
+
+def _block(number: str) -> int:
+    return block_of(int(number)) if number else 0
+
+
+def _tried(endpoint: Endpoint, called: bool) -> str:
+    rights = endpoint.rights
+    words = {
+        "be seen": rights.seen,
+        "see who is online": rights.sees,
+        "be told of changes": rights.watches,
+        "lease its block": rights.leases,
+        "hear its inbox": rights.hears,
+        "call robots": called,
+        "ping": rights.pings,
+    }
+    return ", ".join(word for word, may in words.items() if may)
+
+
+# -- who is there ------------------------------------------------------------------------------------------------
+
+
+def _mesh(facts: Facts) -> Iterator[Finding]:
+    if not any(endpoint.router for endpoint in facts.endpoints):
+        return
+    conflicts = [*_blocks_twice(facts), *_ids_twice(facts), *_names_twice(facts), *_ids_and_blocks(facts)]
+    yield from conflicts
+    count = sum(len(program.agents) for program in facts.programs)
+    gateways = sum(1 for program in facts.programs if program.blocks)
+    if not count and not gateways:
+        yield found("nobody")
+    elif not conflicts:
+        yield found("mesh_ok", agents=_count(count, "agent"), gateways=_count(gateways, "gateway"))
+    yield from _namespaces(facts, bool(count))
+
+
+def _blocks_twice(facts: Facts) -> Iterator[Finding]:
+    holders: dict[int, set[str]] = defaultdict(set)
+    for key in _keys(facts, "leases"):
+        if fields := LEASE.parse(key):
+            holders[int(fields["block"])].add(str(fields["zid"]))
+    for block, zids in sorted(holders.items()):
+        if len(zids) > 1:
+            yield found("block_twice", f"block {block}", count=len(zids), who=_zids(zids))
+
+
+def _ids_twice(facts: Facts) -> Iterator[Finding]:
+    holders: dict[str, set[str]] = defaultdict(set)
+    for key in _keys(facts, "presence"):
+        if fields := PRESENCE.parse(key):
+            holders[f"{type_name(int(fields['type']))}/{fields['id']}"].add(str(fields["zid"]))
+    for agent, zids in sorted(holders.items()):
+        if len(zids) > 1:
+            yield found("id_twice", agent, count=len(zids), who=_zids(zids))
+
+
+def _names_twice(facts: Facts) -> Iterator[Finding]:
+    holders: dict[str, set[str]] = defaultdict(set)
+    for key in _keys(facts, "names"):
+        if fields := NAME.parse(key):
+            holders[str(fields["name"])].add(str(fields["zid"]))
+    for name, zids in sorted(holders.items()):
+        if len(zids) > 1:
+            yield found("name_twice", name, count=len(zids), who=_zids(zids))
+
+
+def _ids_and_blocks(facts: Facts) -> Iterator[Finding]:
+    """Headsets behind a gateway have its ids, others keep out of leased blocks. Robots choose theirs freely."""
+    gateways = {block: program.zid for program in facts.programs for block in program.blocks}
+    for program in facts.programs:
+        for agent in program.agents:
+            kind, _, number = agent.partition("/")
+            block = block_of(int(number))
+            if kind != type_name(UNITY) or block in program.blocks:
+                continue
+            if program.blocks:
+                blocks = ", ".join(map(str, sorted(program.blocks)))
+                yield found("id_outside", agent, blocks=blocks, who=program.zid[:8])
+            elif block in gateways:
+                yield found("id_in_block", agent, block=block, gateway=gateways[block][:8])
+
+
+def _namespaces(facts: Facts, somebody: bool) -> Iterator[Finding]:
+    counts: dict[str, set[str]] = defaultdict(set)
+    for key in _keys(facts, "elsewhere"):
+        namespace, _, rest = key.rpartition("macs/live/")
+        counts[namespace.rstrip("/")].add(rest)
+    for namespace, keys in sorted(counts.items()):
+        own = f"“{facts.own.namespace}”" if facts.own.namespace else "none"
+        yield found(
+            "other_namespace" if somebody else "wrong_namespace",
+            count=len(keys),
+            namespace=f"“{namespace}”" if namespace else "“” (none)",
+            own=own,
+        )
+
+
+def _keys(facts: Facts, field: str) -> list[str]:
+    return sorted({key for endpoint in facts.endpoints for key in getattr(endpoint, field)})
+
+
+# -- programs ----------------------------------------------------------------------------------------------------
+
+
+def _programs(facts: Facts) -> Iterator[Finding]:
+    for endpoint in facts.endpoints:
+        if endpoint.way.clock is not None:
+            yield from _clock_off(endpoint.way.clock, endpoint.endpoint)
+    pingable = any(endpoint.rights.pings for endpoint in facts.endpoints)
+    pinged = facts.programs[: len(facts.programs) - facts.unpinged]
+    for program in pinged:
+        where = _name(program)
+        if program.pong is None:
+            if pingable:
+                yield found("program_silent", where)
+            continue
+        yield from _one_program(facts, program, where)
+    if facts.unpinged:
+        yield found("programs_left_out", count=facts.unpinged)
+    macs: dict[str, list[str]] = defaultdict(list)
+    for program in pinged:
+        if program.pong is not None and program.pong.macs:
+            macs[program.pong.macs].append(_name(program))
+    if facts.own.macs:
+        macs[facts.own.macs].append("here")
+    if len(macs) > 1:
+        yield found("macs_versions_differ", versions=_listed_versions(macs))
+
+
+def _one_program(facts: Facts, program: Program, where: str) -> Iterator[Finding]:
+    assert program.pong is not None
+    pong, clock = program.pong, program.way.clock
+    yield found(
+        "program_ok",
+        where,
+        macs=pong.macs or "(unknown)",
+        round_trip=_round_trip(program.way),
+        throughput=_throughput_words(program.way, crossings=2),
+        clock=f"{clock.offset_s * 1000:+.1f} ms (±{clock.within_s * 1000:.1f})" if clock else "unknown",
+    )
+    if clock is not None:
+        yield from _clock_off(clock, where)
+    yield from _way(program.way, where, crossings=2)
+    ours, theirs = (facts.own.id_slots, facts.own.group_slots), (pong.id_slots, pong.group_slots)
+    if any(theirs) and ours != theirs:
+        yield found("slots_differ", where, ours="{} and {}".format(*ours), theirs="{} and {}".format(*theirs))
+    if pong.shared_memory:
+        yield found("program_shared_memory", where)
+    if pong.mode != "client":
+        yield found("program_peer", where, mode=pong.mode)
+    if pong.drops:
+        yield found("losses", where, drops=", ".join(f"{name} {count}" for name, count in sorted(pong.drops.items())))
+
+
+def _clock_off(clock: Clock, where: str) -> Iterator[Finding]:
+    if abs(clock.offset_s) - clock.within_s > CLOCK_S:
+        direction = "ahead of" if clock.offset_s > 0 else "behind"
+        yield found("clock_off", where, offset=_seconds(abs(clock.offset_s)), direction=direction)
+
+
+def _way(way: Way, where: str, *, crossings: int) -> Iterator[Finding]:
+    if way.lost_bytes:
+        yield found("large_lost", where, size=_bytes(way.lost_bytes))
+
+
+# -- our settings ------------------------------------------------------------------------------------------------
+
+
+def _settings(facts: Facts) -> Iterator[Finding]:
+    problems = list(_setting_problems(facts))
+    yield from problems
+    if not problems:
+        yield found(
+            "settings_ok",
+            macs=facts.own.macs or "(not installed)",
+            zenoh=facts.own.zenoh or "(unknown)",
+            mode=_setting(facts, "mode") or "client",
+            lease=_seconds(_number(_setting(facts, "transport/link/tx/lease")) / 1000),
+        )
+    yield from _dropped(facts)
+
+
+def _setting_problems(facts: Facts) -> Iterator[Finding]:
+    if _setting(facts, "transport/shared_memory/enabled") is not False:
+        yield found("own_shared_memory")
+    if _setting(facts, "scouting/multicast/enabled") is not False:
+        yield found("own_multicast")
+    mode = _setting(facts, "mode") or "client"
+    if mode != "client":
+        yield found("own_mode", mode=mode)
+    lease_ms = _number(_setting(facts, "transport/link/tx/lease"))
+    if 0 < lease_ms < LEASE_MS[0]:
+        yield found("lease_short", lease=_seconds(lease_ms / 1000))
+    elif lease_ms > LEASE_MS[1]:
+        yield found("lease_long", lease=_seconds(lease_ms / 1000))
+    for name, size in sorted((_setting(facts, "transport/link/tx/queue/size") or {}).items()):
+        if _number(size) > QUEUE_BATCHES:
+            yield found("queue_long", name=name, size=size)
+    wait_us = _number(_congestion(facts, "block", "wait_before_close"))
+    if wait_us > max(CLOSE_US, lease_ms * 1000):  # with a longer lease it is for slow links: config/wan/plan.yaml
+        yield found("close_long", wait=_seconds(wait_us / 1e6))
+
+
+def _dropped(facts: Facts) -> Iterator[Finding]:
+    """How large a stream message may be at the throughput measured: what does not fit into the queue has
+    ``max_wait_before_drop_fragments`` to leave it."""
+    sizes = _setting(facts, "transport/link/tx/queue/size") or {}
+    queue = _number(sizes.get("data")) * BATCH_BYTES
+    wait_s = _number(_congestion(facts, "drop", "max_wait_before_drop_fragments")) / 1e6
+    for endpoint in facts.endpoints:
+        rate = _bytes_per_s(endpoint.way, crossings=4)
+        if rate and queue and (limit := queue + rate * wait_s) < 5e6:
+            yield found("large_dropped", endpoint.endpoint, throughput=_rate(rate), size=_bytes(limit))
+
+
+def _setting(facts: Facts, path: str) -> Any:
+    return facts.own.zenoh_settings.get(path)
+
+
+def _congestion(facts: Facts, kind: str, name: str) -> Any:
+    return ((_setting(facts, "transport/link/tx/queue/congestion_control") or {}).get(kind) or {}).get(name)
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else 0.0
+
+
+# -- words -------------------------------------------------------------------------------------------------------
+
+
+def _name(program: Program) -> str:
+    """A gateway by its blocks, others by their agents."""
+    if program.blocks:
+        return f"gateway {program.zid[:8]} (block {', '.join(map(str, sorted(program.blocks)))})"
+    return ", ".join(program.agents) or program.zid[:8]
+
+
+def _median_ms(way: Way) -> float:
+    return statistics.median(way.round_trips_ms) if way.round_trips_ms else 0.0
+
+
+def _round_trip(way: Way) -> str:
+    return f"{_median_ms(way):.1f} ms" if way.round_trips_ms else "an unknown time"
+
+
+def _bytes_per_s(way: Way, *, crossings: int) -> float:
+    """Throughput out of the largest echo: how much longer it took than the smallest. ``crossings``: how often the
+    bytes went over a link, one after the other. 0: unknown."""
+    if len(way.echoes) < 2:
+        return 0.0
+    small, large = way.echoes[0], way.echoes[-1]
+    took_s = large.took_s - small.took_s
+    return crossings * (large.size_bytes - small.size_bytes) / took_s if took_s > 0 else 0.0
+
+
+def _throughput_words(way: Way, *, crossings: int) -> str:
+    rate = _bytes_per_s(way, crossings=crossings)
+    return f", about {_rate(rate)}" if rate else ""
+
+
+def _rate(bytes_per_s: float) -> str:
+    mbit = bytes_per_s * 8 / 1e6
+    return f"{mbit:.3g} Mbit/s" if mbit < 999 else f"{mbit / 1000:.1f} Gbit/s"
+
+
+def _bytes(size: float) -> str:
+    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"
+
+
+def _seconds(value_s: float) -> str:
+    return f"{value_s:.3g} s" if value_s >= 1 else f"{value_s * 1000:.0f} ms"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _some(who: list[str], most: int = 4) -> str:
+    shown = ", ".join(who[:most])
+    return shown if len(who) <= most else f"{shown} and {len(who) - most} more"
+
+
+def _zids(zids: set[str]) -> str:
+    return ", ".join(sorted(zid[:8] for zid in zids))
