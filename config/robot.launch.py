@@ -14,7 +14,7 @@ ARGUMENTS = {
     "agent_id": ("1", "number of this robot"),
     "group_id": ("0", "group of this robot; 0 is none"),
     "namespace": ("/", "of the agent's ROS node: relative topic names of headsets begin there"),
-    "settings": ("/etc/macs/macs.toml", "settings file"),
+    "settings": ("/etc/macs/robot.toml", "settings file"),
 }
 
 
