@@ -14,6 +14,8 @@ from types import TracebackType
 from tests.programs import ROOT, STOP_S, free_port
 
 START_S = 30.0
+LINE_BYTES = 4 << 20
+"""zenohd logs its whole configuration, with every access rule, as one line."""
 
 
 def zenohd() -> str | None:
@@ -67,7 +69,7 @@ class Router:
         pipe = asyncio.subprocess.PIPE
         env = {"RUST_LOG": "info", **os.environ}
         self._process = await asyncio.create_subprocess_exec(
-            *self._command, cwd=ROOT, env=env, stdout=pipe, stderr=pipe
+            *self._command, cwd=ROOT, env=env, stdout=pipe, stderr=pipe, limit=LINE_BYTES
         )
         assert self._process.stdout is not None
         assert self._process.stderr is not None
