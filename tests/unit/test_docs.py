@@ -9,8 +9,9 @@ import pytest
 
 from bridge.cli import VERBS
 from macs_zenoh import config
-from macs_zenoh.config import Settings
+from macs_zenoh.config import Settings, TrafficRule
 from macs_zenoh.messages import MANAGERS, NodeType
+from macs_zenoh.shaping import REASONS
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
@@ -54,6 +55,22 @@ def test_the_readme_has_every_verb() -> None:
     assert set(re.findall(r"`macs (\w+)", page("README.md").partition("## Commands")[2])) >= set(VERBS)
 
 
+@pytest.mark.parametrize("name", ["docs/traffic.md", "docs/robot.md", "docs/reliable.md"])
+def test_settings_on_a_page_are_settings(name: str) -> None:
+    """Every example of settings on a page is accepted as it stands there."""
+    examples = re.findall(r"^```toml\n(.*?)^```", page(name), re.MULTILINE | re.DOTALL)
+    assert examples
+    for example in examples:
+        config.parse(example)
+
+
+def test_the_traffic_page_has_every_setting() -> None:
+    """Each field of a traffic rule is in the table, and how its drops are counted."""
+    rows = re.findall(r"^\| `(\w+)` \|.*?\| (?:`(\w+)` )?\|$", page("docs/traffic.md"), re.MULTILINE)
+    assert [name for name, _ in rows] == list(TrafficRule.__struct_fields__)
+    assert {name: reason for name, reason in rows if reason} == REASONS
+
+
 def test_the_settings_file_explains_every_setting() -> None:
     """config/macs.toml has every field of every section, commented out, with its default if there is one."""
     text = page("config/macs.toml")
@@ -66,3 +83,6 @@ def test_the_settings_file_explains_every_setting() -> None:
             default = getattr(defaults, name)
             if default not in (None, []):  # without a default the file shows an example
                 assert getattr(getattr(shown, section), name) == default, name
+    example = text.partition("\n#traffic = ")[2].partition("\n")[0]
+    assert set(re.findall(r"(\w+) = ", example)) == set(TrafficRule.__struct_fields__)
+    assert len(shown.traffic) == example.count("match = ")
