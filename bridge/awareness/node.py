@@ -9,6 +9,7 @@ from __future__ import annotations
 import array
 import logging
 import threading
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 from as2_ca_msgs.msg import InterAgentMessage, LocalGenericMessage
@@ -21,6 +22,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
 from bridge.awareness import cdr
+from bridge.ros.intake import Intake
 from macs_zenoh.config import AwarenessSettings
 from macs_zenoh.errors import ConfigError, UsageError
 from macs_zenoh.named import check_word
@@ -74,6 +76,7 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
         self.problem = ""
         """Why the last transition failed."""
         self._owner = owner
+        self._intake = Intake(self)
         self._active = False
         self._lock = threading.Lock()
         self._modules: dict[str, Any] = {}
@@ -93,6 +96,11 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
         except ParameterException as error:
             raise ConfigError(f"parameters of {self.get_fully_qualified_name()}", str(error)) from error
         self._service_change_state.callback = self._change_state
+
+    def destroy_node(self) -> None:
+        """End everything."""
+        self._intake.close()
+        super().destroy_node()
 
     @property
     def state(self) -> str:
@@ -171,7 +179,8 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
         self._agents = self._publisher(String, AGENTS_TOPIC, LATCHED)
         self._undelivered = self._publisher(LocalGenericMessage, UNDELIVERED_TOPIC, QOS)
         self._diagnostics = self._publisher(DiagnosticArray, "/diagnostics", QOS)
-        self._subscribe(LocalGenericMessage, parameters.out_messages_topic, self._from_module, raw=True)
+        from_modules = parameters.out_messages_topic, self._from_module, QOS
+        self._made.append((self._intake.unsubscribe, self._intake.subscribe(LocalGenericMessage, *from_modules)))
         timer = self.create_timer(LOOK_S, self._look)
         self._made.append((self.destroy_timer, timer))
         service = self.create_service(
@@ -184,8 +193,8 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
         self._made.append((self.destroy_publisher, publisher))
         return publisher
 
-    def _subscribe(self, kind: type[Any], topic: str, callback: Any, *, raw: bool = False) -> None:
-        subscription = self.create_subscription(kind, topic, callback, QOS, raw=raw)
+    def _subscribe(self, kind: type[Any], topic: str, callback: Any) -> None:
+        subscription = self.create_subscription(kind, topic, callback, QOS)
         self._made.append((self.destroy_subscription, subscription))
 
     def _unmake(self) -> None:
@@ -229,7 +238,7 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
             self._wanted = types
             self._owner.types_wanted(types)
 
-    def _from_module(self, raw: bytes) -> None:
+    def _from_module(self, raw: bytes, _info: Mapping[str, Any]) -> None:
         if not self._active:
             return
         try:

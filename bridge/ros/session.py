@@ -24,6 +24,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
+from bridge.ros.intake import Intake
 from macs_zenoh.errors import Unreachable
 
 log = logging.getLogger("macs.ros")
@@ -72,6 +73,8 @@ class RosSession:
         except RuntimeError as error:
             self.context.try_shutdown()
             raise Unreachable("ROS 2", str(error).splitlines()[0]) from error
+        self.intake = Intake(self.node)
+        """For subscriptions whose messages are only passed on."""
         self._jobs: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._lock = threading.Lock()
         self._spinning = True
@@ -127,6 +130,7 @@ class RosSession:
         """End the thread, then the node, then the context: in another order rclpy can abort the process."""
         self.submit(self._stop)
         self._thread.join()
+        self.intake.close()
         self._executor.shutdown()
         if self.context.ok():
             self.node.destroy_node()

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import math
+import threading
 import time
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -37,15 +38,13 @@ class SubscriberNode(InterfaceNode):
     NODE_TYPE = NodeType.SUBSCRIBER
     ROLE = "subscriber"
 
-    BURST = 64
-    """Messages taken in one turn of the executor: a turn costs more than a message."""
-
     def __init__(self, robot: Robot, request: AddNode) -> None:
         super().__init__(robot, request)
         self._subscription: Any = None
         self._profile: Any = None
-        self._message: type[Any] | None = None
+        self._message: Any = None
         self._rate = RateLimit(self.rule.max_hz) if self.rule.max_hz else None
+        self._rate_lock = threading.Lock()
         self._gaps = Gaps()
         self._loop = asyncio.get_running_loop()
         self._frame = self._framing()
@@ -64,7 +63,7 @@ class SubscriberNode(InterfaceNode):
     def close(self) -> None:
         subscription, self._subscription = self._subscription, None
         if subscription is not None:
-            self.robot.session.node.destroy_subscription(subscription)
+            self.robot.session.intake.unsubscribe(subscription)
 
     def retire(self) -> None:
         self.robot.keep_stream(self.key.node_name, None)
@@ -86,7 +85,7 @@ class SubscriberNode(InterfaceNode):
         return qos.overridden(profile, self.rule)
 
     def _subscribe(self, profile: Any) -> None:
-        node, topic = self.robot.session.node, self.request.tos_name
+        subscribe, topic = self.robot.session.intake.subscribe, self.request.tos_name
         events = SubscriptionEventCallbacks(
             matched=self._publisher_matched,
             incompatible_qos=self._publisher_incompatible,
@@ -95,25 +94,15 @@ class SubscriberNode(InterfaceNode):
         )
         with ros_errors(topic):
             try:
-                self._subscription = node.create_subscription(
-                    self._message, topic, self._forward, profile, raw=True, event_callbacks=events
-                )
+                self._subscription = subscribe(self._message, topic, self._pass_on, profile, events=events)
             except UnsupportedEventTypeError:  # of some middlewares; then the QoS stays as it is
-                self._subscription = node.create_subscription(self._message, topic, self._forward, profile, raw=True)
+                self._subscription = subscribe(self._message, topic, self._pass_on, profile)
         self._profile = profile
 
-    def _forward(self, cdr: bytes, info: Mapping[str, Any]) -> None:
-        self._pass_on(cdr, info)
-        handle, message = self._subscription.handle, self._message
-        with handle:
-            for _ in range(self.BURST):
-                taken = handle.take_message(message, True)
-                if taken is None:
-                    return
-                self._pass_on(*taken)
+    # -- in the thread of the intake -----------------------------------------------------------------------------
 
     def _pass_on(self, cdr: bytes, info: Mapping[str, Any]) -> None:
-        """One message with what rclpy knows about it. From any one thread."""
+        """One message with what rclpy knows about it."""
         if self._gaps.take(info["publication_sequence_number"]):
             self._loop.call_soon_threadsafe(self._loop.call_later, self._gaps.SETTLE_S, self._tell_gaps)
         self._publish(cdr)
@@ -123,8 +112,9 @@ class SubscriberNode(InterfaceNode):
             self._put(cdr)
             return
         now = time.monotonic()
-        waits = self._rate.waiting
-        due = self._rate.offer(cdr, now)
+        with self._rate_lock:
+            waits = self._rate.waiting
+            due = self._rate.offer(cdr, now)
         if due is None:
             self._put(cdr)
         elif not waits:
@@ -135,7 +125,8 @@ class SubscriberNode(InterfaceNode):
 
     def _put_latest(self) -> None:
         if self._rate is not None and self._subscription is not None:
-            latest = self._rate.take(time.monotonic())
+            with self._rate_lock:
+                latest = self._rate.take(time.monotonic())
             if latest is not None:
                 self._put(latest)
 

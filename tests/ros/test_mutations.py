@@ -132,7 +132,7 @@ async def test_every_spoilt_registration_is_answered(mesh: tuple[RobotAgent, Age
                     except MacsError as error:
                         refusals.add(str(error))
     assert not [refusal for refusal in refusals if "\n" in refusal or "internal error" in refusal]
-    await headset.call("ros", ROBOT, "add_node", encode_data(adding("/fine", registrant=6)))
+    await headset.call("ros", ROBOT, "add_node", encode_data(adding("/fine")))
 
 
 async def _works(robot: RobotAgent, headset: Agent, peer: Peer, heard: asyncio.Queue[Any]) -> None:
