@@ -365,9 +365,12 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     stop_topic: Annotated[str, Meta(pattern=r"^(/[A-Za-z_]\w*)*$")] = "/emergency_stop"
     """The emergency stop: true on this topic (std_msgs/Bool) stops, false releases. Empty: there is none."""
     stop_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
-    """Who may stop: ``*``, ``unity``, ``unity/5``, ``group/3`` or ``operator/5`` (`macs stop --as`)."""
+    """Who may stop: ``*``, ``unity``, ``unity/5``, ``block/1`` (headsets of this block of ids), ``group/3`` or
+    ``operator/5`` (`macs stop --as`)."""
     release_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
     """Who may release a stop."""
+    register_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
+    """Who may register to publish, to call, to serve and to give goals. Others may register for topics only."""
     rules: list[TopicRule] = []
 
 

@@ -182,12 +182,16 @@ class Identity:
                 break
             except MacsError as error:
                 log.error("%s is also held by session %s, and there is no other id: %s", self, others, error)
-                await asyncio.sleep(AGAIN_S)
+            except Exception:
+                log.exception("%s is also held by session %s, and looking for another id failed", self, others)
+            await asyncio.sleep(AGAIN_S)
         log.warning("%s is also held by session %s; from now on this is id %d", self, others, new.id)
         self._claim = new
         self._changing = None
         try:
             self._on_id(old.id, new.id)
+        except Exception:
+            log.exception("handling the new id of %s failed", self)  # whoever listens; the id is changed
         finally:
             old.close()
         self.contested(self._presence.contested())

@@ -30,6 +30,9 @@ UNITY = 2
 OPERATOR = 255
 """Agent type of people who watch and stop robots, with `macs ls` and `macs stop`. No TCP agent has it."""
 
+NOBODY = 254
+"""Agent type of nobody: with an operator's certificate `macs doctor` tries as one whether tokens are seen."""
+
 AgentType = Annotated[int, Meta(ge=0, le=255)]
 AgentId = Annotated[int, Meta(ge=0, le=0xFFFF)]
 GroupId = Annotated[int, Meta(ge=0, le=255)]
@@ -92,6 +95,12 @@ class Metadata(Struct, frozen=True, rename="camel", forbid_unknown_fields=True):
     def encode(self) -> bytes:
         """Write compact JSON with all seven keys."""
         return msgspec.json.encode(self)
+
+    def sent_by(self, agent_type: int, agent_id: int) -> Metadata:
+        """The same with this sender, itself when it names it already."""
+        if self.sender_agent_id == agent_id and self.sender_agent_type == agent_type:
+            return self
+        return msgspec.structs.replace(self, sender_agent_type=agent_type, sender_agent_id=agent_id)
 
 
 _metadata_decoder = msgspec.json.Decoder(Metadata)
@@ -302,12 +311,22 @@ def encode_data(value: Struct) -> bytes:
     return msgspec.json.encode(value)
 
 
+_SENDER = frozenset(("senderagenttype", "senderagentid"))
+
+
 def correct_sender(metadata: bytes, agent_type: int, agent_id: int) -> bytes:
     """The same metadata JSON with its true sender and our keys in camelCase, itself when it is so already; unknown
-    keys are kept. Raises BadJson."""
+    keys are kept. Raises BadJson.
+
+    Keys that are the sender's to a reader who takes small and capital letters for the same are not kept.
+    """
     fields = _json("metadata", metadata)
     names = _wire_names(Metadata)
-    true = {names.get(_snake(key), key): value for key, value in fields.items()}
+    true = {}
+    for key, value in fields.items():
+        name = names.get(_snake(key))
+        if name is not None or key.casefold() not in _SENDER:
+            true[name or key] = value
     true |= {"senderAgentType": agent_type, "senderAgentId": agent_id}
     return metadata if true == fields else msgspec.json.encode(true)
 

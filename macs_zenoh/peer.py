@@ -42,7 +42,7 @@ from .messages import (
     decode_management,
     encode_data,
 )
-from .wire import MACS, MAX_FRAME_BYTES, Frame, FrameDecoder, Layout, encode_frame, encode_message, parse_frames
+from .wire import MACS, MAX_FRAME_BYTES, Frame, FrameDecoder, Layout, encode_message
 
 
 class State(Enum):
@@ -353,7 +353,7 @@ class Peer:
         metadata, corrected = known
         if corrected is not None:
             self.corrected += frame.count
-            frame = self._with_metadata(frame, corrected)
+            frame = frame.with_metadata(corrected)
         return Sent(frame, metadata)
 
     def _judge(self, raw: bytes) -> tuple[Metadata, bytes | None]:
@@ -369,21 +369,6 @@ class Peer:
                 self._metadata.clear()
             self._metadata[raw] = (metadata, corrected)
         return metadata, corrected
-
-    def _with_metadata(self, frame: Frame, metadata: bytes) -> Frame:
-        header, management = frame.header, frame.management
-        data = b"".join(
-            encode_frame(
-                header.agent_type,
-                header.ids,
-                header.groups,
-                management=management,
-                message=encode_message(metadata, single.body),
-                layout=self._layout,
-            )
-            for single in frame.each()
-        )
-        return parse_frames(data, self._layout, runs=True)[0]
 
     def _decode(self, frame: Frame) -> Metadata:
         raw = frame.metadata

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 from msgspec import structs
 
+from .errors import Refused
+from .keyexpr import type_name
 from .messages import AddNode, RemoveNode
 
 AgentKey = tuple[int, int]
@@ -37,6 +39,9 @@ class _Wish:
 
 Robots = dict[int, int]
 """Robots online: id → group."""
+
+Streams = dict[tuple[int, str], set[AgentKey]]
+"""(robot id, node name) → who is registered there."""
 
 
 class Registrations:
@@ -110,14 +115,28 @@ class Registrations:
         wish = self._wishes.get((agent, node_type, node_name))
         return wish.node if wish else None
 
-    def streams(self, node_type: int, robots: Robots) -> set[tuple[int, str]]:
-        """(robot id, node name) of every stream that somebody here is registered for."""
-        return {
-            (robot_id, name)
-            for (_, kind, name), wish in self._wishes.items()
-            if kind == node_type
-            for robot_id in wish.robot_ids.union(_covered(wish, robots))
-        }
+    def streams(self, node_type: int, robots: Robots) -> Streams:
+        """Every stream that somebody here is registered for, and who is."""
+        streams: Streams = {}
+        for (agent, kind, name), wish in self._wishes.items():
+            if kind == node_type:
+                for robot_id in wish.robot_ids.union(_covered(wish, robots)):
+                    streams.setdefault((robot_id, name), set()).add(agent)
+        return streams
+
+
+def check_own(node: AddNode | RemoveNode, caller: AgentKey) -> None:
+    """A registration is for whoever calls: the key says who that is, and routers hold callers to their keys.
+
+    Raises Refused.
+    """
+    registrant = (node.registrant_agent_type, node.registrant_agent_id)
+    if registrant != caller:
+        raise Refused(f"{_named(caller)} cannot register or remove nodes for {_named(registrant)}")
+
+
+def _named(agent: AgentKey) -> str:
+    return f"{type_name(agent[0])}/{agent[1]}"
 
 
 def _key(node: AddNode | RemoveNode) -> tuple[AgentKey, int, str]:

@@ -139,6 +139,8 @@ class Shaper:
             if getattr(rule, setting) is not None
         }
         self._shapes: OrderedDict[str, Shape] = OrderedDict()
+        self._free: OrderedDict[str, None] = OrderedDict()
+        """Keys that no rule fits: by themselves, so that they push nobody's pace out."""
         self._first: set[tuple[str, str]] = set()
 
     def of(self, key: str) -> Shape | None:
@@ -146,11 +148,15 @@ class Shaper:
         if not self._rules:
             return None
         with self.lock:
+            if key in self._free:
+                return None
             shape = self._shapes.get(key)
-            if shape is None and (shape := self._shape(key)) is not None:
-                self._shapes[key] = shape
-                if len(self._shapes) > self.KEYS:
-                    self._shapes.popitem(last=False)
+            if shape is None:
+                shape = self._shape(key)
+                if shape is None:
+                    _remember(self._free, key, None, self.KEYS)
+                else:
+                    _remember(self._shapes, key, shape, self.KEYS)
             return shape
 
     def count(self, limit: Limit, key: str) -> Overrun:
@@ -191,6 +197,12 @@ class Shaper:
         rules = [rule for _, rule in fitting]
         priority: Priority | None = _first_given(rule.priority for rule in rules)
         return Shape(self, key, priority, _first_given(rule.reliable for rule in rules), limits)
+
+
+def _remember(among: OrderedDict[str, T], key: str, value: T, limit: int) -> None:
+    among[key] = value
+    if len(among) > limit:
+        among.popitem(last=False)
 
 
 def _first_given(values: Iterable[T | None]) -> T | None:

@@ -218,6 +218,27 @@ class Frame:
             frame._body_at = self._body_at
             yield frame
 
+    def with_metadata(self, metadata: bytes) -> Frame:
+        """The same, checked, with other metadata in each message."""
+        header, management = self.header, self.management
+        data = b"".join(
+            encode_frame(
+                header.agent_type,
+                header.ids,
+                header.groups,
+                management=management,
+                message=encode_message(metadata, single.body),
+                layout=self.layout,
+            )
+            for single in self.each()
+        )
+        return parse_frames(data, self.layout, runs=True)[0]
+
+
+def is_probe(data: Buffer, layout: Layout = MACS) -> bool:
+    """Whether a payload is a `PROBE`."""
+    return len(data) < layout.header_bytes and bytes(data[: len(PROBE)]) == PROBE
+
 
 def parse_frame(data: bytes | bytearray, layout: Layout = MACS) -> Frame:
     """Take ``data`` as exactly one frame, check all of its sizes and return it. Raises BadSizes."""
@@ -244,7 +265,7 @@ def parse_frames(data: bytes | bytearray, layout: Layout = MACS, *, runs: bool =
     header_bytes, sizes_at = layout.header_bytes, layout.destination_bytes
     while True:
         if end - start < header_bytes:
-            if start == 0 and data.startswith(PROBE):
+            if start == 0 and is_probe(data, layout):
                 return frames
             raise BadSizes("header", header_bytes, end - start)
         management_bytes, message_bytes = _SIZES.unpack_from(data, start + sizes_at)

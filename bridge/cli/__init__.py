@@ -10,7 +10,6 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 
 from bridge.cli import (
     agent,
@@ -23,11 +22,13 @@ from bridge.cli import (
     ls,
     options,
     router,
+    running,
     security,
     stop,
     up,
 )
 from macs_zenoh.errors import ConfigError, MacsError, UsageError
+from macs_zenoh.versions import installed
 
 VERBS = {
     "up": up,
@@ -72,7 +73,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="macs", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=_VerbsInOneColumn
     )
-    parser.add_argument("--version", action="version", version=f"macs-zenoh {_version()}")
+    version = installed("macs-zenoh") or "(not installed)"
+    parser.add_argument("--version", action="version", version=f"macs-zenoh {version}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True, title="verbs")
     for name, module in VERBS.items():
         verb = verbs.add_parser(
@@ -114,17 +116,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except KeyboardInterrupt:
-        return 130
+        return running.INTERRUPTED
     return code
 
 
 def _fail(verb: str, error: Exception, code: int) -> int:
     sys.stderr.write(f"macs {verb}: {error}\n")
     return code
-
-
-def _version() -> str:
-    try:
-        return version("macs-zenoh")
-    except PackageNotFoundError:
-        return "(not installed)"

@@ -19,15 +19,12 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from importlib.metadata import PackageNotFoundError, version
 
 from bridge.cli import options, running
 from macs_zenoh.errors import UsageError
+from macs_zenoh.versions import installed
 
 SUMMARY = "what is wrong with a mesh, and what to do"
-
-INTERRUPTED = 130
-"""As with any program that Ctrl-C ends: nothing was found to be well."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,11 +60,9 @@ def run(args: argparse.Namespace) -> int:
         who=who,
         timeout_s=args.timeout,
         quick=args.quick,
-        versions=(_version("macs-zenoh"), _version("eclipse-zenoh")),
+        versions=(installed("macs-zenoh"), installed("eclipse-zenoh")),
         on_progress=_progress,
     )
-
-    done: list[int] = []
 
     async def examine() -> int:
         facts = await examination.run()
@@ -76,11 +71,9 @@ def run(args: argparse.Namespace) -> int:
         in_colour = sys.stdout.isatty()
         text = report.as_json(findings, facts) if args.json else report.as_text(findings, facts, colours=in_colour)
         sys.stdout.write(text + "\n")
-        done.append(report.exit_code(findings))
-        return done[0]
+        return report.exit_code(findings)
 
-    code = running.until_stopped(examine)
-    return code if done else INTERRUPTED
+    return running.until_stopped(examine, interrupted=running.INTERRUPTED)
 
 
 def _progress(text: str) -> None:
@@ -88,10 +81,3 @@ def _progress(text: str) -> None:
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\033[K{text[:100]}")
         sys.stderr.flush()
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""

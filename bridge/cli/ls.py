@@ -57,7 +57,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="for programs: a list of {type, id, group, zid, name}; robots also {status, problem}, with -v {offers}",
     )
     parser.add_argument(
-        "--timeout", type=float, default=3.0, metavar="S", help="how long to wait for a router (default: 3)"
+        "--timeout",
+        type=float,
+        default=3.0,
+        metavar="S",
+        help="how long to wait for a router, the last of several (default: 3)",
     )
     robots.add_as_option(parser)
     options.add_mesh_options(parser)

@@ -166,14 +166,19 @@ class Operator:
 
 @asynccontextmanager
 async def operator(settings: MeshSettings, caller: Caller, *, timeout_s: float) -> AsyncIterator[Operator]:
-    """An operator's session until the end of the block. Raises Unreachable when no router answers in time."""
+    """An operator's session until the end of the block. Of several routers each but the last one may take its time
+    (``open_limit_ms``) beside ``timeout_s``, as when its host is off.
+
+    Raises Unreachable when no router answers in time.
+    """
     from macs_zenoh.mesh import Mesh
 
+    patience_s = timeout_s + max(0, len(settings.routers) - 1) * settings.open_limit_ms / 1000
     try:
-        mesh = await asyncio.wait_for(Mesh.open(settings, on_waiting=lambda target: None), timeout_s)
+        mesh = await asyncio.wait_for(Mesh.open(settings, on_waiting=lambda target: None), patience_s)
     except asyncio.TimeoutError:
         target = ", ".join(settings.routers) or "a router"
-        raise Unreachable(target, f"no Zenoh router answered within {timeout_s:g} s") from None
+        raise Unreachable(target, f"no Zenoh router answered within {patience_s:g} s") from None
     async with mesh:
         yield Operator(mesh, caller, timeout_s)
 

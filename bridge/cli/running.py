@@ -16,27 +16,33 @@ STOP_WITH_STDIN = "MACS_STOP_WITH_STDIN"
 """Set by ``macs up`` for its children: end of stdin means that it is gone, however it went."""
 
 
-def until_stopped(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
-    """Run ``work`` to its end and return its exit code; SIGINT and SIGTERM cancel it, which is a success (0).
+INTERRUPTED = 130
+"""The exit code, as with any program that Ctrl-C ends, of one that was to find or do something: nobody must take it
+for a confirmation."""
+
+
+def until_stopped(work: Callable[[], Coroutine[Any, Any, int]], *, interrupted: int = 0) -> int:
+    """Run ``work`` to its end and return its exit code; SIGINT and SIGTERM cancel it. For who serves until it is
+    stopped that is a success; for others ``interrupted`` is the exit code then.
 
     A second Ctrl-C ends the process at once, for whoever does not want to wait for a clean close.
     """
     loop = _new_loop()
     try:
         asyncio.set_event_loop(loop)
-        return loop.run_until_complete(_stoppable(work))
+        return loop.run_until_complete(_stoppable(work, interrupted))
     finally:
         loop.run_until_complete(loop.shutdown_asyncgens())
         asyncio.set_event_loop(None)
         loop.close()
 
 
-async def _stoppable(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
+async def _stoppable(work: Callable[[], Coroutine[Any, Any, int]], interrupted: int) -> int:
     loop = asyncio.get_running_loop()
     task = loop.create_task(work())
 
     def interrupt() -> None:
-        loop.add_signal_handler(signal.SIGINT, os._exit, 130)
+        loop.add_signal_handler(signal.SIGINT, os._exit, INTERRUPTED)
         task.cancel()
 
     loop.add_signal_handler(signal.SIGINT, interrupt)
@@ -47,7 +53,7 @@ async def _stoppable(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
     try:
         return await task
     except asyncio.CancelledError:
-        return 0
+        return interrupted
 
 
 def _stop_at_end_of_stdin(loop: asyncio.AbstractEventLoop, task: asyncio.Task[int]) -> None:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from bridge.security.check import Result
     from bridge.security.generate import Report
 
-SUMMARY = "certificates and access rules from a plan, and whether they hold"
+SUMMARY = "certificates and access rules from a plan"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -124,7 +124,7 @@ def _check(args: argparse.Namespace) -> int:
     """Try what each node may and may not, with its own certificate, on routers that run.
 
     Exit code 0: everything is as planned; 1: something is not, or a router does not answer; 2: the plan or the
-    directory cannot be used.
+    directory cannot be used; 130 after Ctrl-C.
     """
     from bridge.security import plan
     from bridge.security.check import check
@@ -149,7 +149,7 @@ def _check(args: argparse.Namespace) -> int:
             sys.stdout.write(f"{len(results)} attempts, {len(results) - len(wrong)} as planned, {len(wrong)} not\n")
         return 1 if wrong or not results else 0
 
-    return running.until_stopped(work)
+    return running.until_stopped(work, interrupted=running.INTERRUPTED)
 
 
 def _line(result: Result) -> str:

@@ -33,7 +33,6 @@ SUMMARY = "stop robots, and release them"
 FIRST_S = 0.5
 """How long the first attempt waits for its answer; each further one waits twice as long."""
 RETRY_S = 0.05
-INTERRUPTED = 130
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--release", action="store_true", help="end the stop")
     parser.add_argument("--json", action="store_true", help="for programs: a list of {id, done, stopped, by, problem}")
     parser.add_argument(
-        "--timeout", type=float, default=5.0, metavar="S", help="for a router, then for the robots (default: 5)"
+        "--timeout",
+        type=float,
+        default=5.0,
+        metavar="S",
+        help="for a router, more with several; then for the robots (default: 5)",
     )
     robots.add_as_option(parser)
     options.add_mesh_options(parser)
@@ -68,13 +71,7 @@ def run(args: argparse.Namespace) -> int:
     if args.release and not named and not args.all:
         raise UsageError("say which robots shall go on, or --all")
 
-    async def work() -> int:
-        try:
-            return await _stop(settings, args)
-        except asyncio.CancelledError:
-            return INTERRUPTED  # whoever waits for this must not take it for a confirmation
-
-    return running.until_stopped(work)
+    return running.until_stopped(lambda: _stop(settings, args), interrupted=running.INTERRUPTED)
 
 
 async def _stop(settings: MeshSettings, args: argparse.Namespace) -> int:

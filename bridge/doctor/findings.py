@@ -100,7 +100,7 @@ def _routers(facts: Facts) -> Iterator[Finding]:
                 yield found("admin_hidden", where)
             if _median_ms(endpoint.way) > SLOW_MS:
                 yield found("slow", where, round_trip=_round_trip(endpoint.way))
-            yield from _way(endpoint.way, where, crossings=4)
+            yield from _way(endpoint.way, where)
         elif endpoint.reach not in ("ok", "untried"):
             # programs use the others meanwhile
             severity = WARNING if some_answer else ERROR
@@ -397,7 +397,7 @@ def _one_program(facts: Facts, program: Program, where: str) -> Iterator[Finding
     )
     if clock is not None:
         yield from _clock_off(clock, where)
-    yield from _way(program.way, where, crossings=2)
+    yield from _way(program.way, where)
     ours, theirs = (facts.own.id_slots, facts.own.group_slots), (pong.id_slots, pong.group_slots)
     if any(theirs) and ours != theirs:
         yield found("slots_differ", where, ours="{} and {}".format(*ours), theirs="{} and {}".format(*theirs))
@@ -415,7 +415,7 @@ def _clock_off(clock: Clock, where: str) -> Iterator[Finding]:
         yield found("clock_off", where, offset=_seconds(abs(clock.offset_s)), direction=direction)
 
 
-def _way(way: Way, where: str, *, crossings: int) -> Iterator[Finding]:
+def _way(way: Way, where: str) -> Iterator[Finding]:
     if way.lost_bytes:
         yield found("large_lost", where, size=_bytes(way.lost_bytes))
 

@@ -23,8 +23,9 @@ from macs_zenoh.config import Settings
 from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError, WireError
 from macs_zenoh.keyexpr import BLOCK_SIZE, LEASE, NAME, PING, PRESENCE, UNICAST, block_of, type_name, type_number
 from macs_zenoh.mesh import Mesh, Subscription, Traffic, configuration
-from macs_zenoh.messages import ROS, UNITY, Metadata
+from macs_zenoh.messages import NOBODY, ROS, UNITY, Metadata
 from macs_zenoh.routing import call, inbox
+from macs_zenoh.wire import PROBE
 
 from . import below
 from .facts import Clock, Echo, Endpoint, Facts, Own, Program, Rights, RouterInfo, Session, Way
@@ -38,8 +39,6 @@ ECHO_BYTES = (4 << 10, 64 << 10, 256 << 10, 1 << 20)
 ECHO_S = 0.25
 CALLED = ("ping", "status")
 """Calls without effect: every agent serves the first, robots the second, which access rules may allow alone."""
-NOBODY = 254
-"""The type of the agent as which nobody in particular tries whether tokens are seen."""
 MAX_PINGED = 64
 """Programs that are pinged."""
 MAX_ECHOED = 16
@@ -320,7 +319,7 @@ class Examination:
         gateway = self._who.kind == "gateway"
         ours = UNICAST.every(type=kind, block=self._who.number) if gateway else inbox(kind, number)
         listening = place.second.subscribe(ours, lambda batch: heard.extend(sent_to for sent_to, _ in batch))
-        arrived = await self._repeat(lambda: place.first.put(key, b""), lambda: key in heard, place.waited_s)
+        arrived = await self._repeat(lambda: place.first.put(key, PROBE), lambda: key in heard, place.waited_s)
         listening.close()
         return arrived
 

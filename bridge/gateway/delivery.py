@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from typing import NamedTuple
 
 from macs_zenoh.directory import Directory
 from macs_zenoh.errors import WireError
-from macs_zenoh.keyexpr import BROADCAST, GROUP, UNICAST
+from macs_zenoh.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue, type_name
 from macs_zenoh.mesh import Sample
-from macs_zenoh.messages import ROS, Metadata, NodeType, StreamData, decode_management
+from macs_zenoh.messages import ROS, Metadata, NodeType, StreamData, correct_sender, decode_management
+from macs_zenoh.registrations import AgentKey
 from macs_zenoh.routing import takes_group_copy
-from macs_zenoh.wire import Frame, Layout, parse_frames
+from macs_zenoh.wire import Frame, Layout, is_probe, parse_frames
 
 from .agents import Agents
 from .connection import Connection
@@ -32,10 +34,24 @@ KNOWN_BYTES = 4096
 """Longer ones are read each time: what others choose must not decide how much is kept here."""
 
 
+NOBODY: frozenset[AgentKey] = frozenset()
+
+
+class Stream(NamedTuple):
+    """Topic data of one robot under one node, and who of ours is registered there."""
+
+    robot: AgentKey
+    node: str
+    registrants: set[AgentKey]
+
+
 class Delivery:
     """Samples of the mesh → messages to connections. Each method takes a batch and flushes at its end.
 
-    ``drops`` counts ``bad_frame`` and ``nobody_with_this_id``.
+    The sender is the one of the key, which routers can hold it to: metadata that names another is put right.
+
+    ``drops`` counts ``bad_frame``, ``nobody_with_this_id``, ``not_registered`` (topic data for an agent that did not
+    register it on this robot, or has just taken that back) and ``wrong_sender``, which is put right and delivered.
     """
 
     def __init__(self, agents: Agents, directory: Directory, layout: Layout) -> None:
@@ -43,23 +59,30 @@ class Delivery:
         self._agents = agents
         self._directory = directory
         self._layout = layout
-        self._targets: dict[str, Connection] = {}
+        self.streams: dict[str, Stream] = {}
+        """By their keys."""
+        self._targets: dict[str, tuple[Connection, AgentKey]] = {}
         self._metadata: dict[bytes, Metadata] = {}
-        self._registrants: dict[bytes, list[tuple[int, int]]] = {}
+        self._registrants: dict[bytes, list[AgentKey]] = {}
         self._dirty: list[Connection] = []
 
     def inbox(self, batch: list[Sample]) -> None:
         """Frames sent to ids of ours."""
         for key, payload in batch:
-            connection = self._targets.get(key) or self._find(key)
-            if connection is None:
+            target = self._targets.get(key)
+            if target is None:
+                if is_probe(payload, self._layout):
+                    continue
+                target = self._find(key)
+            if target is None:
                 if self._agents.former:
                     self._late_answer(key, payload)
                 continue
-            for frame, metadata in self._read(key, payload):
+            connection, sender = target
+            for frame, metadata in self._read(key, payload, sender):
                 self._send(connection, frame, metadata)
-            if connection.congested and (fields := UNICAST.parse(key)) is not None:
-                self._hold_sender((fields["from_type"], fields["from_id"]), [connection])
+            if connection.congested:
+                self._hold_sender(sender, [connection])
         self.flush()
 
     def group(self, batch: list[Sample]) -> None:
@@ -68,9 +91,9 @@ class Delivery:
             fields = GROUP.parse(key)
             if fields is None:
                 continue
-            sender = (int(fields["from_type"]), int(fields["from_id"]))
+            sender = _sender(fields)
             members = self._agents.members(int(fields["type"]), int(fields["group"]))
-            for frame, metadata in self._read(key, payload):
+            for frame, metadata in self._read(key, payload, sender):
                 header = frame.header
                 for connection in members:
                     if takes_group_copy(header, connection.agent_id, sender, connection.peer.agent_type):
@@ -84,9 +107,9 @@ class Delivery:
             fields = BROADCAST.parse(key)
             if fields is None:
                 continue
-            sender = (fields["from_type"], fields["from_id"])
+            sender = _sender(fields)
             others = [connection for connection in self._agents.online() if connection.key != sender]
-            for frame, metadata in self._read(key, payload):
+            for frame, metadata in self._read(key, payload, sender):
                 for connection in others:
                     self._send(connection, frame, metadata)
             self._hold_sender(sender, others)
@@ -95,13 +118,21 @@ class Delivery:
     def stream(self, batch: list[Sample]) -> None:
         """A robot's topic data, for those of its registrants that are ours."""
         for key, payload in batch:
-            for frame, metadata in self._read(key, payload):
+            stream = self.streams.get(key)
+            if stream is None:
+                continue  # the last registrant has just left
+            for frame, metadata in self._read(key, payload, stream.robot):
+                true = metadata.node_name == stream.node and metadata.node_type == NodeType.SUBSCRIBER
+                registered = stream.registrants if true else NOBODY
                 for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
                     connection = self._agents.find(*registrant)
-                    if connection is None or not self._may_have(connection, frame, metadata):
+                    if connection is None:
                         continue
-                    if connection.has(metadata):  # else the frame is older than the agent, which has another's id
-                        connection.send_stream(metadata.node_name, frame.messages)
+                    if registrant in registered:
+                        connection.send_stream(stream.node, frame.messages)
+                    elif self._may_have(connection, frame, metadata):
+                        # a forged list; or the frame is older than the agent, which has another's id
+                        self.drops["not_registered"] += frame.count
         self.flush()
 
     def dirty(self, connection: Connection) -> None:
@@ -130,7 +161,8 @@ class Delivery:
         connection.complain("wrong_node_type", problem, frame.count)
         return False
 
-    def _find(self, key: str) -> Connection | None:
+    def _find(self, key: str) -> tuple[Connection, AgentKey] | None:
+        """Who of ours a frame is for, and who sent it."""
         fields = UNICAST.parse(key)
         if fields is None:
             return None
@@ -141,8 +173,8 @@ class Delivery:
             return None
         if len(self._targets) >= KNOWN:
             self._targets.clear()
-        self._targets[key] = connection
-        return connection
+        target = self._targets[key] = (connection, _sender(fields))
+        return target
 
     def _late_answer(self, key: str, payload: bytes | bytearray) -> None:
         """An answer to a service call that an agent made under the id it had then. Anything else that is sent to
@@ -152,31 +184,31 @@ class Delivery:
             return
         connection = self._agents.former.get((int(fields["type"]), int(fields["id"])))
         if connection is not None:
-            for frame, metadata in self._read(key, payload):
+            for frame, metadata in self._read(key, payload, _sender(fields)):
                 if metadata.node_type in ANSWERS and connection.has(metadata):
                     self._send(connection, frame, metadata)
 
-    def _hold_sender(self, sender: tuple[object, object], receivers: list[Connection]) -> None:
+    def _hold_sender(self, sender: AgentKey, receivers: list[Connection]) -> None:
         """Slow down a sender on this gateway. Those elsewhere are slowed by nobody: the outbox's limit decides."""
         for receiver in receivers:
             if receiver.congested and (connection := self._agents.find(*sender)) is not None:
                 receiver.brake.hold(connection)
 
-    def _read_registrants(self, key: str, frame: Frame) -> list[tuple[int, int]]:
-        """(type, id) of each registrant. The list changes only with registrations, so each is read once."""
+    def _read_registrants(self, key: str, frame: Frame) -> list[AgentKey]:
+        """Each registrant, once. The list changes only with registrations, so each is read once."""
         try:
             management = decode_management(frame.management)
         except WireError as error:
             self._bad(key, error)
             return []
-        registrants = management.targets() if isinstance(management, StreamData) else []
+        registrants = list(dict.fromkeys(management.targets())) if isinstance(management, StreamData) else []
         if len(frame.management) <= KNOWN_BYTES:
             if len(self._registrants) >= KNOWN:
                 self._registrants.clear()
             self._registrants[frame.management] = registrants
         return registrants
 
-    def _read(self, key: str, payload: bytes | bytearray) -> list[tuple[Frame, Metadata]]:
+    def _read(self, key: str, payload: bytes | bytearray, sender: AgentKey) -> list[tuple[Frame, Metadata]]:
         """The frames of a sample with their metadata; those that no agent must see are left out."""
         try:
             frames = parse_frames(payload, self._layout, runs=True)
@@ -184,17 +216,29 @@ class Delivery:
             self._bad(key, error)
             return []
         known = self._metadata
+        from_type, from_id = sender
         read = []
         for frame in frames:
-            raw = frame.metadata
-            metadata = known.get(raw) or self._read_metadata(key, raw)
-            if metadata is not None:
+            metadata = known.get(frame.metadata)
+            if metadata and metadata.sender_agent_id == from_id and metadata.sender_agent_type == from_type:
                 read.append((frame, metadata))
+            elif (judged := self._judge(key, frame, sender)) is not None:
+                read.append(judged)
         return read
 
-    def _read_metadata(self, key: str, raw: bytes) -> Metadata | None:
+    def _judge(self, key: str, frame: Frame, sender: AgentKey) -> tuple[Frame, Metadata] | None:
+        """A frame with its true sender, and its metadata, which is remembered if it was true already."""
+        raw = frame.metadata
         try:
             metadata = Metadata.decode(raw)
+            named = (metadata.sender_agent_type, metadata.sender_agent_id)
+            # written as we write it, there is nothing in it that another reader may take for the sender
+            if named != sender or metadata.encode() != raw:
+                true = correct_sender(raw, *sender)
+                if true is not raw:
+                    if named != sender:
+                        self._wrong_sender(key, named, frame.count)
+                    return frame.with_metadata(true), Metadata.decode(true)
         except WireError as error:
             self._bad(key, error)
             return None
@@ -202,9 +246,20 @@ class Delivery:
             if len(self._metadata) >= KNOWN:
                 self._metadata.clear()
             self._metadata[raw] = metadata
-        return metadata
+        return frame, metadata
+
+    def _wrong_sender(self, key: str, named: tuple[int | None, int | None], count: int) -> None:
+        if not self.drops["wrong_sender"]:
+            who = "nobody" if None in named else f"{type_name(named[0] or 0)}/{named[1]}"
+            problem = "a frame on %s names %s as its sender: put right (logged once, counted as wrong_sender)"
+            log.warning(problem, key, who)
+        self.drops["wrong_sender"] += count
 
     def _bad(self, key: str, error: WireError) -> None:
         self.drops["bad_frame"] += 1
         if self.drops["bad_frame"] == 1:
             log.warning("a frame on %s cannot be used: %s (logged once, counted as bad_frame)", key, error)
+
+
+def _sender(fields: dict[str, FieldValue]) -> AgentKey:
+    return int(fields["from_type"]), int(fields["from_id"])

@@ -8,8 +8,8 @@ from collections.abc import Awaitable, Callable
 from macs_zenoh.errors import Refused
 from macs_zenoh.keyexpr import CALL
 from macs_zenoh.mesh import Mesh, Subscription
-from macs_zenoh.messages import ROS, UNITY, AddNode, Metadata, RemoveNode, decode_data
-from macs_zenoh.registrations import AgentKey
+from macs_zenoh.messages import ROS, UNITY, AddNode, Metadata, RemoveNode, decode_data, encode_data
+from macs_zenoh.registrations import AgentKey, check_own
 from macs_zenoh.routing import inbox
 from macs_zenoh.wire import Layout, encode_message, parse_frame
 
@@ -59,11 +59,14 @@ class OwnKeys:
             fields = CALL.parse(key)
             if fields is None or self._agents.find(*connection.key) is not connection:
                 raise Refused("the robot is not connected")
-            sender = Metadata(int(fields["from_type"]), int(fields["from_id"]), message_manager=kind.manager)
-            body = parse_frame(payload, self._layout).body
-            if not connection.tell(decode_data(kind, body)):
+            caller = (int(fields["from_type"]), int(fields["from_id"]))
+            node = decode_data(kind, parse_frame(payload, self._layout).body)
+            check_own(node, caller)
+            if not connection.tell(node):
                 return b""  # it has that node already
-            connection.send_call(encode_message(sender.encode(), body))
+            metadata = Metadata(*caller, message_manager=kind.manager)
+            # written anew: a robot program reads of it what was judged here, however it takes keys named twice
+            connection.send_call(encode_message(metadata.encode(), encode_data(node)))
             self._delivery.flush()
             return b""
 

@@ -35,6 +35,9 @@ GATHER_S = 0.2
 AT_ONCE = 64
 """How many agents change their id at the same time."""
 
+AGAIN_S = 5.0
+"""Pause after an attempt to change ids that failed as a whole."""
+
 ANSWER_S = 5.0
 """How long answers of services are still taken under the old id: as long as existing headsets wait for them."""
 
@@ -132,16 +135,28 @@ class Renumbering:
             await asyncio.sleep(GATHER_S)
             while self._wanted:
                 wanted, self._wanted = sorted(filter(self._must_change, self._wanted), key=lambda c: c.agent_id), {}
-                slow: set[int] = set()  # robots that do not answer: waited for once, not by everybody
-                room = asyncio.Semaphore(AT_ONCE)
-                ids = await self._reserve(len(wanted))
-                await asyncio.gather(
-                    *(self._move(agent, new, slow, room) for agent, new in zip(wanted, ids, strict=True))
-                )
-                if wanted:
-                    log.warning("%d agents here have other ids now: another gateway had given out theirs", len(wanted))
+                try:
+                    await self._move_all(wanted)
+                except Exception:
+                    log.exception("%d agents here keep ids that others have; trying again", len(wanted))
+                    self._wanted.update(dict.fromkeys(wanted))
+                    await asyncio.sleep(AGAIN_S)
         finally:
             self._working = None
+
+    async def _move_all(self, wanted: list[Connection]) -> None:
+        if not wanted:
+            return
+        slow: set[int] = set()  # robots that do not answer: waited for once, not by everybody
+        room = asyncio.Semaphore(AT_ONCE)
+        ids = await self._reserve(len(wanted))
+        moves = (self._move(agent, new, slow, room) for agent, new in zip(wanted, ids, strict=True))
+        ends = await asyncio.gather(*moves, return_exceptions=True)
+        failures = [(agent, end) for agent, end in zip(wanted, ends, strict=True) if isinstance(end, Exception)]
+        for agent, error in failures:
+            log.error("%s: the change of its id failed", agent, exc_info=error)
+        if moved := len(wanted) - len(failures):
+            log.warning("%d agents here have other ids now: another gateway had given out theirs", moved)
 
     def _must_change(self, connection: Connection) -> bool:
         """Whether it is still there, and under an id that it cannot keep: it may be moved already for another
@@ -154,22 +169,30 @@ class Renumbering:
     async def _reserve(self, count: int) -> list[int]:
         """So many free ids of our blocks; more blocks are leased for them if need be."""
         ids: list[int] = []
-        while len(ids) < count:
-            agent_id = self._leases.free_id(self._agents.ids | self._presence.directory.ids_elsewhere(self._zid))
-            if agent_id is None:
-                await self._leases.more()
-            else:
-                self._agents.reserve(agent_id)
-                ids.append(agent_id)
+        try:
+            while len(ids) < count:
+                agent_id = self._leases.free_id(self._agents.ids | self._presence.directory.ids_elsewhere(self._zid))
+                if agent_id is None:
+                    await self._leases.more()
+                else:
+                    self._agents.reserve(agent_id)
+                    ids.append(agent_id)
+        except BaseException:
+            for agent_id in ids:
+                self._agents.unreserve(agent_id)
+            raise
         return ids
 
     async def _move(self, connection: Connection, new_id: int, slow: set[int], room: asyncio.Semaphore) -> None:
         async with room:
             try:
                 old = connection.key
-                told = await self._robots.prepare(old, new_id, slow) if old[0] != ROS else []
-                if self._agents.find(*old) is connection:  # it may have left meanwhile
+                tasks = self._robots.to_prepare(old, new_id) if old[0] != ROS else []
+                told = await self._robots.prepare(tasks, slow)
+                if self._agents.find(*old) is connection:
                     await self._change(connection, new_id, told, slow)
+                else:  # it has left meanwhile
+                    self._robots.take_back(tasks)
             finally:
                 self._agents.unreserve(new_id)
 

@@ -17,7 +17,7 @@ from macs_zenoh.directory import Change, Directory
 from macs_zenoh.errors import OutOfRange, Refused, Unreachable
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.messages import ROS, AddNode, Metadata, NodeRefused, NodeType, RemoveNode, encode_data
-from macs_zenoh.registrations import AgentKey, Registrations, Robots, Task
+from macs_zenoh.registrations import AgentKey, Registrations, Robots, Streams, Task
 from macs_zenoh.routing import call
 from macs_zenoh.wire import Layout
 
@@ -42,7 +42,7 @@ class RobotCalls:
         directory: Directory,
         layout: Layout,
         *,
-        on_streams: Callable[[set[tuple[int, str]]], None],
+        on_streams: Callable[[Streams], None],
         on_refused: Callable[[AgentKey, NodeRefused], None],
     ) -> None:
         self._mesh = mesh
@@ -89,24 +89,31 @@ class RobotCalls:
                 self._start(task)
         self._streams_changed()
 
-    async def prepare(self, agent: AgentKey, agent_id: int, slow: set[int]) -> list[Task]:
-        """Have robots know an agent under the id that it is about to have, too; what they were told. Services, which
-        take one agent only, are left to `rename`. Robots in ``slow`` are not waited for; those that do not answer in
-        time get into it."""
+    def to_prepare(self, agent: AgentKey, agent_id: int) -> list[Task]:
+        """What makes robots know an agent under the id that it is about to have, too. Services, which take one agent
+        only, are left to `rename`."""
         tasks = self._registrations.of_agent(agent, self._robots())
         nodes = [(task.robot_id, task.node) for task in tasks if task.node.node_type != NodeType.SERVICE]
-        return await self._try(
-            [Task(r, structs.replace(node, registrant_agent_id=agent_id)) for r, node in nodes], slow
-        )
+        return [Task(r, structs.replace(node, registrant_agent_id=agent_id)) for r, node in nodes]
+
+    async def prepare(self, tasks: list[Task], slow: set[int]) -> list[Task]:
+        """Tell it; what robots have confirmed. Those in ``slow`` are not waited for; those that do not answer in time
+        get into it."""
+        return await self._try(tasks, slow)
+
+    def take_back(self, tasks: list[Task]) -> None:
+        """The agent left before it had the other id. No presence ends under that id, so robots have to be told."""
+        for task in tasks:
+            self._start(Task(task.robot_id, _removal(task.node)))
 
     async def rename(self, agent: AgentKey, agent_id: int, told: list[Task], slow: set[int]) -> None:
         """An agent has another id now; robots forget the one before. ``told`` is what `prepare` gave."""
         before = self._registrations.of_agent(agent, self._robots())
         self._registrations.rename(agent, agent_id)
+        self._streams_changed()  # it is registered under the new id
         for key in [key for key in self._running if key[1] == agent]:
             self._running.pop(key).cancel()
-        nodes = [(task.robot_id, task.node) for task in before]
-        forget = [Task(r, RemoveNode(*agent, node.node_type, node.node_name)) for r, node in nodes]
+        forget = [Task(task.robot_id, _removal(task.node)) for task in before]
         forgotten = await self._try(forget, slow)
         for task in [*forget, *self._registrations.of_agent((agent[0], agent_id), self._robots())]:
             if task not in told and task not in forgotten:
@@ -117,7 +124,7 @@ class RobotCalls:
         told = []
 
         async def ask(task: Task) -> None:
-            with suppress(Refused, Unreachable):
+            with suppress(Refused, Unreachable, OutOfRange):
                 await self._ask(task)
                 told.append(task)
 
@@ -195,6 +202,10 @@ class RobotCalls:
         metadata = Metadata(*sender, message_manager=node.manager)
         key, frame = call((ROS, task.robot_id), verb, sender, encode_data(node), metadata, self._layout)
         await self._mesh.query(key, frame, timeout_s=CALL_TIMEOUT_S)
+
+
+def _removal(node: AddNode | RemoveNode) -> RemoveNode:
+    return RemoveNode(node.registrant_agent_type, node.registrant_agent_id, node.node_type, node.node_name)
 
 
 def _describe(node: AddNode | RemoveNode) -> str:

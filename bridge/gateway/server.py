@@ -35,14 +35,14 @@ from macs_zenoh.messages import (
 )
 from macs_zenoh.peer import Asked, AskedOnline, Event, Joined, Limits, Peer, Registering, Sent, Streamed
 from macs_zenoh.presence import Presence
-from macs_zenoh.registrations import AgentKey
+from macs_zenoh.registrations import AgentKey, Streams
 from macs_zenoh.routing import keys_of
 from macs_zenoh.wire import FrameDecoder, Header, Layout, encode_message
 
 from .agents import Agents, Group
 from .brake import Brake
 from .connection import Connection
-from .delivery import Delivery
+from .delivery import Delivery, Stream
 from .door import Door
 from .leases import Leases
 from .own_keys import OwnKeys
@@ -105,7 +105,6 @@ class Gateway:
         self._waiting: deque[Connection] = deque()  # connections for which there is no id yet
         self._routes: dict[Connection, dict[bytes, Route]] = {}
         self._subscriptions: dict[str, Subscription] = {}
-        self._streams: set[str] = set()
         self._server: asyncio.Server | None = None
         self._run = NO_RUN
         self._brake = Brake()
@@ -146,7 +145,7 @@ class Gateway:
 
     @property
     def drops(self) -> Counter[str]:
-        """What was lost, by name: here, and for connections that have ended."""
+        """What was lost, by name: here, and for connections that have ended; ``wrong_sender`` was only put right."""
         return self._drops + self._delivery.drops
 
     # -- life ----------------------------------------------------------------------------------------------------
@@ -391,15 +390,18 @@ class Gateway:
 
     # -- subscriptions -------------------------------------------------------------------------------------------
 
-    def _streams_wanted(self, streams: set[tuple[int, str]]) -> None:
-        """Listen to exactly these streams of robots: (robot id, node name)."""
-        wanted = {STREAM.of(type=ROS, id=robot_id, node=node) for robot_id, node in streams}
-        for key in wanted - self._streams:
+    def _streams_wanted(self, streams: Streams) -> None:
+        """Listen to exactly these streams of robots, for those who are registered there."""
+        wanted = {
+            STREAM.of(type=ROS, id=robot_id, node=node): Stream((ROS, robot_id), node, registrants)
+            for (robot_id, node), registrants in streams.items()
+        }
+        before, self._delivery.streams = self._delivery.streams, wanted
+        for key in wanted.keys() - before.keys():
             # whether a robot keeps a stream for recovery is seen from its messages: others cost nothing more
             self._subscribe(key, self._delivery.stream, reliable=True)
-        for key in self._streams - wanted:
+        for key in before.keys() - wanted.keys():
             self._unsubscribe(key)
-        self._streams = wanted
 
     def _subscribe(self, key: str, on_batch: OnBatch, *, reliable: bool = False) -> None:
         if key not in self._subscriptions:

@@ -29,6 +29,7 @@ from macs_zenoh.errors import MacsError, Refused, WireError
 from macs_zenoh.keyexpr import type_name, type_number
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.messages import AddNode, FunctionalityRequest, Metadata, RemoveNode, decode_data, encode_data
+from macs_zenoh.registrations import check_own
 from macs_zenoh.wire import Layout
 
 log = logging.getLogger("macs.ros")
@@ -216,11 +217,8 @@ class RobotAgent:
 
 
 def _own(request: _Registration, call: Call) -> _Registration:
-    """A registration by the agent that it is for: the key says who calls, and routers hold callers to their keys."""
-    caller = Registrant(type_number(call.sender_type), call.sender_id)
-    registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
-    if registrant != caller:
-        raise Refused(f"{caller} cannot register or remove nodes for {registrant}")
+    """A registration by the agent that it is for."""
+    check_own(request, (type_number(call.sender_type), call.sender_id))
     return request
 
 

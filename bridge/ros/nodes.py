@@ -12,12 +12,14 @@ from collections.abc import Iterator
 from bridge.ros.actions import ActionNode
 from bridge.ros.early import EarlyMessages, NodeKey
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, key_of
+from bridge.ros.rules import names_agent
 from bridge.ros.services import ClientNode, ServiceNode, tell_failure
 from bridge.ros.stop import StopNode
 from bridge.ros.topics import PublisherNode, SubscriberNode
 from macs_zenoh.agent import Message
 from macs_zenoh.errors import Refused
-from macs_zenoh.messages import AddNode, RemoveNode
+from macs_zenoh.keyexpr import type_name
+from macs_zenoh.messages import AddNode, NodeType, RemoveNode
 
 log = logging.getLogger("macs.ros")
 
@@ -57,14 +59,16 @@ class InterfaceNodes:
 
         A repeated registration changes nothing; a further registrant takes the node as it is.
         Raises Refused: node type not supported, invalid name, type not installed, type of the topic is another one,
-        name taken by another topic, limit reached.
+        name taken by another topic, limit reached, not allowed to this agent.
         """
+        registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
+        if request.node_type != NodeType.SUBSCRIBER:
+            self._check_allowed(registrant)
         node = self._nodes.get(key_of(request))
         if node is None:
             node = self._create(request)
         else:
             node.check_same(request)
-        registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
         node.register(registrant)
         self._end_lingering(node, registrant)
         assert node.opening is not None
@@ -124,6 +128,12 @@ class InterfaceNodes:
             self._remove(node)
         if self._expiry is not None:
             self._expiry.cancel()
+
+    def _check_allowed(self, agent: Registrant) -> None:
+        """What an agent may register for is in the payload, where no router's access rule can see it."""
+        allowed = self.robot.rules.settings.register_allow
+        if not names_agent(allowed, type_name(agent.agent_type), agent.agent_id, self.robot.group_of(agent)):
+            raise Refused(f"{agent} may only register for topics that this robot sends")
 
     def _create(self, request: AddNode) -> InterfaceNode:
         kind = KINDS.get(request.node_type)

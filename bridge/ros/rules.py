@@ -14,6 +14,8 @@ from msgspec import structs
 
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
+from macs_zenoh.keyexpr import block_of, type_name
+from macs_zenoh.messages import UNITY
 
 DEFAULT_HOLD_S = 3.0
 
@@ -83,8 +85,10 @@ def _merged(rules: Iterable[TopicRule]) -> TopicRule:
 
 
 def names_agent(patterns: Iterable[str], agent_type: str, agent_id: int, group: int) -> bool:
-    """Whether one of ``*``, ``unity``, ``unity/5`` or ``group/3`` means this agent."""
+    """Whether one of ``*``, ``unity``, ``unity/5``, ``block/1`` or ``group/3`` means this agent."""
     own = {"*", agent_type, f"{agent_type}/{agent_id}"}
+    if agent_type == type_name(UNITY):
+        own.add(f"block/{block_of(agent_id)}")
     if group:
         own.add(f"group/{group}")
     return not own.isdisjoint(patterns)

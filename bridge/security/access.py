@@ -38,7 +38,7 @@ from macs_zenoh.keyexpr import (
     Key,
     block_of,
 )
-from macs_zenoh.messages import OPERATOR, ROS, UNITY
+from macs_zenoh.messages import NOBODY, OPERATOR, ROS, UNITY
 
 TYPES = {"robots": ROS, "gateways": UNITY, "operators": OPERATOR}
 
@@ -59,9 +59,6 @@ MESSAGES = (
 
 ADMIN = ("@/*/router", "@/*/router/**")
 """The admin space of routers, read only: versions, sessions, links."""
-
-NOBODY = 254
-"""The agent type as which `macs doctor` tries, with an operator's certificate, whether tokens are seen."""
 
 RECOVERY = "@adv/**"
 """Behind a key: what the source of reliable messages and their receivers say about messages that were lost."""

@@ -102,6 +102,8 @@ class Authority:
             return "incomplete"
         if not _belongs(certificate, key):
             return "not its key"
+        if certificate.subject != _named(directory.name):
+            return "other name"
         try:
             certificate.verify_directly_issued_by(self.certificate)
         except (InvalidSignature, ValueError, TypeError):
@@ -122,7 +124,7 @@ class Authority:
         key = ec.generate_private_key(ec.SECP256R1())
         usages = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if addresses else [])]
         builder = (
-            _builder(directory.name, self.certificate.subject, key, now, until)
+            _builder(_named(directory.name), self.certificate.subject, key, now, until)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_usage(digital_signature=True), critical=True)
             .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
@@ -139,7 +141,7 @@ class Authority:
 
 def _new_authority(directory: Path, plan: Plan, now: dt.datetime, why: str) -> tuple[Authority, Issued]:
     key = ec.generate_private_key(ec.SECP256R1())
-    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"macs {plan.namespace or 'mesh'} authority")])
+    subject = _named(f"macs {plan.namespace or 'mesh'} authority")
     until = now + dt.timedelta(days=plan.certificates.ca_days)
     certificate = (
         _builder(subject, subject, key, now, until)
@@ -154,10 +156,8 @@ def _new_authority(directory: Path, plan: Plan, now: dt.datetime, why: str) -> t
 
 
 def _builder(
-    subject: str | x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: dt.datetime, until: dt.datetime
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: dt.datetime, until: dt.datetime
 ) -> x509.CertificateBuilder:
-    if isinstance(subject, str):
-        subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, subject)])
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -168,6 +168,10 @@ def _builder(
         .not_valid_after(until)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
+
+
+def _named(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
 
 
 def _usage(*, digital_signature: bool = False, key_cert_sign: bool = False, crl_sign: bool = False) -> x509.KeyUsage:

@@ -9,7 +9,9 @@ at once, and then a message that each node may send to itself follows the others
 there, what has not come was refused.
 
 Of a mesh that is in use, this is seen: everybody who listens gets a few `PROBE` payloads, which are not passed on;
-robots log one message type that nobody has registered. Presence tokens have a last chunk that no program reads.
+robots log one message type that nobody has registered. Calls of verbs that robots have go to the robot where it is
+online; elsewhere the check's sessions stand in for it, and answer nobody but the check. Presence tokens have a last
+chunk that no program reads.
 """
 
 from __future__ import annotations
@@ -24,9 +26,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bridge.security import access, certificates
+from bridge.security.expected import Expected, agent_of, inbox_of, presence_of, sender_of
 from bridge.security.files import client_overrides
 from bridge.security.plan import Client, Gateway, Operator, Plan, Robot
-from macs_zenoh.config import MeshSettings
+from macs_zenoh.config import MeshSettings, changed
 from macs_zenoh.errors import ConfigError, Refused, Unreachable
 from macs_zenoh.keyexpr import (
     BROADCAST,
@@ -42,7 +45,6 @@ from macs_zenoh.keyexpr import (
     STREAM,
     UNICAST,
     WANTED,
-    FieldValue,
 )
 from macs_zenoh.mesh import Mesh, Sample, Subscription
 from macs_zenoh.messages import ROS, UNITY
@@ -155,73 +157,6 @@ async def check(
     return results
 
 
-# -- what the plan says ------------------------------------------------------------------------------------------
-
-
-class _Expected:
-    """The plan's answers. What two gateways without blocks may do is one thing: their headsets are one crowd."""
-
-    def __init__(self, plan: Plan) -> None:
-        self.plan = plan
-
-    def speaks_as(self, one: Client, other: Client) -> bool:
-        """Whether a node may send in the name of another's sample agent."""
-        if one is other:
-            return True
-        if isinstance(one, Gateway) and isinstance(other, Gateway):
-            return not one.blocks or (not other.blocks and 255 in one.blocks)
-        return self._both_nobody(one, other)
-
-    def has_inbox(self, one: Client, other: Client) -> bool:
-        """Whether a node gets what is sent to another's sample agent."""
-        return one is other or (isinstance(one, Gateway) and isinstance(other, Gateway) and self.speaks_as(one, other))
-
-    def reaches(self, one: Client, other: Client) -> bool:
-        """Whether a node's agents may send to another's: those who have an inbox."""
-        return bool(access.inboxes(other)) and (one is other or access.reaches(self.plan, one, other))
-
-    def sees(self, one: Client, other: Client) -> bool:
-        """Whether a node may know that another's sample agent is online."""
-        return (
-            isinstance(one, Operator)
-            or one is other
-            or self.plan.related(one, other)
-            or (isinstance(one, Gateway) and self.has_inbox(one, other))
-        )
-
-    def knows_name(self, one: Client, other: Client) -> bool:
-        """Whether a node may know of another's name and what is taken under it."""
-        if isinstance(one, Operator) or one is other:
-            return True
-        both = access.called(one) is not None and access.called(other) is not None
-        return both and access.converse(self.plan, one, other)
-
-    def writes_to(self, one: Client, other: Client) -> bool:
-        """Whether a named node may send to another by name."""
-        both = access.called(one) is not None and access.called(other) is not None
-        return both and one is not other and self.plan.may(one, "message", other)
-
-    @staticmethod
-    def _both_nobody(one: Client, other: Client) -> bool:
-        """Operators without an id are one: ``operator/0``."""
-        return isinstance(one, Operator) and isinstance(other, Operator) and one.id is None and other.id is None
-
-
-def _agent(client: Client) -> dict[str, FieldValue]:
-    """One agent that a node speaks for: of a gateway the last id, which is least in use."""
-    agent = access.agents(client)[-1]
-    return agent if "id" in agent else {**agent, "id": 0xFFFF}
-
-
-def _sender(client: Client) -> dict[str, FieldValue]:
-    return {f"from_{name}": value for name, value in _agent(client).items()}
-
-
-def _inbox(client: Client) -> dict[str, FieldValue]:
-    agent = _agent(client)
-    return {**agent, "block": int(agent["id"]) // 256}
-
-
 # -- one router, or the way from one to another ------------------------------------------------------------------
 
 
@@ -234,7 +169,8 @@ class _Way:
         self._label = label
         self._near, self._far = near, far
         self._timeout_s = timeout_s
-        self._expected = _Expected(plan)
+        self._expected = Expected(plan)
+        self._verbs = self._expected.limited_verbs()
         self._clients = {client.name: client for client in plan.clients}
         self._saying: dict[str, Mesh] = {}
         self._listening: dict[str, Mesh] = {}
@@ -261,7 +197,7 @@ class _Way:
 
     async def _open(self, stack: AsyncExitStack) -> None:
         async def one(name: str, endpoint: str, sessions: dict[str, Mesh]) -> None:
-            settings = _settings(self._plan, self._directory / name, endpoint)
+            settings = settings_of(self._plan, self._directory / name, endpoint)
             sessions[name] = await stack.enter_async_context(await Mesh.open_once(settings, timeout_s=self._timeout_s))
 
         opening = [one(name, self._near, self._saying) for name in self._clients]
@@ -297,7 +233,7 @@ class _Way:
                 )
             self._serve(name, mesh)
             # a token that is declared after all that, and seen by the same node elsewhere, has overtaken nothing
-            token = _token(PRESENCE.every(**_presence(self._clients[name])), f"ready-{name}")
+            token = _token(PRESENCE.every(**presence_of(self._clients[name])), f"ready-{name}")
             ready[name] = asyncio.Event()
             self._kept.append(
                 self._saying[name].watch_tokens(token, lambda key, alive, name=name: ready[name].set())  # type: ignore[misc]
@@ -309,7 +245,7 @@ class _Way:
         """What everybody tries to hear: each inbox, group, stream and name, and everything at once."""
         keys = {BROADCAST.every(), NAMED_ALL.every(), PING.of(zid=MARK), "macs/**"}
         for client in self._plan.clients:
-            keys.add(UNICAST.every(**_inbox(client)))
+            keys.add(UNICAST.every(**inbox_of(client)))
             if isinstance(client, Robot):
                 keys.add(STREAM.of(type=ROS, id=client.id, node=MARK))
                 if client.group:
@@ -333,29 +269,24 @@ class _Way:
             attempt.heard.add(name)
 
     def _serve(self, name: str, mesh: Mesh) -> None:
-        async def answer(key: str, payload: bytes) -> bytes:
+        async def answer(key: str, payload: bytes) -> bytes | None:
+            if not payload.startswith(PROBE):
+                return None  # somebody else's call of a robot that is not there
             self._asked.setdefault(payload, set()).add(name)
             return b""
 
-        def serve(key: str) -> None:
-            self._kept.append(mesh.serve(key, answer))
+        def serve(key: str, *, stand_in: bool = False) -> None:
+            self._kept.append(mesh.serve(key, answer, stand_in=stand_in))
 
         for other in self._plan.clients:
-            for mark in (MARK, *self._limited_verbs()) if other.name == name else (f"{MARK}-{name}",):
+            for mark in (MARK, *self._verbs) if other.name == name else (f"{MARK}-{name}",):
+                real = mark in self._verbs  # calls of others may come: they are for the robot, if it is there
                 if not isinstance(other, Gateway):
-                    serve(CALL.every(**_agent(other), verb=mark))
-                if (called := access.called(other)) is not None and mark not in self._limited_verbs():
+                    serve(CALL.every(**agent_of(other), verb=mark), stand_in=real)
+                if (called := access.called(other)) is not None and not real:
                     serve(NAMED.every(name=called, message_type=mark))
                     serve(LAST.every(name=called, message_type=mark))
         serve(PING.of(zid=f"{MARK}-{name}"))
-
-    def _limited_verbs(self) -> list[str]:
-        """Verbs that some may call of somebody who may not call all."""
-        found: dict[str, None] = {}
-        for one in self._plan.clients:
-            for other in self._plan.clients:
-                found.update(dict.fromkeys(self._plan.verbs(one, other) or ()))
-        return list(found)
 
     # -- saying --------------------------------------------------------------------------------------------------
 
@@ -381,16 +312,16 @@ class _Way:
                     heard_by.pop(name.name)  # it has its own words already
                 pretending = "" if name is client else f" as {name.name}"
                 yield Attempt(f"{client.name} puts{pretending} {what}", key, target, heard_by)
-        at_once = UNICAST.every(type=ROS, **_sender(client))
+        at_once = UNICAST.every(type=ROS, **sender_of(client))
         nobody = {other.name: False for other in self._here}
         yield Attempt(f"{client.name} puts to every robot at once", at_once, None, nobody)
 
     def _puts_as(self, name: Client) -> Iterator[tuple[str, str, str | None, list[Client]]]:
         """What somebody may put, or who pretends to be him: in words, the key, for whom, and who may hear it."""
-        expected, sender, here = self._expected, _sender(name), self._here
+        expected, sender, here = self._expected, sender_of(name), self._here
         reached = [other for other in here if expected.reaches(name, other)]
         for receiver in here:
-            key = UNICAST.of(**_inbox(receiver), **sender)
+            key = UNICAST.of(**inbox_of(receiver), **sender)
             hearers = [other for other in here if receiver in reached and expected.has_inbox(other, receiver)]
             yield f"to {receiver.name} by id", key, receiver.name, hearers
         for group in sorted({robot.group for robot in self._plan.robots if robot.group}):
@@ -424,7 +355,7 @@ class _Way:
             leases = {other.name: really and not isinstance(other, Robot) for other in self._here}
             yield Attempt(
                 f"{client.name} is online{pretending}",
-                _token(PRESENCE.every(**_presence(name)), mark),
+                _token(PRESENCE.every(**presence_of(name)), mark),
                 None,
                 sees,
             )
@@ -457,7 +388,7 @@ class _Way:
             if isinstance(client, Operator):
                 key = PING.of(zid=f"{MARK}-{client.name}")
             else:
-                key = UNICAST.of(**_inbox(client), **_sender(client))
+                key = UNICAST.of(**inbox_of(client), **sender_of(client))
             payload = PROBE + f" echo {number} {client.name}".encode()
             events[client.name] = self._echoes[payload] = asyncio.Event()
             self._saying[client.name].put_unasked(key, payload)
@@ -517,14 +448,14 @@ class _Way:
             verbs = self._plan.verbs(name, callee)
             if name is not client and verbs == []:
                 continue  # what its owner may not do shows nothing about who pretends to be it
-            for verb in (MARK, *self._limited_verbs()):
-                key = CALL.of(**_agent(callee), verb=verb, **_sender(name))
+            for verb in (MARK, *self._verbs):
+                key = CALL.of(**agent_of(callee), verb=verb, **sender_of(name))
                 what = f"{client.name} calls {verb} of {callee.name}{pretending}"
                 yield Question(client.name, what, key, really and (verbs is None or verb in verbs))
             if name is client and verbs is None:
                 for thief in self._here:
                     if thief is not callee:
-                        key = CALL.of(**_agent(callee), verb=f"{MARK}-{thief.name}", **_sender(client))
+                        key = CALL.of(**agent_of(callee), verb=f"{MARK}-{thief.name}", **sender_of(client))
                         what = f"{thief.name} answers {client.name} as {callee.name}"
                         permitted = self._expected.speaks_as(thief, callee)
                         yield Question(client.name, what, key, permitted, thief.name)
@@ -561,18 +492,18 @@ async def _answered(mesh: Mesh, key: str, payload: bytes) -> bool:
     return True
 
 
-def _presence(client: Client) -> dict[str, FieldValue]:
-    return {**_agent(client), "group": client.group if isinstance(client, Robot) else 0}
-
-
 def _token(expression: str, mark: str) -> str:
     """A key of an expression that ends in ``**``, which no program takes for a token of its own."""
     return expression.removesuffix("**") + f"{UNREAD}-{mark}"
 
 
-def _settings(plan: Plan, directory: Path, endpoint: str) -> MeshSettings:
-    return MeshSettings(
-        connect=[endpoint], namespace=plan.namespace, overrides=client_overrides(str(directory.resolve()))
+def settings_of(plan: Plan, directory: Path, endpoint: str) -> MeshSettings:
+    """A node's session for the check: its certificate, and what the plan says of every link."""
+    return changed(
+        plan.mesh,
+        connect=[endpoint],
+        namespace=plan.namespace,
+        overrides=client_overrides(str(directory.resolve())),
     )
 
 
@@ -592,9 +523,9 @@ async def _refusals(plan: Plan, directory: Path, label: str, endpoint: str, time
         )
         root = f"transport/link/tls/root_ca_certificate:'{(ours / certificates.AUTHORITY).resolve()}'"
         attempts = {
-            f"{name} with a certificate of another authority is let in": _settings(plan, foreign, endpoint),
-            "somebody without a certificate is let in": MeshSettings(connect=[endpoint], overrides=[root]),
-            "somebody without TLS is let in": MeshSettings(connect=[f"tcp/{endpoint.partition('/')[2]}"]),
+            f"{name} with a certificate of another authority is let in": settings_of(plan, foreign, endpoint),
+            "somebody without a certificate is let in": changed(plan.mesh, connect=[endpoint], overrides=[root]),
+            "somebody without TLS is let in": changed(plan.mesh, connect=[f"tcp/{endpoint.partition('/')[2]}"]),
         }
         seen = await asyncio.gather(*(_let_in(settings, timeout_s) for settings in attempts.values()))
     return [Result(label, what, False, inside) for what, inside in zip(attempts, seen, strict=True)]

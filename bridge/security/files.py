@@ -12,6 +12,8 @@ from bridge.security import access
 from bridge.security.access import Rule
 from bridge.security.plan import Client, Gateway, Plan, Robot, Router
 from macs_zenoh.config import MeshSettings, TrafficRule, changed
+from macs_zenoh.keyexpr import STREAM, type_name
+from macs_zenoh.messages import UNITY
 
 WIDTH = 119
 
@@ -288,14 +290,27 @@ def _low_pass(plan: Plan) -> Iterator[str]:
         yield "  ],"
 
 
+STREAMS = STREAM.template.split("/")[:2]
+"""How the keys of robots' topics begin, and no others."""
+
+
 def _priorities(plan: Plan) -> Iterator[str]:
-    entries = [
-        f'    {{ id: "priority {number}", messages: ["put", "query"], flows: ["ingress"],'
-        f" key_exprs: {json.dumps([_inside(plan, rule.match)])},"
-        f" overwrite: {{ priority: {json.dumps(rule.priority)} }} }},"
-        for number, rule in enumerate(plan.traffic)
-        if rule.priority is not None
-    ]
+    """Not of robots' topics: a robot's own rule for a topic wins over one for its key; a router would undo that."""
+    entries: list[str] = []
+    given = [(number, rule) for number, rule in enumerate(plan.traffic) if rule.priority is not None]
+    for number, rule in given:
+        begin = rule.match.split("/")[:2]
+        if begin == STREAMS:
+            yield f"  // priority of {rule.match} is left to the programs: a robot may have another for the topic"
+        elif len(begin) == 2 and "*" not in "".join(begin):
+            entries.append(
+                f'    {{ id: "priority {number}", messages: ["put", "query"], flows: ["ingress"],'
+                f" key_exprs: {json.dumps([_inside(plan, rule.match)])},"
+                f" overwrite: {{ priority: {json.dumps(rule.priority)} }} }},"
+            )
+        else:
+            yield f"  // priorities from {rule.match} on are left to the programs: robots' topics are among its keys"
+            break
     if entries:
         yield "  // the last one that fits wins here, the first one in the plan"
         yield "  qos: { network: ["
@@ -325,7 +340,7 @@ def settings_toml(plan: Plan, client: Client, directory: str) -> str:
         *(f"  {_toml(override)}," for override in client_overrides(directory)),
         "]",
     ]
-    lines += _sections(client)
+    lines += _sections(plan, client)
     for rule in plan.traffic:
         lines += ["", "[[traffic]]"]
         given = msgspec.structs.asdict(rule)
@@ -346,16 +361,26 @@ def _command(client: Client, directory: str) -> str:
     return f"macs {verb} --settings {directory}/macs.toml"
 
 
-def _sections(client: Client) -> list[str]:
+def _sections(plan: Plan, client: Client) -> list[str]:
     if isinstance(client, Gateway) and client.blocks:
         return ["", "[gateway]", "# the certificate is good for these only", f"blocks = {json.dumps(client.blocks)}"]
     if not isinstance(client, Robot):
         return []
     lines = ["", "[robot]", f"id = {client.id}", f"group = {client.group}"]
+    commanders = [pattern for other in plan.clients if plan.may(other, "command", client) for pattern in _who(other)]
+    lines += ["# who may command it; who may only see it registers for its topics and for nothing else"]
+    lines += [f"register_allow = {json.dumps(list(dict.fromkeys(commanders)))}"]
     if client.called is not None:
         name = json.dumps(client.called, ensure_ascii=False)
         lines += ["", "[awareness]", f"name = {name}", f"id = {client.id}", "beside = true"]
     return lines
+
+
+def _who(client: Client) -> list[str]:
+    """The agents that a client speaks for, as a robot's settings name them."""
+    if isinstance(client, Gateway):
+        return [f"block/{block}" for block in client.blocks] or [type_name(UNITY)]
+    return [f"{type_name(int(agent['type']))}/{agent['id']}" for agent in access.agents(client)]
 
 
 def _toml(text: str) -> str:

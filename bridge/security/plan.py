@@ -314,6 +314,9 @@ def _check(plan: Plan) -> None:
     for field in ELSEWHERE:
         if getattr(plan.mesh, field) != getattr(MeshSettings(), field):
             raise ConfigError(f"mesh.{field}", "is not for every link; a plan says it elsewhere")
+    days, ca_days = plan.certificates.days, plan.certificates.ca_days
+    if ca_days < days:
+        raise ConfigError("certificates.ca_days", f"below days, {days}: the authority would end before what it signs")
     _check_crowd(plan)
     MeshSettings(namespace=plan.namespace)  # its rules for a namespace
 

@@ -64,21 +64,21 @@ class Arrivals:
         finally:
             self._own.payload = None
 
-    def receiver(self, on_batch: OnBatch, on_numbered: OnNumbered | None = None) -> Callable[[zenoh.Sample], None]:
-        """What Zenoh calls, in whatever thread, for each sample of one subscription. Samples that their source has
-        numbered go to ``on_numbered``, if it is given."""
+    def receiver(self, on_batch: OnBatch, on_numbered: OnNumbered | None = None) -> Callable[[zenoh.Sample], bool]:
+        """What Zenoh calls, in whatever thread, for each sample of one subscription; whether there was room for it.
+        Samples that their source has numbered go to ``on_numbered``, if it is given."""
         queue, limit, large, own = self._queue, self.LIMIT, self.LARGE_BYTES, self._own
 
-        def receive(sample: zenoh.Sample) -> None:
+        def receive(sample: zenoh.Sample) -> bool:
             if len(queue) >= limit and not self._has_room():
                 self._drops["loop_behind"] += 1
-                return
+                return False
             payload = getattr(own, "payload", None)
             if payload is None:
                 payload = sample.payload.to_bytes()
             if len(payload) > large and not self._has_room_for(len(payload)):
                 self._drops["loop_behind"] += 1
-                return
+                return False
             info = sample.source_info if on_numbered is not None else None
             if info is None or on_numbered is None:
                 queue.append((on_batch, (str(sample.key_expr), payload)))
@@ -87,6 +87,7 @@ class Arrivals:
                 queue.append((on_numbered, (str(sample.key_expr), payload, source, info.source_sn)))
             if not self._waiting:
                 self._wake_loop()
+            return True
 
         return receive
 

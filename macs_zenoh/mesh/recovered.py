@@ -24,6 +24,8 @@ class Recovered:
 
     ASK_S = 3.0
     """How long a question may take; what it has brought until then stays."""
+    AGAIN_S = 0.5
+    """After so long it is asked again which sources exist, when answers had to be dropped."""
 
     def __init__(
         self,
@@ -81,16 +83,21 @@ class Recovered:
     def _look_for_sources(self) -> None:
         """Ask every source for its newest number, so that only what it sends from now on is wanted."""
         linked = self._linked
+        dropped: list[bool] = []
 
         def known(batch: list[Numbered]) -> None:
+            freed: list[Sample] = []
             for key, _, source, number in batch:
-                self._recovery.known(source, key, number, time.monotonic())
+                freed += self._recovery.known(source, key, number, time.monotonic())
+            self._go_on(freed)
 
         def ended(_: list[Sample]) -> None:
-            if linked and self._linked:  # else once there is a router
+            if dropped and not self._closed:
+                self._loop.call_later(self.AGAIN_S, self._look_for_sources)
+            elif linked and self._linked:  # else once there is a router
                 self._recovery.settled = True
 
-        self._get(f"{self._key}/{SOURCES}?_max=1", known, ended)
+        self._get(f"{self._key}/{SOURCES}?_max=1", known, ended, dropped)
 
     def _numbered(self, batch: list[Numbered]) -> None:
         now = time.monotonic()
@@ -101,11 +108,12 @@ class Recovered:
 
     def _heartbeat(self, batch: list[Sample]) -> None:
         now = time.monotonic()
+        freed: list[Sample] = []
         for key, payload in batch:
             data_key, _, source = key.removesuffix("/_").rpartition(f"/{SOURCES.removesuffix('**')}")
             if data_key and len(payload) == 4:
-                self._recovery.heartbeat(source, data_key, int.from_bytes(payload, "little"), now)
-        self._go_on([])
+                freed += self._recovery.heartbeat(source, data_key, int.from_bytes(payload, "little"), now)
+        self._go_on(freed)
 
     def _go_on(self, freed: list[Sample]) -> None:
         """Pass on what is in turn, ask for what is missing."""
@@ -126,26 +134,33 @@ class Recovered:
             self._on_batch(freed)
 
     def _ask(self, ask: Ask) -> None:
+        dropped: list[bool] = []
+
         def replied(batch: list[Numbered]) -> None:
             now = time.monotonic()
+            if dropped:
+                self._recovery.reply_dropped(ask)
             freed: list[Sample] = []
             for key, payload, _, number in batch:
                 freed += self._recovery.reply(ask, number, (key, payload), now)
             self._go_on(freed)
 
         def ended(_: list[Sample]) -> None:
+            if dropped:
+                self._recovery.reply_dropped(ask)
             self._go_on(self._recovery.ended(ask, time.monotonic()))
 
         source = f"{SOURCES.removesuffix('**')}{ask.source}/**"
-        self._get(f"{ask.key}/{source}?_sn={ask.numbers}", replied, ended)
+        self._get(f"{ask.key}/{source}?_sn={ask.numbers}", replied, ended, dropped)
 
-    def _get(self, selector: str, on_replies: OnNumbered, on_end: OnBatch) -> None:
+    def _get(self, selector: str, on_replies: OnNumbered, on_end: OnBatch, dropped: list[bool]) -> None:
+        """``dropped`` gets an entry for each reply that there was no room for, before those that came after it."""
         arrivals = self._arrivals
         receive = arrivals.receiver(_ignore, on_replies)
 
         def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                receive(reply.ok)
+            if reply.ok is not None and not receive(reply.ok):
+                dropped.append(True)
 
         try:
             self._session.get(

@@ -34,7 +34,8 @@ Sample = tuple[str, Payload]
 
 OnBatch = Callable[[list[Sample]], None]
 OnMiss = Callable[[str, int], None]
-Handler = Callable[[str, bytes], Awaitable[bytes]]
+Handler = Callable[[str, bytes], Awaitable[bytes | None]]
+"""Answers a query, by its key and payload. None: not at all, as if nobody were here."""
 
 Numbered = tuple[str, Payload, str, int]
 """Key, payload, source and number of a sample that its source keeps."""

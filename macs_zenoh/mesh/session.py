@@ -7,8 +7,8 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
 
 import msgspec
@@ -19,6 +19,7 @@ from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.errors import CallTimeout, ConfigError, MacsError, NotServed, OutOfRange, Refused, Unreachable
 from macs_zenoh.keyexpr import PING
 from macs_zenoh.shaping import Shaper
+from macs_zenoh.versions import installed
 
 from .arrivals import Arrivals
 from .opening import first_line, insert, zenoh_config
@@ -99,7 +100,7 @@ class Mesh:
         while True:
             config = zenoh_config(settings)
             try:
-                return cls(await asyncio.to_thread(zenoh.open, config), settings, traffic)
+                return cls(await _open(config), settings, traffic)
             except zenoh.ZError as error:
                 problem = first_line(error)
                 if settings.mode != "client":
@@ -120,14 +121,10 @@ class Mesh:
         zenoh.init_log_from_env_or("off")  # what goes wrong is in the error
         config = zenoh_config(settings)
         insert(config, "connect/timeout_ms", str(round(timeout_s * 1000)))
-        opening = asyncio.ensure_future(asyncio.to_thread(zenoh.open, config))
         try:
-            return cls(await asyncio.shield(opening), settings)
+            return cls(await _open(config), settings)
         except zenoh.ZError as error:
             raise Unreachable(", ".join(settings.routers) or "a router", first_line(error)) from error
-        except asyncio.CancelledError:
-            opening.add_done_callback(_close_late)
-            raise
 
     @property
     def backlogged(self) -> bool:
@@ -305,15 +302,20 @@ class Mesh:
         await ended.wait()
         return answers
 
-    def serve(self, key: str, handler: Handler) -> Subscription:
-        """Answer queries on ``key`` with ``await handler(key, payload)``; raise Refused in it to refuse."""
+    def serve(self, key: str, handler: Handler, *, stand_in: bool = False) -> Subscription:
+        """Answer queries on ``key`` with ``await handler(key, payload)``; raise Refused in it to refuse.
+
+        With ``stand_in`` it is asked only where nobody else serves the key.
+        """
 
         async def answer(query: zenoh.Query) -> None:
             with query:
                 name = str(query.key_expr)
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
-                    query.reply(query.key_expr, await handler(name, payload))
+                    reply = await handler(name, payload)
+                    if reply is not None:
+                        query.reply(query.key_expr, reply)
                 except Refused as refusal:
                     query.reply_err(msgspec.json.encode({"refused": refusal.reason}))
                 except MacsError as error:
@@ -330,13 +332,13 @@ class Mesh:
         def on_query(query: zenoh.Query) -> None:
             self._from_thread(spawn, query)
 
-        return Subscription(
-            self._session.declare_queryable(key, zenoh.handlers.Callback(on_query, indirect=False), complete=True)
-        )
+        answering = zenoh.handlers.Callback(on_query, indirect=False)
+        # Zenoh asks one that is complete if there is any, else all
+        return Subscription(self._session.declare_queryable(key, answering, complete=not stand_in))
 
     def answer_pings(self) -> Subscription:
         """Let `macs doctor` measure the way to this program, and learn its clock and version."""
-        macs, wheel = _version("macs-zenoh"), _version("eclipse-zenoh")
+        macs, wheel = installed("macs-zenoh"), installed("eclipse-zenoh")
 
         async def answer(key: str, payload: bytes) -> bytes:
             said = ping.pong(self.settings, now_s=time.time(), macs=macs, zenoh=wheel, drops=dict(self.drops))
@@ -402,17 +404,25 @@ def _problem(key: str, payload: bytes, timeout_s: float) -> MacsError:
     return Unreachable(key, answer.get("failed", "unknown failure"))
 
 
-def _version(package: str) -> str:
+async def _open(config: zenoh.Config) -> zenoh.Session:
+    """Open a session in a thread. When the caller is cancelled, a session that comes late is closed there: the event
+    loop may have ended by then, and a process that exits with an open session hangs.
+
+    Raises zenoh.ZError.
+    """
+    thread = ThreadPoolExecutor(1, "macs-open")
+    opened = thread.submit(zenoh.open, config)
+    thread.shutdown(wait=False)
     try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
+        return await asyncio.wrap_future(opened)
+    except asyncio.CancelledError:
+        opened.add_done_callback(_close_late)
+        raise
 
 
-def _close_late(opening: asyncio.Future[zenoh.Session]) -> None:
-    """Close a session that nobody waits for any more."""
-    if not opening.cancelled() and opening.exception() is None:
-        opening.result().close()  # type: ignore[no-untyped-call]
+def _close_late(opened: Future[zenoh.Session]) -> None:
+    if not opened.cancelled() and opened.exception() is None:
+        opened.result().close()  # type: ignore[no-untyped-call]
 
 
 def _log_waiting(target: str) -> None:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import threading
+
+import pytest
+import zenoh
 
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
@@ -15,6 +19,32 @@ async def test_the_next_router_is_tried_at_the_start(router: str) -> None:
     away = f"tcp/127.0.0.1:{free_port()}"
     async with await asyncio.wait_for(Mesh.open(MeshSettings(connect=[away, router])), 10) as mesh:
         await until(lambda: mesh.linked)
+
+
+@pytest.mark.parametrize("once", [False, True], ids=["open", "open_once"])
+async def test_a_session_that_comes_late_is_closed(router: str, once: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who stops waiting for a session leaves none behind when it comes about after all."""
+    sessions: list[zenoh.Session] = []
+    began, go_on, there = threading.Event(), threading.Event(), threading.Event()
+    really_open = zenoh.open
+
+    def slow(config: zenoh.Config) -> zenoh.Session:
+        began.set()
+        go_on.wait(10)
+        sessions.append(really_open(config))
+        there.set()
+        return sessions[0]
+
+    monkeypatch.setattr(zenoh, "open", slow)
+    settings = MeshSettings(connect=[router])
+    opening = asyncio.ensure_future(Mesh.open_once(settings, timeout_s=5) if once else Mesh.open(settings))
+    await asyncio.to_thread(began.wait, 10)
+    opening.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    go_on.set()
+    await asyncio.to_thread(there.wait, 10)
+    await until(sessions[0].is_closed)
 
 
 async def test_waiting_goes_on_until_any_router_is_there() -> None:

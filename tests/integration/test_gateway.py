@@ -41,13 +41,18 @@ class Socket:
 
     async def message(self) -> tuple[Metadata, bytes]:
         """The next message; ConnectionError at the end of the stream."""
+        metadata, body = await self.raw_message()
+        return Metadata.decode(metadata), body
+
+    async def raw_message(self) -> tuple[bytes, bytes]:
+        """The same with its metadata as it came."""
         while not self._messages:
             data = await asyncio.wait_for(self.reader.read(65536), 5)
             if not data:
                 raise ConnectionError
             self._messages += self._decoder.feed(data)
         metadata, body = split_message(self._messages.pop(0))
-        return Metadata.decode(metadata), bytes(body)
+        return metadata, bytes(body)
 
     async def greet(self) -> None:
         """Take the first message, which gives the id."""

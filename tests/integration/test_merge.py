@@ -4,6 +4,7 @@ mesh without duplicate ids."""
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import time
 from collections import Counter
@@ -14,11 +15,14 @@ from typing import Any
 import pytest
 
 import macs_zenoh
-from bridge.gateway import Gateway
+from bridge.gateway import Gateway, renumbering
+from bridge.gateway.leases import Leases
+from bridge.gateway.robots import RobotCalls
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Incoming, Subscription
 from macs_zenoh.agent import Agent
-from macs_zenoh.config import GatewaySettings, MeshSettings, changed
+from macs_zenoh.config import GatewaySettings, MeshSettings, TrafficRule, changed
+from macs_zenoh.directory import Directory
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.messages import (
     ROS,
@@ -35,7 +39,8 @@ from macs_zenoh.messages import (
     decode_data,
     encode_management,
 )
-from macs_zenoh.wire import MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.registrations import AgentKey, Task
+from macs_zenoh.wire import Layout, MessageDecoder, encode_frame, encode_message, split_message
 from tests.integration.conftest import until
 from tests.links import Link, counted
 from tests.programs import Program, macs
@@ -133,6 +138,8 @@ class Robot:
         self.agent = agent
         self.registrants: dict[tuple[int, str], set[int]] = {}
         self.answer_after: asyncio.Event | None = None
+        self.added: asyncio.Event | None = None
+        """Set by each `add_node`, which is then not answered."""
         agent.serve("add_node", self._add)
         agent.serve("remove_node", self._remove)
         serving = asyncio.ensure_future(self._serve())
@@ -151,6 +158,9 @@ class Robot:
     async def _add(self, call: macs_zenoh.Call) -> bytes:
         node = decode_data(AddNode, call.data)
         self.registrants.setdefault((node.node_type, node.node_name), set()).add(node.registrant_agent_id)
+        if self.added is not None:
+            self.added.set()
+            await asyncio.sleep(30)
         return b""
 
     async def _remove(self, call: macs_zenoh.Call) -> bytes:
@@ -257,7 +267,7 @@ async def heard(robot: Robot, stream: Subscription, text: bytes) -> None:
         await asyncio.wait([arriving], timeout=0.1)
     first = int((await arriving).data.rpartition(b" ")[2])
     robot.chatter(b"last")
-    rest = []
+    rest: list[bytes] = []
     while not rest or rest[-1] != b"last":
         rest.append((await asyncio.wait_for(stream.__anext__(), 5)).data)
     assert rest == [*(b"%s %d" % (text, n) for n in range(first + 1, number + 1)), b"last"]
@@ -347,6 +357,28 @@ async def test_an_answer_to_the_former_id_arrives(sites: Sites) -> None:
     assert robot.registrants[NodeType.CLIENT, "nd__set"] == {256}
 
 
+async def test_who_leaves_before_it_has_its_other_id_is_forgotten(sites: Sites) -> None:
+    """A robot that was told the id that a headset was about to have is told to forget it when the headset leaves
+    first: no presence ever ends under that id."""
+    await sites.part()
+    await sites.headset(await sites.gateway("a", "aa"))
+    there = await sites.gateway("b", "bb")
+    robot = await sites.robot("b", 1002)
+    headset = await sites.headset(there)
+    await asyncio.wait_for(
+        heard(robot, await headset.subscribe("/chatter", "std_msgs/String", agents=[1002]), b"parted"), 10
+    )
+    robot.added = asyncio.Event()
+    await sites.meet()
+    await asyncio.wait_for(robot.added.wait(), 10)
+    registrants = robot.registrants[NodeType.SUBSCRIBER, "nd__chatter"]
+    assert registrants == {1, 256}
+    robot.added = None
+    await headset.close()
+    await until(lambda: 256 not in registrants)
+    assert (UNITY, 256) not in there.directory
+
+
 async def test_the_winner_keeps_what_it_registered_at_the_other_site(sites: Sites) -> None:
     """When both headsets of one id are registered on one robot, both get its topic after the merge, each once."""
     here, there = await sites.gateway("a", "aa", block=0), await sites.gateway("b", "bb", block=1)
@@ -367,14 +399,19 @@ async def test_the_winner_keeps_what_it_registered_at_the_other_site(sites: Site
         await asyncio.wait_for(heard(robot, each, b"together"), 10)
 
 
-async def test_two_agents_have_leased_the_same_id(sites: Sites) -> None:
+async def test_two_agents_have_leased_the_same_id(sites: Sites, caplog: pytest.LogCaptureFixture) -> None:
     """Of two agents that took the same free id while they were parted, one gets another and goes on under it: it
-    receives, serves, sends and publishes; the program hears of it."""
+    receives, serves, sends and publishes; the program hears of it, and what fails there changes nothing."""
     await sites.part()
     one, two = await sites.agent("a", "ros", "aa"), await sites.agent("b", "ros", "bb")
     assert (one.id, two.id) == (1, 1)
     changes: list[tuple[int, int]] = []
-    two.on_id(lambda old, new: changes.append((old, new)))
+
+    def changed_to(old: int, new: int) -> None:
+        changes.append((old, new))
+        raise RuntimeError("the program's own fault")
+
+    two.on_id(changed_to)
 
     async def name(call: macs_zenoh.Call) -> bytes:
         return f"{two.id}".encode()
@@ -385,6 +422,7 @@ async def test_two_agents_have_leased_the_same_id(sites: Sites) -> None:
     await sites.right(await sites.meet(), [(1, 1), (1, 2), (2, 700)])
     assert (one.id, two.id) == (1, 2)
     assert changes == [(1, 2)]
+    assert errors(caplog) == ["handling the new id of ros/2 failed"]
     assert await other.call("ros", 2, "name") == b"2"
     other.send(b"to two", to="ros", ids=[2])
     assert (await asyncio.wait_for(two.receive(), 5)).data == b"to two"
@@ -397,6 +435,60 @@ async def test_two_agents_have_leased_the_same_id(sites: Sites) -> None:
         await asyncio.sleep(0.05)
     watching.close()
     assert set(streamed) == {"macs/from/ros/2/nd__x"}
+
+
+async def test_what_fails_for_one_agent_stops_no_other(
+    sites: Sites, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A fault of ours while ids change costs its own agent at most, and is told: others get their ids, the id that
+    was set aside is free again, and a round that fails as a whole is repeated."""
+    await sites.part()
+    here, there = await sites.gateway("a", "aa"), await sites.gateway("b", "bb")
+    await sites.headset(here), await sites.headset(here)
+    headsets = [await sites.headset(there) for _ in "12"]
+    assert [headset.id for headset in headsets] == [1, 2]
+    monkeypatch.setattr(renumbering, "AGAIN_S", 0.1)
+    prepare, more = RobotCalls.to_prepare, Leases.more
+    attempts: list[int] = []
+
+    def failing(calls: RobotCalls, agent: AgentKey, agent_id: int) -> list[Task]:
+        if agent == (UNITY, 1):
+            raise RuntimeError("of one agent")
+        return prepare(calls, agent, agent_id)
+
+    async def failing_once(leases: Leases) -> None:
+        attempts.append(1)
+        if len(attempts) == 1:
+            raise RuntimeError("of all")
+        await more(leases)
+
+    monkeypatch.setattr(RobotCalls, "to_prepare", failing)
+    monkeypatch.setattr(Leases, "more", failing_once)
+    await sites.meet()
+    await until(lambda: headsets[1].id != 2)
+    assert (headsets[0].id, headsets[1].id) == (1, 257)
+    await until(lambda: len(errors(caplog)) == 2)
+    assert there.agents.ids == {1, 257}
+    told = {str(record.exc_info[1]) for record in caplog.records if record.exc_info}
+    assert told == {"of all", "of one agent"}
+
+
+async def test_a_registration_that_a_rule_refuses_keeps_nobody_from_its_id(router: str) -> None:
+    """What a traffic rule does not let pass is not told to the robot, and nothing else happens."""
+    faults: list[str] = []
+    loop = asyncio.get_running_loop()
+    loop.set_exception_handler(lambda _, context: faults.append(context["message"]))
+    rules = [TrafficRule(match="macs/**", max_bytes=1)]
+    async with await Mesh.open(MeshSettings(connect=[router]), traffic=rules) as mesh:
+        calls = RobotCalls(mesh, Directory(), Layout(), on_streams=lambda _: None, on_refused=lambda *_: None)
+        told = await calls.prepare(
+            [Task(7, AddNode(UNITY, 256, NodeType.SUBSCRIBER, "nd__x", "/x", "std_msgs/String"))], set()
+        )
+    gc.collect()
+    await asyncio.sleep(0)
+    assert told == []
+    assert mesh.drops["over_size"] == 1
+    assert faults == []
 
 
 @pytest.mark.parametrize("zids", [("aa", "bb"), ("bb", "aa")], ids=["the smaller leased", "the greater leased"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
+import socket as socketlib
 import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -133,6 +134,19 @@ async def test_stop_of_nobody_is_no_success(router: str) -> None:
     code, out, errors = await ended("stop", "-e", "tcp/127.0.0.1:1", "--timeout", "0.5")
     assert (code, out) == (1, "")
     assert "no Zenoh router answered" in errors
+
+
+@pytest.mark.parametrize("verb", ["ls", "stop"])
+async def test_the_next_router_gets_its_turn(verb: str, router: str, start_robot: StartRobot) -> None:
+    """With the first router's host off, which refuses nothing, a verb with its usual patience works over the second
+    one."""
+    robot = await start_robot(7)
+    off = socketlib.create_server(("127.0.0.1", 0))  # takes connections and says nothing
+    with off:
+        code, out, _ = await ended(verb, "-e", f"tcp/127.0.0.1:{off.getsockname()[1]}", "-e", router)
+    assert code == 0
+    assert "7" in out
+    assert robot.stopped is (verb == "stop")
 
 
 async def test_an_interrupted_stop_is_no_success(router: str, start_robot: StartRobot) -> None:

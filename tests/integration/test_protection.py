@@ -7,7 +7,14 @@ import json
 
 import pytest
 
+import macs_zenoh
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.errors import Refused
+from macs_zenoh.keyexpr import BROADCAST, GROUP
+from macs_zenoh.mesh import Mesh
 from macs_zenoh.messages import (
+    ROS,
+    UNITY,
     AddNode,
     Metadata,
     NodeType,
@@ -17,7 +24,8 @@ from macs_zenoh.messages import (
     encode_data,
     encode_management,
 )
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.routing import call, unicast_key
+from macs_zenoh.wire import PROBE, encode_frame, encode_message
 from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_gateway import Socket, socket
 
@@ -92,3 +100,177 @@ async def test_messages_of_an_unknown_node_go_through(start_gateway: StartGatewa
         await talker.send(json.dumps({"after": True}).encode(), ids=[listener.id], manager="Greeting")
         heard = [await listener.receive(5), await listener.receive(5)]
         assert sorted(bytes(message.data) for message in heard) == [b"answer", b'{"after": true}']
+
+
+# -- what a program on the mesh could pretend ------------------------------------------------------------------------
+
+
+FORGED = {
+    "another id": Metadata(ROS, 8, 5, "Greeting").encode(),
+    "another type": Metadata(UNITY, 7, 5, "Greeting").encode(),
+    "nobody": Metadata(request_id=5, message_manager="Greeting").encode(),
+    "in capitals": Metadata(ROS, 7, 5, "Greeting").encode()[:-1] + b',"SENDERAGENTID":8}',
+    "in two ways": b'{"sender_agent_id":8,"SenderAgentId":8,"requestId":5,"messageManager":"Greeting"}',
+}
+
+
+@pytest.mark.parametrize("forged", FORGED.values(), ids=FORGED.keys())
+async def test_the_sender_is_who_the_key_says(
+    forged: bytes, router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """Whatever metadata says, a headset is told the sender of the key, for each frame of a run and on every plane."""
+    gateway = await start_gateway()
+    true = Metadata(ROS, 7, 5, "Greeting").encode()
+    async with socket(gateway) as headset, await Mesh.open(MeshSettings(connect=[router])) as robot:
+        headset.configure(group=3)
+        await headset.online()
+        for key in (
+            unicast_key(UNITY, headset.id, ROS, 7),
+            GROUP.of(group=3, type=UNITY, from_type=ROS, from_id=7),
+            BROADCAST.of(from_type=ROS, from_id=7),
+        ):
+            said = [true, forged, forged, forged, true]
+            frames = [encode_frame(UNITY, message=encode_message(raw, b"%d" % n)) for n, raw in enumerate(said)]
+            robot.put(key, b"".join(frames))
+            for number in range(len(said)):
+                raw, body = await headset.raw_message()
+                assert body == b"%d" % number
+                fields = json.loads(raw)
+                sender = {name: value for name, value in fields.items() if "sender" in name.lower()}
+                assert sender == {"senderAgentType": ROS, "senderAgentId": 7}
+                assert (fields["requestId"], fields["messageManager"]) == (5, "Greeting")
+        lied = forged != FORGED["in capitals"]  # there the key that we read is true, and the other one is taken out
+        assert gateway.drops == ({"wrong_sender": 9} if lied else {})
+
+
+async def test_topic_data_only_for_whom_registered_it(
+    router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """Robot 7 reaches no headset that registered the topic on robot 8 only, whom it lists and whatever it says; and
+    nobody takes its data for robot 8's."""
+    gateway = await start_gateway()
+    of_seven, of_eight = await connect(gateway), await connect(gateway)
+
+    def data(robot: int, node: str, text: bytes) -> bytes:
+        metadata = Metadata(ROS, robot, 0, StreamData.manager, NodeType.SUBSCRIBER, node, "std_msgs/String")
+        management = encode_management(StreamData({"2": [of_eight.id, of_seven.id, of_eight.id, of_seven.id]}))
+        return encode_frame(ROS, management=management, message=encode_message(metadata.encode(), text))
+
+    async with (
+        macs_zenoh.join("ros", id=7, connect=[router]) as seven,
+        macs_zenoh.join("ros", id=8, connect=[router]) as eight,
+    ):
+        for robot in (seven, eight):
+            robot.serve("add_node", _accept)
+        chatter = await of_seven.subscribe("/chatter", "std_msgs/String", agents=[7])
+        other = await of_eight.subscribe("/other", "std_msgs/String", agents=[7])
+        true = await of_eight.subscribe("/chatter", "std_msgs/String", agents=[8])
+        for headset in (of_seven, of_eight):
+            await headset.online()  # the gateway knows of the registrations
+        seven.publish_stream("nd__chatter", data(8, "nd__chatter", b"forged"))
+        seven.publish_stream("nd__other", data(7, "nd__chatter", b"under another node's key"))
+        seven.publish_stream("nd__other", data(7, "nd__other", b"seven's"))
+        heard = await asyncio.wait_for(other.__anext__(), 5)
+        assert bytes(heard.data) == b"seven's"
+        eight.publish_stream("nd__chatter", data(8, "nd__chatter", b"eight's"))
+        heard = await asyncio.wait_for(true.__anext__(), 5)
+        assert (bytes(heard.data), heard.metadata.sender_agent_id) == (b"eight's", 8)
+        heard = await asyncio.wait_for(chatter.__anext__(), 5)
+        assert (bytes(heard.data), heard.metadata.sender_agent_id) == (b"forged", 7)
+        # of_eight on 7's /chatter; both under the other node's key; of_seven on 7's /other and on 8's /chatter
+        assert gateway.drops == {"wrong_sender": 1, "not_registered": 5}
+
+
+async def test_topic_data_stops_when_the_registration_does(
+    router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """A headset that has taken its registration back gets no more of the topic, though the robot still lists it."""
+    gateway = await start_gateway()
+    async with (
+        socket(gateway) as left,
+        socket(gateway) as stays,
+        macs_zenoh.join("ros", id=7, connect=[router]) as robot,
+    ):
+        robot.serve("add_node", _accept)
+        for headset in (left, stays):
+            headset.configure()
+            adding = AddNode(UNITY, headset.id, 1, "nd__chatter", "/chatter", "std_msgs/String")
+            headset.writer.write(registration(headset, [7], adding))
+            await headset.online()
+        left.writer.write(registration(left, [7], RemoveNode(UNITY, left.id, 1, "nd__chatter")))
+        await left.online()
+        metadata = Metadata(ROS, 7, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__chatter", "std_msgs/String")
+        management = encode_management(StreamData({"2": [left.id, stays.id]}))
+        message = encode_message(metadata.encode(), b"text")
+        robot.publish_stream("nd__chatter", encode_frame(ROS, management=management, message=message))
+        assert (await stays.message())[1] == b"text"
+        robot.broadcast(b"next")
+        assert (await left.message())[1] == b"next"
+        assert gateway.drops == {"not_registered": 1}
+
+
+async def _accept(_call: macs_zenoh.Call) -> bytes:
+    return b""
+
+
+async def test_a_registration_for_somebody_else_is_refused(router: str, start_gateway: StartGateway) -> None:
+    """Nobody registers another agent on an existing robot program, nor takes its registration back."""
+    gateway = await start_gateway()
+    async with socket(gateway) as robot, await Mesh.open(MeshSettings(connect=[router])) as mesh:
+        robot.configure(agent_type=ROS)
+        await robot.online()
+
+        async def ask(verb: str, node: AddNode | RemoveNode, caller: int) -> None:
+            metadata = Metadata(UNITY, caller, message_manager=node.manager)
+            key, frame = call((ROS, robot.id), verb, (UNITY, caller), encode_data(node), metadata)
+            await mesh.query(key, frame, timeout_s=5)
+
+        adding = AddNode(UNITY, 600, 1, "nd__chatter", "/chatter", "std_msgs/String")
+        removing = RemoveNode(UNITY, 600, 1, "nd__chatter")
+        await ask("add_node", adding, 600)
+        for verb, node in (("add_node", adding), ("remove_node", removing)):
+            with pytest.raises(Refused, match="unity/601 cannot register or remove nodes for unity/600"):
+                await ask(verb, node, 601)
+        await ask("remove_node", removing, 600)
+        for manager in (AddNode.manager, RemoveNode.manager):
+            metadata, _ = await robot.message()
+            assert (metadata.message_manager, metadata.sender_agent_id) == (manager, 600)
+
+
+async def test_a_probe_is_no_loss(router: str, start_gateway: StartGateway, connect: Connect) -> None:
+    """What `macs doctor` and `macs security check` send to see whether it arrives reaches no headset, and is counted
+    nowhere."""
+    gateway = await start_gateway()
+    headset = await connect(gateway)
+    async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
+        last = gateway.blocks[0] * 256 + 255
+        for agent_id in (last, headset.id):
+            mesh.put(unicast_key(UNITY, agent_id, UNITY, last), PROBE)
+        mesh.put(BROADCAST.of(from_type=UNITY, from_id=last), PROBE)
+        message = encode_message(Metadata(message_manager="Greeting").encode(), b"next")
+        mesh.put(unicast_key(UNITY, headset.id, UNITY, last), encode_frame(UNITY, message=message))
+        assert bytes((await headset.receive(5)).data) == b"next"
+        assert gateway.drops == {"wrong_sender": 1}  # the greeting named nobody
+
+
+async def test_an_agent_is_told_the_true_sender(router: str) -> None:
+    """A Python agent that looks into the metadata of a message or a call finds the sender of the key there."""
+    asked: list[Metadata] = []
+
+    async def look(asking: macs_zenoh.Call) -> bytes:
+        asked.append(asking.metadata)
+        return b""
+
+    async with (
+        macs_zenoh.join("ros", id=9, connect=[router]) as agent,
+        await Mesh.open(MeshSettings(connect=[router])) as robot,
+    ):
+        agent.serve("look", look)
+        forged = Metadata(ROS, 8, 5, "Greeting")
+        robot.put(
+            unicast_key(ROS, 9, ROS, 7), encode_frame(ROS, (9,), message=encode_message(forged.encode(), b"text"))
+        )
+        message = await asyncio.wait_for(agent.receive(), 5)
+        key, frame = call((ROS, 9), "look", (ROS, 7), b"", forged)
+        await robot.query(key, frame, timeout_s=5)
+        assert message.metadata == asked[0] == Metadata(ROS, 7, 5, "Greeting")

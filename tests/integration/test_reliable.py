@@ -7,11 +7,12 @@ import itertools
 import logging
 import signal
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
 
 import pytest
+import zenoh
 
 import macs_zenoh
 from bridge.gateway import Gateway
@@ -20,8 +21,10 @@ from macs_zenoh import awareness
 from macs_zenoh.agent import Agent, Call
 from macs_zenoh.config import GatewaySettings, MeshSettings, TrafficRule
 from macs_zenoh.keyexpr import NAMED_ALL
-from macs_zenoh.mesh import Mesh, Sample, Traffic
+from macs_zenoh.mesh import Mesh, Sample, Traffic, recovered
+from macs_zenoh.mesh.arrivals import Arrivals
 from macs_zenoh.mesh.outgoing import Outgoing
+from macs_zenoh.mesh.samples import OnBatch, OnNumbered
 from macs_zenoh.messages import AddNode, Metadata, NodeType, StreamData, decode_data, encode_management
 from macs_zenoh.named import Outcome
 from macs_zenoh.wire import encode_frame, encode_message
@@ -183,6 +186,37 @@ async def test_an_outage_during_recovery_costs_nothing(routers: Routers) -> None
             await routers.outage(0.3)
         back = stream.sent
         await until(lambda: kept.heard[-1] >= back, 20)
+        assert kept.heard == list(range(kept.heard[0], kept.heard[-1] + 1))
+        assert kept.missed == []
+
+
+async def test_replies_that_there_was_no_room_for_are_asked_for_again(
+    routers: Routers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When the first replies to a question are dropped because the receiver is behind, nothing counts as missed."""
+    really, dropped = Arrivals.receiver, [3]
+
+    def receiver(
+        arrivals: Arrivals, on_batch: OnBatch, on_numbered: OnNumbered | None = None
+    ) -> Callable[[zenoh.Sample], bool]:
+        receive = really(arrivals, on_batch, on_numbered)
+
+        def behind(sample: zenoh.Sample) -> bool:
+            if dropped[0] == 3:
+                return receive(sample)
+            dropped[0] += 1
+            return False
+
+        return behind if on_batch is recovered._ignore else receive
+
+    monkeypatch.setattr(Arrivals, "receiver", receiver)
+    async with robot_and_receiver(routers, KEEP_ALL) as (source, _, kept, _), Stream(source, KEPT) as stream:
+        await until(lambda: len(kept.heard) > HZ)  # the question for the sources that exist has long ended
+        dropped[0] = 0
+        await routers.outage(0.5)
+        back = stream.sent
+        await until(lambda: kept.heard[-1] >= back, 20)
+        assert dropped == [3]
         assert kept.heard == list(range(kept.heard[0], kept.heard[-1] + 1))
         assert kept.missed == []
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import datetime as dt
 import signal
+import socket
 import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
@@ -413,6 +414,37 @@ async def test_a_client_is_no_router(site: Site) -> None:
             await Mesh.open_once(victim, timeout_s=3)
 
 
+async def test_a_client_that_says_it_is_a_router_may_no_more(site: Site) -> None:
+    """A client's certificate opens a session as a router as well, which Zenoh cannot refuse; what it may put, hear and
+    declare there is the same."""
+    stolen = config.changed(site.settings("robot-8"), mode="router", listen=[f"tcp/127.0.0.1:{free_port()}"])
+    async with (
+        site.session("robot-7") as robot,
+        site.session("hall-2") as hall,
+        site.session("anna") as anna,
+        await Mesh.open(stolen) as thief,
+    ):
+        by_name = listening(robot, "macs/ca/to/drone7/**")
+        inbox = listening(hall, "macs/to/unity/2/**")
+        stream = listening(hall, "macs/from/ros/7/**")
+        taken = [listening(thief, key) for key in ("macs/to/ros/0/7/**", "macs/from/**", "macs/ca/to/drone7/**")]
+        tokens = [thief.declare_token(f"macs/live/ros/{number}/3/a8") for number in (7, 8)]
+        while not by_name:  # what it may do
+            thief.put_unasked("macs/to/unity/2/767/ros/7", b"forged")
+            thief.put_unasked("macs/from/ros/7/nd__x", b"forged")
+            thief.put_unasked("macs/ca/to/drone7/t/by/drone8", b"x")
+            await asyncio.sleep(0.05)
+        while not (stream and inbox):
+            robot.put_unasked("macs/from/ros/7/nd__x", b"true")
+            robot.put_unasked("macs/to/unity/2/767/ros/7", b"true")
+            await asyncio.sleep(0.05)
+        assert {bytes(payload) for _, payload in (*stream, *inbox)} == {b"true"}
+        assert {bytes(payload) for got in taken for _, payload in got} == {b"forged", b"x"}  # its own
+        assert await anna.tokens("macs/live/**") == ["macs/live/ros/8/3/a8"]
+        for token in tokens:
+            token.close()
+
+
 async def test_a_link_ends_with_its_certificate(site: Site) -> None:
     """A session whose certificate expires is cut off, and is back with a renewed one without being started again."""
     short = plan.parse(
@@ -613,6 +645,57 @@ async def test_a_check_does_not_disturb_who_is_there(site: Site) -> None:
         assert drone.others() == []
 
 
+async def test_calls_of_others_pass_a_check(site: Site) -> None:
+    """While everything is tried, a call of a robot that is online gets that robot's answer, and one of a robot that is
+    not gets none."""
+    async with (
+        macs_zenoh.join("ros", id=7, group=3, settings=site.settings("robot-7")) as robot,
+        macs_zenoh.join("unity", id=256, settings=site.settings("hall-1")) as headset,
+    ):
+
+        async def answer(call: macs_zenoh.Call) -> bytes:
+            return call.data + b" by the robot"
+
+        verbs = ("stop", "add_node", "status")
+        for verb in verbs:
+            robot.serve(verb, answer)
+        await until(lambda: ("ros", 7) in online(headset))
+        checking = asyncio.create_task(site.wrong())
+        calls = 0
+        while not checking.done():
+            for verb in verbs:
+                assert await headset.call("ros", 7, verb, b"%d" % calls) == b"%d by the robot" % calls
+                with pytest.raises(Unreachable):
+                    await headset.call("ros", 8, verb)
+                calls += 1
+        assert await checking == []
+        assert calls > len(verbs)
+
+
+async def test_a_stand_in_gives_way(site: Site) -> None:
+    """Who stands in for a robot is asked while the robot is not there, and not any more when it is; its silence is no
+    answer."""
+    asked: list[bytes] = []
+
+    async def silence(key: str, payload: bytes) -> bytes | None:
+        asked.append(payload)
+        return None
+
+    async def answer(key: str, payload: bytes) -> bytes:
+        return b"yes"
+
+    key = "macs/call/ros/7/stop/unity/256"
+    async with site.session("robot-7") as first, site.session("robot-7") as robot, site.session("hall-1") as hall:
+        first.serve("macs/call/ros/7/stop/**", silence, stand_in=True)
+        while not asked:
+            assert not await answered(hall, key)
+        robot.serve("macs/call/ros/7/**", answer)
+        await until_answered(hall, key)
+        asked.clear()
+        assert [await answered(hall, key) for _ in range(10)] == [True] * 10
+        assert not asked
+
+
 # -- our programs ----------------------------------------------------------------------------------------------------
 
 
@@ -726,6 +809,29 @@ async def run(*argv: str) -> tuple[int, str, str]:
     out, errors = await asyncio.wait_for(process.communicate(), 60)
     assert process.returncode is not None
     return process.returncode, out.decode(), errors.decode()
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+async def test_a_check_that_was_stopped_is_none_that_went_well(how: signal.Signals, tmp_path: Path) -> None:
+    """Ctrl-C or SIGTERM in the middle of a check ends it with 130."""
+    found = made(tmp_path / "pki")
+    listen = found.router("site")[0]
+    (tmp_path / "plan.yaml").write_text(
+        f"routers: [{{name: site, addresses: [127.0.0.1], listen: ['{listen}']}}]" + CLIENTS
+    )
+    with socket.create_server(("127.0.0.1", int(listen.rpartition(":")[2]))) as says_nothing:
+        says_nothing.setblocking(False)
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "bridge", "security", "check", str(tmp_path / "plan.yaml")),
+            *("--dir", str(found.directory)),
+            cwd=ROOT,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.DEVNULL,
+        )
+        begun, _ = await asyncio.wait_for(asyncio.get_running_loop().sock_accept(says_nothing), 30)
+        process.send_signal(how)
+        assert await asyncio.wait_for(process.wait(), 30) == 130
+        begun.close()
 
 
 async def test_the_command_generates_and_checks(tmp_path: Path) -> None:

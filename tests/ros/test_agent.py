@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 from geometry_msgs.msg import Twist
+from msgspec.structs import replace
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from ros_peer import Peer, adding, command, get, removing, until
@@ -195,6 +196,25 @@ async def test_nobody_registers_for_another(robot: RobotAgent, headset: Agent, p
     with pytest.raises(Refused, match="unity/5 cannot"):
         await headset.call("ros", ROBOT, "remove_node", encode(removing("/chatter", registrant=9)))
     assert len(robot.nodes) == 1
+
+
+async def test_who_may_not_register_gets_topics_only(router: str, domain: int, peer: Peer) -> None:
+    """An agent that `register_allow` does not name registers for a topic and for nothing else: nobody who may only see
+    takes a service from the one that may command."""
+    settings = Settings(mesh=MeshSettings(connect=[router]), robot=RobotSettings(id=ROBOT, register_allow=["block/1"]))
+    service = adding("/add", "std_srvs/SetBool", node_type=NodeType.SERVICE)
+    async with (
+        open_robot(settings, domain_id=domain) as robot,
+        macs_zenoh.join("unity", id=5, connect=[router]) as sees,
+        macs_zenoh.join("unity", id=256, connect=[router]) as commands,
+    ):
+        await until(lambda: all((1, ROBOT) in agent.directory for agent in (sees, commands)))
+        for node_type in set(NodeType) - {NodeType.SUBSCRIBER}:
+            with pytest.raises(Refused, match="unity/5 may only register for topics"):
+                await sees.call("ros", ROBOT, "add_node", encode(adding("/t", node_type=node_type)))
+        await sees.call("ros", ROBOT, "add_node", encode(adding("/t")))
+        await commands.call("ros", ROBOT, "add_node", encode(replace(service, registrant_agent_id=256)))
+        assert len(robot.nodes) == 2
 
 
 async def test_a_headset_that_vanishes_is_forgotten(robot: RobotAgent, router: str, peer: Peer) -> None:

@@ -60,7 +60,15 @@ def test_parameters_of_nodes_are_hidden_unless_asked_for() -> None:
 
 @pytest.mark.parametrize(
     ("patterns", "named"),
-    [(["*"], True), (["unity"], True), (["unity/5"], True), (["group/3"], True), (["ros"], False)],
+    [
+        (["*"], True),
+        (["unity"], True),
+        (["unity/5"], True),
+        (["block/0"], True),
+        (["block/1"], False),
+        (["group/3"], True),
+        (["ros"], False),
+    ],
 )
 def test_agents_are_named_by_type_id_and_group(patterns: list[str], named: bool) -> None:
     """Each way to name headset 5 of group 3."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 from collections import deque
 
@@ -27,15 +28,16 @@ KEY = "macs/from/ros/7/nd__log"
 class Source:
     """What Zenoh's advanced publisher does: number, keep, answer in order."""
 
-    def __init__(self, keeps: int, name: str = "a/1", first: int = 0, size: int = 10) -> None:
+    def __init__(self, keeps: int, name: str = "a/1", first: int = 0, size: int = 10, key: str = KEY) -> None:
         self.name = name
+        self.key = key
         self.number = first
         self.cache: deque[tuple[int, Sample]] = deque(maxlen=keeps)
         self._size = size
 
     def put(self, data: int | None = None) -> tuple[int, Sample]:
         value = self.number if data is None else data
-        numbered = (self.number % NUMBERS, (KEY, value.to_bytes(self._size, "big")))
+        numbered = (self.number % NUMBERS, (self.key, value.to_bytes(self._size, "big")))
         self.cache.append(numbered)
         self.number += 1
         return numbered
@@ -70,6 +72,12 @@ def serve(to: Recovery, source: Source, now: float = 0.0, *, rounds: int = 50) -
                 freed += to.reply(ask, number, sample, now)
             freed += to.ended(ask, now)
     raise AssertionError("it never stops asking")
+
+
+def serve_one(to: Recovery, source: Source, ask: Ask, now: float = 0.0) -> list[int]:
+    """Answer one question."""
+    freed = [freed for number, sample in source.answer(ask) for freed in to.reply(ask, number, sample, now)]
+    return values(freed + to.ended(ask, now))
 
 
 @pytest.mark.parametrize("first", [0, 1000, NUMBERS - 3])
@@ -308,17 +316,111 @@ def test_what_waits_behind_a_gap_is_bounded(monkeypatch: pytest.MonkeyPatch) -> 
     assert to.misses() == [(KEY, 2)]
 
 
-def test_sources_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Any number of sources may come and go; those with a gap are forgotten last."""
+def test_what_waits_is_bounded_over_all_sources(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many sources are invented under one key, what waits has one bound, and another key's gap stays open."""
+    monkeypatch.setattr(Recovery, "WAITING_BYTES", 10_000)
+    to, honest = Recovery(), Source(100, "honest", size=1000)
+    take(to, honest, honest.put())
+    honest.put()
+    for _ in range(4):
+        assert take(to, honest, honest.put()) == []
+    waiting, delivered = 4, 0
+    for n in range(200):
+        invented = Source(1, f"invented/{n}", size=100, key="macs/from/ros/8/nd__log")
+        take(to, invented, invented.put())
+        invented.put()
+        for _ in range(2):
+            waiting += 1
+            delivered += len(take(to, invented, invented.put()))
+            assert 1000 * 4 + 100 * (waiting - 4 - delivered) <= 10_000
+    assert delivered > 0
+    assert {key for key, _ in to.misses()} == {"macs/from/ros/8/nd__log"}
+    (ask,) = (ask for ask in to.asks(0.0) if ask.source == "honest")
+    assert serve_one(to, honest, ask) == [1, 2, 3, 4, 5]
+
+
+def test_a_source_has_its_name_to_itself() -> None:
+    """Who sends under its own key with another's name takes none of its numbers, and its answers are not the
+    other's."""
+    true, false = Source(10), Source(10, key="macs/from/ros/8/nd__log")
+    to = Recovery()
+    assert take(to, true, true.put(0)) == [0]
+    assert take(to, false, false.put(100)) == [100]
+    assert take(to, false, false.put(101)) == [101]
+    to.heartbeat(false.name, false.key, 1_000_000, 0.0)
+    assert take(to, true, true.put(1)) == [1]
+    true.put(2)
+    assert take(to, true, true.put(3)) == []
+    (ask,) = to.asks(0.0)
+    assert (ask.key, ask.first) == (KEY, 2)
+    assert to.reply(ask, 2, (false.key, b"false"), 0.0) == []
+    assert serve_one(to, true, ask) == [2, 3]
+    assert to.misses() == []
+
+
+def test_the_source_not_heard_longest_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any number of sources may come and go: who is heard stays, and of who goes all that waited is delivered."""
     monkeypatch.setattr(Recovery, "SOURCES", 3)
-    to, gap = Recovery(), Source(10, "gap")
-    take(to, gap, gap.put())
-    gap.put()
-    take(to, gap, gap.put())
-    for n in range(10):
-        other = Source(10, str(n))
-        take(to, other, other.put())
-    assert serve(to, gap) == [1, 2]
+    to, heard, silent = Recovery(), Source(10, "heard"), Source(10, "silent")
+    for source in (heard, silent):
+        take(to, source, source.put())
+        source.put()
+        assert take(to, source, source.put()) == []
+    others = [Source(10, str(n)) for n in range(10)]
+    delivered = []
+    for other in others:
+        to.heartbeat(heard.name, KEY, 2, 0.0)
+        delivered.append(take(to, other, other.put(7)))
+    assert delivered == [[7], [2, 7], *[[7]] * 8]
+    assert to.misses() == [(KEY, 1)]
+    assert serve(to, heard) == [1, 2]
+
+
+def test_a_forgotten_source_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a source keeps is not delivered again because it was forgotten; what came meanwhile is asked for. When
+    even those that were forgotten are too many, it goes on with what comes next."""
+    monkeypatch.setattr(Recovery, "SOURCES", 2)
+    monkeypatch.setattr(Recovery, "FORGOTTEN", 5)
+    to, source = Recovery(), Source(10)
+    to.settled = True
+    others = (Source(10, str(n)) for n in itertools.count())
+
+    def forget(number: int) -> None:
+        for other in itertools.islice(others, number):
+            assert take(to, other, other.put(0)) == [0]
+
+    for n in range(5):
+        assert take(to, source, source.put(n)) == [n]
+    forget(3)
+    source.put(5)
+    to.heartbeat(source.name, KEY, 5, 0.0)
+    assert serve(to, source, OVERTAKEN_S) == [5]
+    forget(20)
+    assert take(to, source, source.put(6)) == [6]
+    assert serve(to, source, OVERTAKEN_S) == []
+
+
+def test_replies_that_are_dropped_here_are_asked_for_again() -> None:
+    """That a first reply is missing proves nothing when it was dropped by us: nothing is skipped, and the question is
+    repeated, not at once."""
+    source, to = Source(100), Recovery()
+    take(to, source, source.put())
+    for _ in range(6):
+        source.put()
+    assert take(to, source, source.put()) == []
+    now = 0.0
+    for _ in range(3 * ATTEMPTS):
+        (ask,) = to.asks(now)
+        to.reply_dropped(ask)
+        for number, sample in source.answer(ask)[3:]:
+            assert to.reply(ask, number, sample, now) == []
+        assert to.ended(ask, now) == []
+        assert take(to, source, source.put(), now) == []
+        assert now < to.next_deadline() < now + 1
+        now = to.next_deadline()
+    assert to.misses() == []
+    assert serve(to, source, now) == list(range(1, source.number))
+    assert to.misses() == []
 
 
 def test_absurd_numbers_cost_nothing() -> None:

@@ -122,16 +122,16 @@ def test_robots_have_what_is_wanted_of_them(story_steps: list[tuple[str, tuple[o
 
 @given(steps)
 def test_streams_are_those_that_somebody_wants(story_steps: list[tuple[str, tuple[object, ...]]]) -> None:
-    """A gateway listens to the topics of robots that have a registrant here, and of those named by id though away."""
+    """A gateway listens to the topics of robots that have a registrant here, and of those named by id though away,
+    and knows for each who is registered."""
     story = Story()
     for what, arguments in story_steps:
         getattr(story, what)(*arguments)
-        expected = {
-            (robot_id, name)
-            for (_, node_type, name), (ids, groups) in story.wanted.items()
-            if node_type == NodeType.SUBSCRIBER
-            for robot_id in ids | {robot for robot, group in story.robots.items() if group and group in groups}
-        }
+        expected: dict[tuple[int, str], set[AgentKey]] = {}
+        for (agent, node_type, name), (ids, groups) in story.wanted.items():
+            if node_type == NodeType.SUBSCRIBER:
+                for robot_id in ids | {robot for robot, group in story.robots.items() if group and group in groups}:
+                    expected.setdefault((robot_id, name), set()).add(agent)
         assert story.registrations.streams(NodeType.SUBSCRIBER, story.robots) == expected
 
 

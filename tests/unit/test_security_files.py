@@ -16,6 +16,7 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from bridge.security import access, files, plan
+from bridge.security.check import settings_of
 from bridge.security.generate import generate
 from bridge.security.plan import Plan
 from macs_zenoh import config
@@ -222,6 +223,8 @@ traffic:
   - {match: "macs/from/ros/*/nd__pose", max_hz: 50}
   - {match: "macs/from/ros/7/nd__log", max_hz: 5, reliable: 100}
   - {match: "macs/from/ros/7/**", max_bytes: 5000000, priority: data_high}
+  - {match: "macs/to/ros/**", priority: interactive_high}
+  - {match: "macs/to/**", priority: data}
   - {match: "macs/**", max_bytes: 100000, max_bytes_per_s: 1000000}
 """
 
@@ -242,9 +245,20 @@ def test_traffic_rules_are_a_guard_in_the_router(tmp_path: Path) -> None:
     ]
     priorities = json.loads(conf.get_json("qos/network"))
     assert [(one["key_exprs"], one["overwrite"]["priority"]) for one in priorities] == [
-        (["macs/from/ros/7/**"], "data_high"),
-        (["macs/from/ros/*/nd__camera$*"], "data_low"),
-    ]
+        (["macs/to/ros/**"], "interactive_high"),
+        (["macs/to/**"], "data"),
+    ][::-1]
+
+
+def test_a_router_leaves_the_priorities_of_topics_to_robots(tmp_path: Path) -> None:
+    """A robot's own rule for a topic wins over a traffic rule for its key, so no router may change it again; behind a
+    rule that holds for topics and others alike nothing is exported, because there the last one would win."""
+    text = TEXT + TRAFFIC.replace("macs/to/ros/**", "macs/**")
+    conf = loaded(plan.parse(text), "site", tmp_path)
+    assert not json.loads(conf.get_json("qos/network"))
+    written = (tmp_path / "router.json5").read_text()
+    assert "priority of macs/from/ros/7/** is left to the programs" in written
+    assert "priorities from macs/** on are left to the programs" in written
 
 
 # -- a client's file -------------------------------------------------------------------------------------------------
@@ -260,9 +274,20 @@ def test_settings_say_who_somebody_is() -> None:
     assert "transport/link/tls/enable_mtls:true" in robot.mesh.overrides
     assert robot.mesh.namespace == "site1"
     assert (robot.robot.id, robot.robot.group) == (7, 3)
+    assert robot.robot.register_allow == ["block/1"]  # hall-2 may see it, and no more
     assert (robot.awareness.name, robot.awareness.id, robot.awareness.beside) == ("drone 7", 7, True)
     assert made["hall-2"].gateway.blocks == [2]
     assert robot.traffic == found.traffic
+
+
+def test_a_robot_knows_who_may_command_it() -> None:
+    """What somebody registers for is in a payload, where no router sees it, so the robot's settings say who may."""
+    text = TEXT.replace("{name: anna}", "{name: anna, id: 5}\n  - {name: berta}").replace(", blocks: [1]", "")
+    text = text.replace(", blocks: [2]", "").partition("permissions:")[0]
+    found = plan.parse(text + "permissions: [{who: [gateways, robot-8, operators], may: command, whom: robot-7}]")
+    first, second = (config.parse(files.settings_toml(found, robot, "/x")).robot for robot in found.robots)
+    assert sorted(first.register_allow) == ["operator/0", "operator/5", "ros/300", "unity"]
+    assert second.register_allow == []
 
 
 def test_names_with_quotes_and_spaces_survive() -> None:
@@ -271,6 +296,15 @@ def test_names_with_quotes_and_spaces_survive() -> None:
     made = config.parse(files.settings_toml(found, found.robots[0], "/etc/it's macs/ß"))
     assert made.awareness.name == "d\"r\\o'né 7"
     assert made.mesh.overrides[0] == 'transport/link/tls/root_ca_certificate:"/etc/it\'s macs/\\u00df/ca.pem"'
+
+
+def test_the_check_has_the_links_of_the_plan(tmp_path: Path) -> None:
+    """Sessions of the check wait as long as everybody's on this mesh, so that a slow link is not cut and misread."""
+    slow = plan.parse(TEXT + "namespace: site1\nmesh: {lease_ms: 10000, block_limit_ms: 5000}\n")
+    made = settings_of(slow, tmp_path, "tls/cloud.example.org:7447")
+    assert (made.lease_ms, made.block_limit_ms, made.namespace) == (10000, 5000, "site1")
+    assert made.connect == ["tls/cloud.example.org:7447"]
+    assert made.overrides
 
 
 # -- certificates ----------------------------------------------------------------------------------------------------
@@ -363,6 +397,15 @@ def test_what_does_not_fit_is_renewed(site: Plan, tmp_path: Path) -> None:
         "hall-1": "unreadable",
         "hall-2": "unreadable",
     }
+
+
+def test_a_directory_under_another_name_gets_a_certificate_of_its_own(site: Plan, tmp_path: Path) -> None:
+    """What was moved or copied says who it was, which no rule knows under the new name: it is made anew."""
+    generate(site, tmp_path, NOW)
+    (tmp_path / "robot-7").rename(tmp_path / "robot-7b")
+    report = generate(plan.parse(TEXT.replace("robot-7", "robot-7b")), tmp_path, NOW + DAY)
+    assert {one.name: one.why for one in report.issued if one.why} == {"robot-7b": "other name"}
+    assert [name.value for name in certificate(tmp_path / "robot-7b").subject] == ["robot-7b"]
 
 
 def test_a_new_authority_ends_all_certificates(site: Plan, tmp_path: Path) -> None:

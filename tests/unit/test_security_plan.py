@@ -147,6 +147,7 @@ WRONG = [
     (BASE + "traffic: [{match: 'a', max_hx: 1}]", "did you mean `max_hz`?"),
     (BASE + "namespace: a/*", "is not a plain key"),
     (BASE + "certificates: {days: 0}", "certificates.days"),
+    (BASE + "certificates: {days: 90, ca_days: 60}", "certificates.ca_days: below days, 90"),
 ]
 
 
@@ -187,6 +188,8 @@ def test_the_page_has_every_field() -> None:
     page = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
     rows = [line.split("|") for line in page.splitlines() if line.startswith("| `")]
     explained = {(name, row[2].strip(" `")) for row in rows for name in re.findall(r"`(\w+)`", row[1])}
+    words = {word for name, of in explained for word in (name, *re.findall(r"\w+", of))}
+    assert {field.name for field in msgspec.structs.fields(Plan)} <= words
     for kind in (plan.Router, plan.Robot, plan.Gateway, plan.Operator, plan.Permission, plan.Certificates):
         where = kind.__name__.lower() + ("" if kind is plan.Certificates else "s")
         for field in msgspec.structs.fields(kind):

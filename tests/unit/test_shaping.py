@@ -6,9 +6,11 @@ import itertools
 import threading
 from collections import Counter
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from macs_zenoh import shaping
 from macs_zenoh.config import TrafficRule
 from macs_zenoh.shaping import BURST_S, OTHER_KEYS, Pace, Shape, Shaper
 
@@ -200,6 +202,26 @@ def test_keys_from_the_network_are_not_remembered_for_ever() -> None:
     assert shaper.drops["**", "over_size", OTHER_KEYS] == number - Shaper.KEYS
     assert shaper.totals == {"over_size": number}
     assert shaper.report()[0].endswith(f"and {Shaper.KEYS - 4} keys more")
+
+
+def test_a_key_that_no_rule_fits_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rules are not asked again for each message of a key that they leave alone, and any number of such keys
+    pushes the pace of no other one out."""
+    asked: Counter[str] = Counter()
+
+    def fits(match: str, key: str) -> bool:
+        asked[key] += 1
+        return key == match
+
+    monkeypatch.setattr(shaping, "fits", fits)
+    shaper = Shaper([TrafficRule(match=CAMERA, max_hz=5)])
+    shape = shaper.of(CAMERA)
+    for number in range(2 * Shaper.KEYS):
+        for _ in range(3):
+            assert shaper.of(f"macs/to/ros/0/{number}") is None
+    assert set(asked.values()) == {1}
+    assert shaper.of(CAMERA) is shape
+    assert len(shaper._free) == Shaper.KEYS
 
 
 def test_threads_share_a_rate() -> None:
