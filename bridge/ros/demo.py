@@ -170,6 +170,15 @@ class DemoRobot:
         self._image.publish(message)
 
 
+def _spin(node: Any) -> None:
+    try:
+        rclpy.spin(node)
+    except RuntimeError:
+        if rclpy.ok():
+            raise
+        # a callback that published in the moment in which a signal ended ROS
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the demo robot until SIGINT or SIGTERM. ``args`` may hold ROS arguments (``--ros-args ...``)."""
     logging.basicConfig(format="%(asctime)s %(levelname).1s %(name)s: %(message)s", datefmt="%H:%M:%S")
@@ -180,7 +189,7 @@ def main(args: Sequence[str] | None = None) -> int:
         DemoRobot(node)
         log.info("demo robot: picture on /camera/image/compressed, /pose; drive it on /cmd_vel; service /set_lights")
         with suppress(KeyboardInterrupt, ExternalShutdownException):
-            rclpy.spin(node)
+            _spin(node)
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

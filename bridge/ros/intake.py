@@ -102,6 +102,8 @@ class Intake:
         while self._open and self._node.context.ok():
             try:
                 self._take_until_changed()
+            except InvalidHandle:  # something was unsubscribed in this moment
+                continue
             except Exception:
                 if self._open and self._node.context.ok():
                     log.exception("waiting for ROS messages failed")

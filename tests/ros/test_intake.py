@@ -6,6 +6,7 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
+import pytest
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 from ros_peer import Peer, until
@@ -93,3 +94,24 @@ async def test_events_of_a_subscription_come(session: RosSession, peer: Peer) ->
     await until(lambda: counts == [1])
     await peer.session.run(lambda: peer.session.node.destroy_publisher(publisher))
     await until(lambda: counts == [1, 0])
+
+
+async def test_unsubscribing_while_messages_come_is_quiet(
+    session: RosSession, peer: Peer, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Subscriptions that end in the middle of messages and events leave no error, and the thread goes on."""
+    publisher = await peer.publisher(String, "/t", 100)
+    events = SubscriptionEventCallbacks(matched=lambda _change: None, use_default_callbacks=False)
+    for _ in range(40):
+        made = await session.run(lambda: session.intake.subscribe(String, "/t", Heard().take, 10, events=events))
+        publisher.publish(String(data="x"))
+        await session.run(lambda made=made: session.intake.unsubscribe(made))
+    heard = Heard()
+    await session.run(lambda: session.intake.subscribe(String, "/t", heard.take, 10, events=events))
+
+    def say() -> bool:
+        publisher.publish(String(data="still here"))
+        return bool(heard.texts)
+
+    await until(say)
+    assert not caplog.records
