@@ -1,6 +1,6 @@
 """The configuration, typed: what a settings file may say, its defaults, and the ranges that hold.
 
-A settings file is TOML with up to four sections and a list of rules, one struct each below::
+A settings file is TOML with up to five sections and a list of rules, one struct each below::
 
     [mesh]                                   # MeshSettings: every program on the mesh
     connect = ["tcp/192.168.1.10:7447"]
@@ -13,6 +13,9 @@ A settings file is TOML with up to four sections and a list of rules, one struct
 
     [awareness]                              # AwarenessSettings: `macs awareness`
     name = "drone0"
+
+    [operator]                               # OperatorSettings: `macs ls`, `macs stop`, `macs doctor`
+    id = 5
 
     [[traffic]]                              # TrafficRule: every program that sends
     match = "macs/from/ros/*/nd__camera$*"
@@ -37,8 +40,8 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, get_a
 import msgspec
 from msgspec import Meta
 
-from macs_zenoh.errors import ConfigError
-from macs_zenoh.keyexpr import expression_problem
+from macs_zenoh.errors import ConfigError, UsageError
+from macs_zenoh.keyexpr import expression_problem, type_name, type_number
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -59,11 +62,14 @@ Seconds = Annotated[float, Meta(gt=0, le=86_400)]
 Bytes = Annotated[int, Meta(ge=39, le=0xFFFF_FFFF)]
 """At least one header, at most what the header's u32 can declare."""
 
-NamePattern = Annotated[str, Meta(pattern=r"^(/[A-Za-z0-9_*]+)+$", max_length=256)]
+_NAME_PATTERN = r"^(/[A-Za-z0-9_*]+)+$"
+_TOPIC_OR_NONE = r"^(/[A-Za-z_]\w*)*$"
+NamePattern = Annotated[str, Meta(pattern=_NAME_PATTERN, max_length=256)]
 """A full ROS name in which ``*`` stands for anything within one level and ``**`` for any number of levels."""
 Priority = Literal["real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background"]
 """Zenoh's priorities by the names that its configuration has for them, the highest first."""
-AgentPattern = Annotated[str, Meta(pattern=r"^(\*|[a-z0-9]+(/[0-9]+)?)$")]
+AgentPattern = str
+"""``*``, a type of agents, one of them (``unity/5``), a group (``group/3``) or a block of headsets (``block/1``)."""
 
 ROUTER_RETRY_MS = 500
 """A router waits at least so long before it dials another one again: a link between routers that is back within 100 ms
@@ -71,6 +77,10 @@ of its loss may stay dead (seen with Zenoh 1.10.2): connected, but without token
 
 LOCAL_ROUTER = "tcp/127.0.0.1:7447"
 EVERY_INTERFACE = "tcp/[::]:7447"
+
+IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "quic_datagram", "ws")
+PROTOCOLS = (*IP_PROTOCOLS, "unixsock-stream", "unixpipe", "serial", "vsock")
+"""What an endpoint may begin with: the links that Zenoh has. Those over IP need a port."""
 
 
 STREAM_PRIORITIES = ("data", "data_low", "background")
@@ -176,6 +186,9 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def _check_endpoint(self, field: str, endpoint: str) -> None:
         if re.fullmatch(r"[a-z][a-z0-9_.-]*/\S+", endpoint):
+            problem = _endpoint_problem(endpoint, lowest_port=0 if field == "listen" else 1)
+            if problem:
+                raise self._wrong(field, f"{endpoint!r} {problem}")
             return
         hint = (
             f", write tcp/{endpoint}" if re.fullmatch(r"[\w.\[\]:-]+:\d+", endpoint) else ", as in tcp/10.0.0.1:7447"
@@ -234,6 +247,21 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             *([("adminspace/enabled", True, ())] if self.mode == "router" else []),
             *([("namespace", self.namespace, ("namespace",))] if self.namespace else []),
         ]
+
+
+def _endpoint_problem(endpoint: str, *, lowest_port: int) -> str:
+    """Why an endpoint can never work; empty for one that might."""
+    protocol, _, rest = endpoint.partition("/")
+    if protocol not in PROTOCOLS:
+        return f"begins with {protocol!r}, which is no protocol of Zenoh's: {', '.join(PROTOCOLS)}"
+    if protocol not in IP_PROTOCOLS:
+        return ""
+    found = re.fullmatch(r".+:([0-9]+)", re.split(r"[?#]", rest)[0])
+    if found is None:
+        return f"needs a host and a port, as in {protocol}/10.0.0.1:7447"
+    if not lowest_port <= int(found[1]) <= 0xFFFF:
+        return f"has the port {found[1]}, allowed is {lowest_port}..65535"
+    return ""
 
 
 class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -362,7 +390,7 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Calls that may be open on one service at one time."""
     result_s: Annotated[float, Meta(gt=0, le=604_800)] = 900.0
     """How long the result of an action is kept for a headset that has lost its connection."""
-    stop_topic: Annotated[str, Meta(pattern=r"^(/[A-Za-z_]\w*)*$")] = "/emergency_stop"
+    stop_topic: Annotated[str, Meta(pattern=_TOPIC_OR_NONE)] = "/emergency_stop"
     """The emergency stop: true on this topic (std_msgs/Bool) stops, false releases. Empty: there is none."""
     stop_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
     """Who may stop: ``*``, ``unity``, ``unity/5``, ``block/1`` (headsets of this block of ids), ``group/3`` or
@@ -372,6 +400,28 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     register_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
     """Who may register to publish, to call, to serve and to give goals. Others may register for topics only."""
     rules: list[TopicRule] = []
+
+    def _check(self) -> None:
+        for field in ("stop_allow", "release_allow", "register_allow"):
+            for number, pattern in enumerate(getattr(self, field)):
+                if not _names_agents(pattern):
+                    problem = f"{pattern!r} names no agents, as *, unity, unity/5, operator/5, block/1 and group/3 do"
+                    raise self._wrong(f"{field}[{number}]", problem)
+
+
+def _names_agents(pattern: str) -> bool:
+    """Whether some agent can fit: others are typing errors, which would lock somebody out without a word."""
+    kind, slash, number = pattern.partition("/")
+    ranges = {"group": (1, 255), "block": (0, 255)}
+    if kind not in ranges:
+        try:
+            known = kind == type_name(type_number(kind))  # 1 is always written ros
+        except UsageError:
+            known = False
+        if not slash or not known:
+            return pattern == "*" or known
+    low, high = ranges.get(kind, (0, 0xFFFF))
+    return number.isascii() and number.isdigit() and str(int(number)) == number and low <= int(number) <= high
 
 
 class AwarenessSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -406,6 +456,16 @@ class AwarenessSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fiel
     def _check(self) -> None:
         if self.beside and self.id is None:
             raise self._wrong("beside", "needs the id of the robot agent")
+
+
+class OperatorSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Who asks robots and stops them from a command line."""
+
+    section: ClassVar[str] = "operator"
+
+    id: AgentId | None = None
+    """Makes it ``operator/5``, for robots and access rules that want to know (``--as`` wins). Unset: ``operator/0``,
+    who is nobody in particular."""
 
 
 class TrafficRule(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -445,6 +505,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     gateway: GatewaySettings = GatewaySettings()
     robot: RobotSettings = RobotSettings()
     awareness: AwarenessSettings = AwarenessSettings()
+    operator: OperatorSettings = OperatorSettings()
     traffic: list[TrafficRule] = []
 
 
@@ -506,10 +567,19 @@ def changed(settings: _S, **changes: Any) -> _S:
     return msgspec.structs.replace(settings, **{name: value for name, value in changes.items() if value is not None})
 
 
+_IN_WORDS = {
+    _NAME_PATTERN: "a full name that begins with /, as /camera/image, /camera/* or /camera/**",
+    _TOPIC_OR_NONE: "the full name of a topic, which begins with /, or nothing",
+}
+"""What msgspec would show as a regular expression."""
+
+
 def _plain(text: str) -> tuple[str, str]:
     """Split msgspec's ``Expected `int` <= 9 - at `$.mesh.port``` into a dotted path and a sentence."""
     problem, _, where = text.partition(" - at `$")
     problem = problem.replace("Object contains unknown field", "unknown name").replace("array", "list")
+    for pattern, words in _IN_WORDS.items():
+        problem = problem.replace(f"`str` matching regex {pattern!r}", words)
     return where.rstrip("`").lstrip("."), problem[:1].lower() + problem[1:]
 
 
@@ -518,7 +588,10 @@ def _hint(where: str, problem: str) -> str:
     unknown = re.fullmatch(r"unknown name `(.+)`", problem)
     sections: dict[str, Any] = {
         kind.section: kind
-        for kind in (MeshSettings, GatewaySettings, RobotSettings, AwarenessSettings, TopicRule, TrafficRule)
+        for kind in (
+            *(MeshSettings, GatewaySettings, RobotSettings, AwarenessSettings, OperatorSettings),
+            *(TopicRule, TrafficRule),
+        )
     }
     owner = sections.get(re.sub(r"\[\d+\]$", "", where), Settings)
     if unknown is None:

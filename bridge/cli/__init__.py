@@ -1,15 +1,18 @@
 """The command ``macs``: one module per verb, each with ``SUMMARY``, ``add_arguments(parser)`` and ``run(args)``.
 
 Data goes to stdout, logs to stderr. Exit code 0: done; 1: not found, unreachable, unhealthy; 2: wrong usage or
-configuration. A verb imports what is heavy (zenoh, rclpy, rosbags) inside ``run``, so that help is instant.
+configuration; 130: stopped before it was done. A verb imports what is heavy (zenoh, rclpy,
+rosbags) inside ``run``, so that help is instant.
 """
 
 from __future__ import annotations
 
 import argparse
+import difflib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from bridge.cli import (
     agent,
@@ -61,6 +64,30 @@ examples:
 `macs VERB --help` explains one verb."""
 
 
+class Parser(argparse.ArgumentParser):
+    """Wrong words are told by the parser of the verb that they were said to, with what may have been meant."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """As argparse's, but whatever is left over is an error here and not in the parser above."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            option = unknown[0].partition("=")[0]
+            known = self._option_string_actions if option.startswith("-") else ()
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{_meant(option, known)}")
+        return found, unknown
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices and (meant := _meant(value, action.choices)):
+            raise argparse.ArgumentError(action, f"invalid choice: {value!r}{meant}")
+        super()._check_value(action, value)
+
+
+def _meant(word: Any, known: Iterable[Any]) -> str:
+    names = {str(name).lstrip("-"): name for name in known}  # what all options begin with makes none likelier
+    near = difflib.get_close_matches(str(word).lstrip("-"), names, n=1, cutoff=0.7)
+    return f", did you mean {names[near[0]]}?" if near else ""
+
+
 class _VerbsInOneColumn(argparse.RawDescriptionHelpFormatter):
     """argparse forgets that verbs are indented, and breaks the line after each of the longest."""
 
@@ -69,10 +96,8 @@ class _VerbsInOneColumn(argparse.RawDescriptionHelpFormatter):
         self._action_max_length = max(map(len, VERBS)) + 4
 
 
-def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="macs", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=_VerbsInOneColumn
-    )
+def build_parser() -> Parser:
+    parser = Parser(prog="macs", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=_VerbsInOneColumn)
     version = installed("macs-zenoh") or "(not installed)"
     parser.add_argument("--version", action="version", version=f"macs-zenoh {version}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True, title="verbs")
@@ -102,7 +127,12 @@ def program() -> int:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; what a user can cause ends in one line on stderr, never in a traceback."""
-    args = build_parser().parse_args(argv)
+    parser = build_parser()
+    words = sys.argv[1:] if argv is None else argv
+    if not words:
+        parser.print_help(sys.stderr)
+        parser.exit(2, "\nmacs: no verb was given\n")
+    args = parser.parse_args(words)
     options.start_logging(args)
     try:
         code: int = args.run(args)

@@ -1,9 +1,10 @@
 """List the agents that are online: robots and headsets, whichever gateway they are behind.
 
 A headset's session is its gateway's, so headsets with one session share a gateway. Robots are asked for their state:
-STATE says which are stopped, who has control of which topic, and ? for a robot that should answer and does not.
+STATE says which are stopped, who has control of which topic, and ? for a robot that should answer and does not: it
+hangs, or access rules do not let you ask it ([operator] in the settings, or --as, say who you are).
 -v adds, for each robot: the emergency stop, who has registered what, control and dead-man of each topic, what was
-lost, and what it offers. Exit code 1 when no router answers.
+lost, and what it offers. Exit code 1 when no router answers, 130 after Ctrl-C.
 
 examples:
   macs ls
@@ -18,7 +19,7 @@ import argparse
 import asyncio
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -68,31 +69,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    settings = options.settings(args).mesh
+    settings = options.settings(args)
+    caller = robots.chosen_caller(args, settings.operator)
     answer_s = args.timeout if args.verbose else min(ANSWER_S, args.timeout)
 
     async def show() -> int:
-        async with robots.operator(settings, args.caller, timeout_s=args.timeout) as operator:
+        async with robots.operator(settings.mesh, caller, timeout_s=args.timeout) as operator:
             agents, names = await operator.online(), await operator.names()
-            ids = [agent.id for agent in agents if agent.type == ROS]
-            asked = (_ask(operator, robot, answer_s, offers=args.verbose) for robot in ids)
-            told = dict(zip(ids, await asyncio.gather(*asked), strict=True))
+            gateways = await operator.gateways()
+            online = [agent for agent in agents if agent.type == ROS]
+            asked = (_ask(operator, robot, gateways, answer_s, offers=args.verbose) for robot in online)
+            told = dict(zip((robot.id for robot in online), await asyncio.gather(*asked), strict=True))
         sys.stdout.write((_json if args.json else _text)(agents, names, told, args.verbose) + "\n")
         return 0
 
-    return running.until_stopped(show)
+    return running.until_stopped(show, interrupted=running.INTERRUPTED)
 
 
-async def _ask(operator: Operator, robot: int, timeout_s: float, *, offers: bool) -> Told:
+async def _ask(
+    operator: Operator, robot: AgentInfo, gateways: Collection[str], timeout_s: float, *, offers: bool
+) -> Told:
     told = Told()
     try:
-        raw, status = robots.read(await operator.ask(robot, "status", timeout_s=timeout_s), Status)
+        raw, status = robots.read(await operator.ask(robot.id, "status", timeout_s=timeout_s), Status)
         told = Told(status=status, raw_status=raw)
         if offers:
-            raw, offered = robots.read(await operator.ask(robot, "offers", timeout_s=timeout_s), Offers)
+            raw, offered = robots.read(await operator.ask(robot.id, "offers", timeout_s=timeout_s), Offers)
             told = replace(told, offers=offered, raw_offers=raw)
     except NotServed:
-        pass
+        told = replace(told, problem=await operator.why_silent(robot, gateways, timeout_s=timeout_s))
     except MacsError as error:
         told = replace(told, problem=error.why if isinstance(error, Unreachable) else str(error))
     return told
@@ -164,7 +169,7 @@ def _details(robot: Told) -> list[str]:
     status = robot.status
     if status is None:
         silent = "is no `macs agent`: it tells nothing of itself"
-        return [f"does not answer: {robot.problem}" if robot.problem else silent]
+        return [f"tells nothing: {robot.problem}" if robot.problem else silent]
     lines = [f"ROS node        {status.ros_node}", f"emergency stop  {_stop(status)}"]
     # the stop has a node of its own, which concerns people only when somebody has registered it
     nodes = [node for node in status.nodes if node.role != "emergency stop" or node.registrants]

@@ -1,7 +1,7 @@
 """Robots as an operator sees them: who is online, and what each one answers to a call.
 
-The session joins nothing: its calls come from ``operator/0``, who has no presence and no inbox. ``--as`` names
-somebody else, where robots or a router's access rules want to know who it is.
+The session joins nothing: its calls come from ``operator/0``, who has no presence and no inbox. The settings
+(``[operator]``) or ``--as`` name somebody else, where robots or a router's access rules want to know who it is.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import Struct
 
-from macs_zenoh.config import MeshSettings
+from macs_zenoh.config import MeshSettings, OperatorSettings
 from macs_zenoh.directory import AgentInfo, Directory
-from macs_zenoh.errors import Unreachable, UsageError
-from macs_zenoh.keyexpr import NAME, PRESENCE, type_name, type_number
+from macs_zenoh.errors import MacsError, Refused, Unreachable, UsageError
+from macs_zenoh.keyexpr import LEASE, NAME, PRESENCE, type_name, type_number
 from macs_zenoh.messages import OPERATOR, ROS, Metadata
 from macs_zenoh.named import Named, Names
 from macs_zenoh.routing import call
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from macs_zenoh.mesh import Mesh
 
 _T = TypeVar("_T")
+
+WITHOUT_A_ROUTER = "(start one with `macs router`, or name it with -e; `macs doctor` looks closer)"
 
 
 class Caller(NamedTuple):
@@ -111,9 +113,8 @@ def add_as_option(parser: argparse.ArgumentParser) -> None:
         "--as",
         dest="caller",
         type=caller,
-        default=Caller(OPERATOR, 0),
         metavar="TYPE/ID",
-        help="ask robots as this agent, as operator/5 or unity/5 (default: operator/0, who is nobody in particular)",
+        help="ask robots as this agent, as operator/5 or unity/5 (default: as the settings say, else operator/0)",
     )
 
 
@@ -127,6 +128,11 @@ def caller(text: str) -> Caller:
     if not 0 <= found.id <= 0xFFFF:
         raise argparse.ArgumentTypeError(f"{text!r} is no agent, as in operator/5")
     return found
+
+
+def chosen_caller(args: argparse.Namespace, settings: OperatorSettings) -> Caller:
+    """Who ``--as`` names, else who the settings are for."""
+    return args.caller or Caller(OPERATOR, settings.id or 0)
 
 
 class Operator:
@@ -151,6 +157,24 @@ class Operator:
         for key in await self._mesh.tokens(NAME.every(), timeout_s=self._timeout_s):
             names.token(key, True)
         return names.claims()
+
+    async def gateways(self) -> set[str]:
+        """The sessions of gateways: who is behind one answers no calls."""
+        leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every(), timeout_s=self._timeout_s)]
+        return {str(lease["zid"]) for lease in leases if lease is not None}
+
+    async def why_silent(self, robot: AgentInfo, gateways: Collection[str], *, timeout_s: float) -> str:
+        """Why a robot that is online does not serve a verb; empty when it need not: it is behind a gateway, or it
+        answers what every program with a session of its own answers."""
+        if robot.zid in gateways:
+            return ""
+        try:
+            await self.ask(robot.id, "ping", timeout_s=timeout_s)
+        except Refused:
+            return ""
+        except MacsError:
+            return f"it does not answer {self._caller}; access rules may not allow it (--as operator/N)"
+        return ""
 
     async def ask(self, robot: int, verb: str, data: bytes = b"", *, timeout_s: float, urgent: bool = False) -> bytes:
         """What a robot answers. ``urgent``: at the priority of commands.
@@ -178,7 +202,7 @@ async def operator(settings: MeshSettings, caller: Caller, *, timeout_s: float) 
         mesh = await asyncio.wait_for(Mesh.open(settings, on_waiting=lambda target: None), patience_s)
     except asyncio.TimeoutError:
         target = ", ".join(settings.routers) or "a router"
-        raise Unreachable(target, f"no Zenoh router answered within {patience_s:g} s") from None
+        raise Unreachable(target, f"no Zenoh router answered within {patience_s:g} s {WITHOUT_A_ROUTER}") from None
     async with mesh:
         yield Operator(mesh, caller, timeout_s)
 

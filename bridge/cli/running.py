@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import signal
 import sys
 from collections.abc import Callable, Coroutine
 from typing import Any
+
+log = logging.getLogger("macs")
 
 READY = "ready: "
 """How a program that serves begins its first line on stdout."""
@@ -15,6 +18,9 @@ READY = "ready: "
 STOP_WITH_STDIN = "MACS_STOP_WITH_STDIN"
 """Set by ``macs up`` for its children: end of stdin means that it is gone, however it went."""
 
+
+LAST_WORDS_S = 1.0
+"""How long tasks may take to end that were left behind: a program that is stopped is gone within 2 s."""
 
 INTERRUPTED = 130
 """The exit code, as with any program that Ctrl-C ends, of one that was to find or do something: nobody must take it
@@ -32,9 +38,23 @@ def until_stopped(work: Callable[[], Coroutine[Any, Any, int]], *, interrupted: 
         asyncio.set_event_loop(loop)
         return loop.run_until_complete(_stoppable(work, interrupted))
     finally:
+        loop.run_until_complete(_end_what_is_left())
         loop.run_until_complete(loop.shutdown_asyncgens())
         asyncio.set_event_loop(None)
         loop.close()
+
+
+async def _end_what_is_left() -> None:
+    """Cancel the tasks that ``work`` left behind and let them end: asyncio complains of each one it destroys."""
+    left = asyncio.all_tasks() - {asyncio.current_task()}
+    if not left:
+        return
+    for task in left:
+        task.cancel()
+    ended, _ = await asyncio.wait(left, timeout=LAST_WORDS_S)
+    for task in ended:
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log.debug("%s ended with %r", task.get_name(), error)  # nobody waits for it any more
 
 
 async def _stoppable(work: Callable[[], Coroutine[Any, Any, int]], interrupted: int) -> int:

@@ -2,7 +2,7 @@
 
 The emergency stop of a robot is latched: commands and goals are refused until it is released, and what each topic is
 given at a stop is in the robot's settings (docs/robot.md). The call is repeated until the robot says that it holds.
-Robots may allow it only to some (stop_allow, release_allow): name yourself with --as.
+Robots and routers may allow it only to some: the settings ([operator]) or --as say who you are.
 
 Exit code 0 when every robot has confirmed; 1 when one has not, or none is online; 130 after Ctrl-C. A program
 that has to start first, and a network in between, do not replace the button on the robot.
@@ -20,12 +20,13 @@ import argparse
 import asyncio
 import json
 import sys
-from dataclasses import asdict, dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 
 from bridge.cli import options, robots, running
 from bridge.cli.robots import Operator, Status
-from macs_zenoh.config import MeshSettings
-from macs_zenoh.errors import CallTimeout, Refused, Unreachable, UsageError
+from macs_zenoh.config import Settings
+from macs_zenoh.errors import CallTimeout, MacsError, NotServed, Refused, Unreachable, UsageError
 from macs_zenoh.messages import ROS
 
 SUMMARY = "stop robots, and release them"
@@ -64,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    settings = options.settings(args).mesh
+    settings = options.settings(args)
     named = bool(args.robots or args.group)
     if named and args.all:
         raise UsageError("robots and groups, or --all, not both")
@@ -74,16 +75,23 @@ def run(args: argparse.Namespace) -> int:
     return running.until_stopped(lambda: _stop(settings, args), interrupted=running.INTERRUPTED)
 
 
-async def _stop(settings: MeshSettings, args: argparse.Namespace) -> int:
+async def _stop(settings: Settings, args: argparse.Namespace) -> int:
     outcomes = []
-    async with robots.operator(settings, args.caller, timeout_s=args.timeout) as operator:
+    caller = robots.chosen_caller(args, settings.operator)
+    async with robots.operator(settings.mesh, caller, timeout_s=args.timeout) as operator:
         ids = await _chosen(operator, args)
-        for coming in asyncio.as_completed([_settle(operator, robot, args) for robot in sorted(ids)]):
-            outcome = await coming
-            outcomes.append(outcome)
-            if not args.json:
-                sys.stdout.write(_line(outcome, release=args.release) + "\n")
-                sys.stdout.flush()
+        asked = [asyncio.create_task(_settle(operator, robot, args)) for robot in sorted(ids)]
+        try:
+            for coming in asyncio.as_completed(asked):
+                outcome = await coming
+                outcomes.append(outcome)
+                if not args.json:
+                    sys.stdout.write(_line(outcome, release=args.release) + "\n")
+                    sys.stdout.flush()
+        finally:
+            for task in asked:
+                task.cancel()
+            await asyncio.gather(*asked, return_exceptions=True)
     if args.json:
         ordered = sorted(outcomes, key=lambda outcome: outcome.id)
         sys.stdout.write(json.dumps([asdict(outcome) for outcome in ordered]) + "\n")
@@ -105,8 +113,9 @@ async def _settle(operator: Operator, robot: int, args: argparse.Namespace) -> O
     """Ask one robot until it says that it is as it was told to be."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + args.timeout
-    wanted, patience_s, outcome = not args.release, FIRST_S, Outcome(robot, False)
+    wanted, patience_s, outcome, unserved = not args.release, FIRST_S, Outcome(robot, False), False
     while (left_s := deadline - loop.time()) > 0:
+        unserved = False
         try:
             answer = await operator.ask(
                 robot, "stop", b"true" if wanted else b"false", timeout_s=min(patience_s, left_s), urgent=True
@@ -119,13 +128,25 @@ async def _settle(operator: Operator, robot: int, args: argparse.Namespace) -> O
             patience_s *= 2
             continue
         except Unreachable as error:
+            unserved = isinstance(error, NotServed)
             outcome = Outcome(robot, False, problem=error.why)
         else:
             if status.stopped is wanted:
                 return Outcome(robot, True, status.stopped, status.stop.by)
             outcome = Outcome(robot, False, status.stopped, status.stop.by, "it has not done what it was told")
         await asyncio.sleep(RETRY_S)
-    return outcome
+    return replace(outcome, problem=await _why_unserved(operator, robot) or outcome.problem) if unserved else outcome
+
+
+async def _why_unserved(operator: Operator, robot: int) -> str:
+    """More about a robot that nobody answers for; empty for one that is not online."""
+    with suppress(MacsError):
+        for agent in await operator.online():
+            if agent.key == (ROS, robot):
+                gateways = await operator.gateways()
+                why = await operator.why_silent(agent, gateways, timeout_s=FIRST_S)
+                return why or "it is online, and has no emergency stop"
+    return ""
 
 
 def _line(outcome: Outcome, *, release: bool) -> str:

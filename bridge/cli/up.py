@@ -35,6 +35,8 @@ SUMMARY = "all of it on this machine: router, gateway, robot"
 
 DEFAULT_ROBOT = 1
 DEMO_DOMAIN = "42"
+READY_S = 20.0
+"""How long the programs may take to be ready for a show that nobody watches (``--once``); others press Ctrl-C."""
 DRIVE = """'{"linear": {"x": 0.2}}' --rate 10"""
 EVERYWHERE = {"0.0.0.0", "::", ""}  # noqa: S104 - recognised, not bound here
 
@@ -45,6 +47,15 @@ class PortTaken(Unreachable):
     def __init__(self, host: str, port: int, advice: str) -> None:
         super().__init__(f"{host}:{port}", f"the port is taken; {advice}")
         self.port = port
+
+
+class NotReady(MacsError):
+    """Programs still wait for something, most often for a router that is not there."""
+
+    def __init__(self, names: list[str], routers: list[str]) -> None:
+        super().__init__(
+            f"not ready within {READY_S:g} s: {', '.join(names)}; is there a router at {', '.join(routers)}?"
+        )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--once belongs to --demo")
     options.prefix_logs(children.prefix("up"))
     plan = make_plan(args, options.settings_file(args))
-    return running.until_stopped(lambda: _up(plan))
+    return running.until_stopped(lambda: _up(plan), interrupted=running.INTERRUPTED if plan.once else 0)
 
 
 @dataclass(frozen=True)
@@ -184,7 +195,11 @@ async def _first_failure_or(work: asyncio.Task[int], tasks: list[asyncio.Task[No
 
 
 async def _when_ready(plan: Plan, programs: list[Child]) -> int:
-    await asyncio.gather(*(child.ready.wait() for child in programs))
+    try:
+        ready = asyncio.gather(*(child.ready.wait() for child in programs))
+        await asyncio.wait_for(ready, READY_S if plan.once else None)
+    except asyncio.TimeoutError:
+        raise NotReady([child.name for child in programs if not child.ready.is_set()], plan.routers) from None
     if plan.demo:
         from bridge.cli.demo import show
 

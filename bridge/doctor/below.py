@@ -6,7 +6,8 @@ from __future__ import annotations
 import socket
 import ssl
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -74,8 +75,8 @@ def tls(host: str, port: int, settings: Mapping[str, Any], timeout_s: float) -> 
     """A handshake with the certificates that Zenoh would use, and what is wrong with it."""
     try:
         context = _context(settings)
-    except (OSError, ssl.SSLError) as error:
-        return Tls(problem="own_files", detail=_words(error))
+    except _OwnFiles as error:
+        return Tls(problem="own_files", detail=str(error))
     try:
         with socket.create_connection((host, port), timeout_s) as plain:
             began = time.monotonic()
@@ -97,13 +98,35 @@ def tls(host: str, port: int, settings: Mapping[str, Any], timeout_s: float) -> 
 
 
 def _context(settings: Mapping[str, Any]) -> ssl.SSLContext:
-    context = ssl.create_default_context(cafile=settings.get("root_ca_certificate"))
+    authority = settings.get("root_ca_certificate")
+    with _naming(authority):
+        context = ssl.create_default_context(cafile=authority)
     # stricter than Zenoh, from Python 3.13 on
     context.verify_flags &= ~getattr(ssl, "VERIFY_X509_STRICT", 0)
     context.check_hostname = settings.get("verify_name_on_connect") not in (False, "false")
     if presents_certificate(settings):
-        context.load_cert_chain(settings["connect_certificate"], settings.get("connect_private_key"))
+        certificate, key = settings["connect_certificate"], settings.get("connect_private_key")
+        with _naming(certificate, key):
+            context.load_cert_chain(certificate, key)
     return context
+
+
+class _OwnFiles(Exception):
+    """Files of ours cannot be used; says which, and why."""
+
+
+@contextmanager
+def _naming(*paths: str | None) -> Iterator[None]:
+    """Name the file that cannot be read, or those that were loaded together, since Python's errors do not."""
+    given = [path for path in paths if path]
+    try:
+        for path in given:
+            with Path(path).open("rb"):
+                pass
+        yield
+    except OSError as error:  # of TLS as well
+        named = "" if error.filename else f"{' with '.join(given)}: "
+        raise _OwnFiles(named + _words(error)) from error
 
 
 def presents_certificate(settings: Mapping[str, Any]) -> bool:

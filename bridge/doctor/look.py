@@ -20,7 +20,7 @@ from msgspec import structs
 
 from macs_zenoh import ping
 from macs_zenoh.config import Settings
-from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError, WireError
+from macs_zenoh.errors import CallTimeout, ConfigError, MacsError, Refused, Unreachable, UsageError, WireError
 from macs_zenoh.keyexpr import BLOCK_SIZE, LEASE, NAME, PING, PRESENCE, UNICAST, block_of, type_name, type_number
 from macs_zenoh.mesh import Mesh, Subscription, Traffic, configuration
 from macs_zenoh.messages import NOBODY, ROS, UNITY, Metadata
@@ -91,7 +91,9 @@ class Who:
             return cls("ros", settings.robot.id, settings.robot.group)
         gateway = settings.gateway
         blocks = [*([gateway.block] if gateway.block is not None else []), *gateway.blocks]
-        return cls("gateway", blocks[0]) if blocks else cls()
+        if blocks:
+            return cls("gateway", blocks[0])
+        return cls("operator", settings.operator.id) if settings.operator.id is not None else cls()
 
     def __str__(self) -> str:
         return f"{self.kind}/{self.number}" if self.kind else ""
@@ -210,8 +212,8 @@ class Examination:
             everywhere = first
             if self._own.namespace:
                 everywhere = await self._open(facts.endpoint, timeout_s, "namespace:null")
-        except Unreachable as error:
-            facts.problem = error.why
+        except (Unreachable, ConfigError) as error:  # the second: a file of ours, see `below`
+            facts.problem = error.why if isinstance(error, Unreachable) else str(error)
             if where is not None and protocol == "tcp":
                 facts.speaks_tls = await asyncio.to_thread(below.speaks_tls, *where, min(1.0, self._timeout_s))
             return None

@@ -456,15 +456,17 @@ async def _until_ended(headset: Headset, requests: asyncio.Queue[ServiceRequest]
     """The requests in a queue, until the headset ends."""
     loop = asyncio.get_running_loop()
     ended = loop.create_task(headset.wait_ended())
+    next_one = loop.create_task(requests.get())
     try:
         while True:
-            next_one = loop.create_task(requests.get())
             await asyncio.wait((next_one, ended), return_when=asyncio.FIRST_COMPLETED)
             if not next_one.done():
-                next_one.cancel()
                 return
-            yield next_one.result()
+            request = next_one.result()
+            next_one = loop.create_task(requests.get())
+            yield request
     finally:
+        next_one.cancel()
         ended.cancel()
 
 

@@ -272,8 +272,7 @@ class PublisherNode(InterfaceNode):
         message = resolve(str(self.interface))
         self._least_bytes = least_cdr_bytes(message)
         if self.rule.deadman_message is not None:
-            stop = fields.filled(message, self.rule.deadman_message, "deadman_message")
-            self._stop_cdr = bytes(serialize_message(stop))
+            self._stop_cdr = bytes(serialize_message(self._stop_message(message)))
         node, topic = self.robot.session.node, self.request.tos_name
         check_topic_type(node, topic, self.interface)
         subscriptions = [endpoint.qos_profile for endpoint in node.get_subscriptions_info_by_topic(topic)]
@@ -288,6 +287,13 @@ class PublisherNode(InterfaceNode):
                 self._publisher = node.create_publisher(message, topic, profile, event_callbacks=events)
             except UnsupportedEventTypeError:  # of some middlewares; then the time decides
                 self._publisher = node.create_publisher(message, topic, profile)
+
+    def _stop_message(self, kind: type[Any]) -> Any:
+        try:
+            return fields.filled(kind, self.rule.deadman_message or {}, "deadman_message")
+        except Refused as refusal:  # the headset cannot mend it
+            self._loop.call_soon_threadsafe(self.robot.drops.note, "wrong_settings", self.topic, refusal.reason)
+            raise
 
     async def settle(self) -> None:
         """Let the subscriptions that exist find the new publisher: what is published before that, ROS loses."""

@@ -25,6 +25,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from bridge.doctor.below import host_and_port
 from bridge.security import access, certificates
 from bridge.security.expected import Expected, agent_of, inbox_of, presence_of, sender_of
 from bridge.security.files import client_overrides
@@ -60,6 +61,7 @@ BARRIER_S = 5.0
 ANSWER_S = 2.0
 """How long a question may stay without an answer that is permitted."""
 AT_ONCE = 200
+RETRY_S = 0.1
 
 Progress = Callable[[int, int], None]
 
@@ -151,10 +153,43 @@ async def check(
         def part(done: int, of: int, number: int = number) -> None:
             progress(number * of + done, len(ways) * of)
 
+        await asyncio.gather(*(_reach(label, endpoint, timeout_s) for endpoint in {near, far}))
         let_in = _refusals(plan, directory, label, near, timeout_s) if near == far else _nothing()
-        for found in await asyncio.gather(one_way.run(part), let_in):
-            results += found
+        trying = [asyncio.create_task(one_way.run(part)), asyncio.create_task(let_in)]
+        try:
+            for found in await asyncio.gather(*trying):
+                results += found
+        finally:
+            for task in trying:
+                task.cancel()
+            await asyncio.gather(*trying, return_exceptions=True)
     return results
+
+
+async def _reach(label: str, endpoint: str, timeout_s: float) -> None:
+    """Wait until somebody listens there: where nobody does, so many sessions take several times their time to fail.
+
+    Raises Unreachable.
+    """
+    place = host_and_port(endpoint)
+    if place is None or endpoint.partition("/")[0] not in ("tcp", "tls"):
+        return
+
+    async def connect() -> None:
+        while True:
+            try:
+                _, writer = await asyncio.open_connection(*place)
+            except OSError:
+                await asyncio.sleep(RETRY_S)
+            else:
+                writer.close()
+                return
+
+    try:
+        await asyncio.wait_for(connect(), timeout_s)
+    except asyncio.TimeoutError:
+        where = label if label == endpoint else f"{label} at {endpoint}"
+        raise Unreachable(where, f"nobody listens there, tried for {timeout_s:g} s") from None
 
 
 # -- one router, or the way from one to another ------------------------------------------------------------------

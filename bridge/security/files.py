@@ -10,7 +10,7 @@ import msgspec
 
 from bridge.security import access
 from bridge.security.access import Rule
-from bridge.security.plan import Client, Gateway, Plan, Robot, Router
+from bridge.security.plan import Client, Gateway, Operator, Plan, Robot, Router
 from macs_zenoh.config import MeshSettings, TrafficRule, changed
 from macs_zenoh.keyexpr import STREAM, type_name
 from macs_zenoh.messages import UNITY
@@ -364,6 +364,13 @@ def _command(client: Client, directory: str) -> str:
 def _sections(plan: Plan, client: Client) -> list[str]:
     if isinstance(client, Gateway) and client.blocks:
         return ["", "[gateway]", "# the certificate is good for these only", f"blocks = {json.dumps(client.blocks)}"]
+    if isinstance(client, Operator) and client.id is not None:
+        return [
+            "",
+            "[operator]",
+            "# as whom robots are asked; routers let this certificate be nobody else",
+            f"id = {client.id}",
+        ]
     if not isinstance(client, Robot):
         return []
     lines = ["", "[robot]", f"id = {client.id}", f"group = {client.group}"]

@@ -107,8 +107,8 @@ class Operator(_Client, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A person with ``macs ls`` and ``macs doctor``, who sees who is there and how the routers are."""
 
     id: AgentId | None = None
-    """With an id it is ``operator/5`` and nobody else: ``macs ls --as operator/5``. Unset: ``operator/0``, who is
-    nobody in particular, and whom nobody can write to."""
+    """With an id it is ``operator/5`` and nobody else, and its settings say so. Unset: ``operator/0``, who is nobody
+    in particular, and whom nobody can write to."""
 
 
 class Permission(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):

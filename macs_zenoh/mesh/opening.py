@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -43,6 +45,59 @@ def zenoh_config(settings: MeshSettings) -> zenoh.Config:
     for path, value in _split(settings.overrides):
         insert(config, path, value)
     return config
+
+
+_CERTIFICATE, _KEY = b"CERTIFICATE-----", b"PRIVATE KEY-----"
+TLS_PROTOCOLS = ("tls", "quic", "quic_datagram")
+TLS_FILES = {
+    "root_ca_certificate": _CERTIFICATE,
+    "connect_certificate": _CERTIFICATE,
+    "connect_private_key": _KEY,
+    "listen_certificate": _CERTIFICATE,
+    "listen_private_key": _KEY,
+}
+"""The settings that name PEM files, below ``transport/link/tls`` or after an endpoint's #, and what is inside."""
+
+
+def check_files(config: zenoh.Config) -> None:
+    """Try the files that TLS will read: of a missing one Zenoh only says, again and again, that it cannot connect.
+    Whether key and certificate belong together is not looked at; ``macs doctor`` does.
+
+    Raises ConfigError.
+    """
+    whole = msgspec.json.decode(str(config))
+    common = (((whole.get("transport") or {}).get("link") or {}).get("tls")) or {}
+    for role in ("connect", "listen"):
+        for endpoint in _endpoints(whole, role):
+            if endpoint.partition("/")[0] not in TLS_PROTOCOLS:
+                continue
+            own = dict(part.partition("=")[::2] for part in endpoint.partition("#")[2].split(";") if part)
+            used = {**common, **own}
+            mutual = used.get("enable_mtls") in (True, "true")
+            for name, begins in TLS_FILES.items():
+                needed = name.startswith(role) and (mutual or role == "listen")
+                if (needed or name == "root_ca_certificate") and used.get(name):
+                    where = endpoint if name in own else f"transport/link/tls/{name}"
+                    _check_pem(f"zenoh configuration {where}", str(used[name]), begins)
+
+
+def _endpoints(whole: dict[str, Any], role: str) -> Iterable[str]:
+    """Zenoh allows one list, or one per mode; and a list in a list."""
+    found = (whole.get(role) or {}).get("endpoints") or []
+    if isinstance(found, dict):
+        found = found.get(whole.get("mode") or "client") or []
+    for endpoint in found:
+        yield from endpoint if isinstance(endpoint, list) else [endpoint]
+
+
+def _check_pem(setting: str, path: str, begins: bytes) -> None:
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise ConfigError(setting, f"{path}: {error.strerror or error}") from error
+    if not re.search(rb"-----BEGIN [A-Z0-9 ]*" + begins, content):
+        what = "certificate" if begins == _CERTIFICATE else "private key"
+        raise ConfigError(setting, f"{path}: there is no {what} in this file")
 
 
 def _split(overrides: Iterable[str]) -> Iterable[tuple[str, str]]:

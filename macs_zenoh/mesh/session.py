@@ -22,7 +22,7 @@ from macs_zenoh.shaping import Shaper
 from macs_zenoh.versions import installed
 
 from .arrivals import Arrivals
-from .opening import first_line, insert, zenoh_config
+from .opening import check_files, first_line, insert, zenoh_config
 from .outgoing import Outgoing
 from .recovered import Recovered
 from .samples import Handler, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
@@ -93,9 +93,11 @@ class Mesh:
         """Join the mesh. A client waits for its first router as long as it takes; ``on_waiting`` hears of it once.
         The ``traffic`` rules hold for what is put and asked here.
 
-        Raises ConfigError when Zenoh does not accept the configuration, Unreachable when a router cannot listen.
+        Raises ConfigError when Zenoh does not accept the configuration or a file of it is missing, Unreachable when a
+        router cannot listen.
         """
         zenoh.init_log_from_env_or("error")  # RUST_LOG, as with Zenoh's own tools
+        check_files(zenoh_config(settings))  # once: a file that is being replaced ends nobody who waits
         waiting = False
         while True:
             config = zenoh_config(settings)
@@ -120,6 +122,7 @@ class Mesh:
         """
         zenoh.init_log_from_env_or("off")  # what goes wrong is in the error
         config = zenoh_config(settings)
+        check_files(config)
         insert(config, "connect/timeout_ms", str(round(timeout_s * 1000)))
         try:
             return cls(await _open(config), settings)

@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import signal
+import socket
 import sys
 
 import pytest
@@ -108,6 +109,26 @@ async def test_a_waiting_gateway_stops_too(endpoint: str) -> None:
     assert await asyncio.wait_for(process.wait(), 2) == 0
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+@pytest.mark.parametrize("verb", ["ls", "stop"])
+async def test_an_interrupted_question_is_130(verb: str, number: signal.Signals) -> None:
+    """Who was to find or do something and was stopped before ends with 130, without a word."""
+    with socket.create_server(("127.0.0.1", 0)) as says_nothing:
+        says_nothing.setblocking(False)
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "bridge", verb, "--timeout", "60"),
+            *("-e", f"tcp/127.0.0.1:{says_nothing.getsockname()[1]}"),
+            cwd=ROOT,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        begun, _ = await asyncio.wait_for(asyncio.get_running_loop().sock_accept(says_nothing), 20)
+        process.send_signal(number)
+        begun.close()
+    assert await asyncio.wait_for(process.communicate(), 20) == (b"", b"")
+    assert process.returncode == 130
+
+
 async def test_a_taken_port_is_one_line(endpoint: str) -> None:
     """A router or gateway that cannot listen says where and ends with 1."""
     async with Program("router", "-l", endpoint), Program("gateway", "--port", "0", "-e", endpoint) as gateway:
@@ -150,6 +171,23 @@ async def test_up_runs_router_and_gateway(endpoint: str) -> None:
     assert process.returncode == 0
     assert "no rclpy here, so no robot" in errors.decode()
     assert "killed" not in errors.decode()
+
+
+async def test_up_once_gives_up() -> None:
+    """`macs up --demo --once` with a router that is not there fails, and says what was not ready."""
+    pytest.importorskip("rclpy")
+    nowhere = f"tcp/127.0.0.1:{free_port()}"
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", "import sys; from bridge.cli import main, up; up.READY_S = 3.0; sys.exit(main())"),
+        *("up", "--demo", "--once", "--port", "0", "-e", nowhere),
+        cwd=ROOT,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    _, errors = await asyncio.wait_for(process.communicate(), 30)
+    assert process.returncode == 1
+    last = errors.decode().splitlines()[-1]
+    assert last == f"macs up: not ready within 3 s: gateway, agent; is there a router at {nowhere}?"
 
 
 async def test_keys_as_a_program() -> None:

@@ -234,6 +234,21 @@ async def test_a_refused_client_certificate_is_named(authority: Authority, forei
             assert report.wrong == {"tls_client_certificate_refused": "error", **also}
 
 
+@pytest.mark.parametrize("broken", ["missing", "garbage", "mismatch"])
+async def test_a_file_of_ours_that_is_broken_is_named(authority: Authority, tmp_path: Path, broken: str) -> None:
+    """A key that is missing, is none or belongs to another certificate is an error that names the file."""
+    certificate, _ = authority.issue("robot")
+    wrong = tmp_path / "wrong.key"
+    if broken == "garbage":
+        wrong.write_text("garbage")
+    elif broken == "mismatch":
+        wrong = authority.issue("other")[1]
+    async with tls_router(authority.issue("router"), authority.ca) as router:
+        report = await doctor("-e", router.endpoint, cfg=[trusting(authority.ca), *showing((certificate, wrong))])
+    assert "tls_own_files" in report.wrong
+    assert str(wrong) in report.find("tls_own_files")["what"]
+
+
 async def test_mutual_tls_that_works(authority: Authority) -> None:
     """With the right certificates nothing is wrong, except that one ends soon; a tcp endpoint for that port is."""
     async with tls_router(authority.issue("router", days=3), authority.ca) as router:

@@ -298,6 +298,19 @@ async def test_a_stopped_subscription_ends_well(start: Start, robot: EchoRobot, 
     await asyncio.wait_for(gone.wait(), 5)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+async def test_a_stopped_service_ends_well(start: Start, robot: EchoRobot, number: signal.Signals) -> None:
+    """A signal ends `serve`, too, with exit code 0 and nothing in its log but its end."""
+    process = await start("serve", "/ask", SET_BOOL, "{}")
+    await robot.registered(NodeType.SERVICE, "nd__ask")
+    process.process.send_signal(number)
+    code, lines, log = await process.end()
+    assert (code, lines) == (0, []), log
+    assert [line.split(":")[2].split()[-1] for line in log.splitlines()] == ["macs.headset"] * len(log.splitlines()), (
+        log
+    )
+
+
 async def test_an_interrupted_count_is_130(start: Start, robot: EchoRobot) -> None:
     """Ctrl-C before a verb has done what was asked is exit code 130."""
     process = await start("sub", "/talk", "std_msgs/String", "--count", "5")

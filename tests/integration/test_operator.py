@@ -134,6 +134,7 @@ async def test_stop_of_nobody_is_no_success(router: str) -> None:
     code, out, errors = await ended("stop", "-e", "tcp/127.0.0.1:1", "--timeout", "0.5")
     assert (code, out) == (1, "")
     assert "no Zenoh router answered" in errors
+    assert "start one with `macs router`" in errors
 
 
 @pytest.mark.parametrize("verb", ["ls", "stop"])
@@ -161,7 +162,9 @@ async def test_an_interrupted_stop_is_no_success(router: str, start_robot: Start
     )
     await until(lambda: robot.calls, 20)
     process.send_signal(signal.SIGINT)
-    assert await asyncio.wait_for(process.wait(), 10) == 130
+    _, errors = await asyncio.wait_for(process.communicate(), 10)
+    assert process.returncode == 130
+    assert "Task was destroyed" not in errors.decode()
 
 
 async def test_ls_shows_who_is_stopped_and_who_has_control(
@@ -211,6 +214,17 @@ async def test_ls_knows_robots_that_tell_nothing(router: str, start_gateway: Sta
         assert (row["type"], row["status"], row["problem"]) == ("ros", None, "")
         _, out, _ = await ended("ls", "-v", "-e", router)
         assert "is no `macs agent`" in out
+
+
+async def test_a_session_that_serves_no_robot_verbs_is_no_fault(router: str) -> None:
+    """A program with a session of its own, which is no robot agent, is listed without a question mark; a stop says
+    that it is there."""
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+        await agent.call("ros", 7, "ping")
+        row, *_ = await macs("ls", "--json", "-e", router)
+        assert (row["status"], row["problem"]) == (None, "")
+        code, out, _ = await ended("stop", "7", "--timeout", "1", "-e", router)
+        assert (code, out) == (1, "robot 7 is NOT stopped: it is online, and has no emergency stop\n")
 
 
 async def test_an_answer_that_makes_no_sense_is_told(router: str) -> None:

@@ -7,6 +7,7 @@ import datetime as dt
 import signal
 import socket
 import sys
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ from macs_zenoh.named import Outcome
 from macs_zenoh.wire import encode_frame, encode_message
 from tests.integration.conftest import until
 from tests.integration.test_reliable import Numbers, Stream
-from tests.programs import ROOT, Program, free_port, macs
+from tests.programs import ROOT, Program, ended, free_port, macs
 from tests.routers import Router
 
 NOW = dt.datetime.now(dt.timezone.utc)
@@ -785,6 +786,72 @@ async def test_an_operator_looks(site: Site) -> None:
         assert {(row["type"], row["id"]) for row in rows} == {("ros", 9), ("unity", 256)}
 
 
+async def test_an_operator_stops_with_its_own_file(tmp_path: Path) -> None:
+    """The generated settings say who an operator is, so that it stops robots and asks them without --as; who asks as
+    somebody else is told that rules may be why nobody answers."""
+    clients = CLIENTS.replace("{name: anna}", "{name: anna, id: 5}")
+    site = made(tmp_path / "pki", clients.replace("may: call, verbs: [status]", "may: [command, call]"))
+    settings = ("--settings", str(site.directory / "anna" / "macs.toml"))
+    callers: list[str] = []
+
+    async def answer(call: macs_zenoh.Call) -> bytes:
+        callers.append(f"{call.verb} by {call.sender_type}/{call.sender_id}")
+        return b'{"ros_node": "/r", "stopped": true, "stop": {"by": "operator/5"}, "nodes": []}'
+
+    async with (
+        Router(site.file()),
+        macs_zenoh.join("ros", id=7, group=3, settings=site.settings("robot-7")) as robot,
+    ):
+        for verb in ("status", "stop"):
+            robot.serve(verb, answer)
+        while not (await macs("ls", "--json", *settings))[0]["status"]:  # until the router knows what it serves
+            await asyncio.sleep(0.02)
+        assert set(callers) == {"status by operator/5"}
+        code, out, _ = await ended("stop", *settings)
+        assert (code, out) == (0, "robot 7 is stopped, by operator/5\n")
+        code, out, _ = await ended("doctor", "--quick", *settings)
+        assert (code, "operator/5" in out) == (0, True), out
+
+        denied = "it does not answer operator/0; access rules may not allow it (--as operator/N)"
+        nobody = (*settings, "--as", "operator/0")
+        code, out, _ = await ended("stop", "--timeout", "1", *nobody)
+        assert (code, out) == (1, f"robot 7 is NOT stopped: {denied}\n")
+        assert (await macs("ls", "--json", *nobody))[0]["problem"] == denied
+        code, out, _ = await ended("ls", *nobody)
+        assert out.splitlines()[1].endswith("?")
+        code, out, _ = await ended("ls", "-v", *nobody)
+        assert f"tells nothing: {denied}" in out
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "problem"),
+    [
+        ("ca.pem", None, "No such file or directory"),
+        ("key.pem", b"garbage", "there is no private key in this file"),
+        ("cert.pem", b"", "there is no certificate in this file"),
+    ],
+)
+async def test_a_file_that_cannot_be_used_is_named(
+    file: str, content: bytes | None, problem: str, tmp_path: Path
+) -> None:
+    """Programs end at once, and name the setting and the file."""
+    site = made(tmp_path / "pki")
+    for name in ("hall-1", "site"):
+        path = site.directory / name / file
+        path.unlink()
+        if content is not None:
+            path.write_bytes(content)
+    settings = ("--settings", str(site.directory / "hall-1" / "macs.toml"))
+    for verb in ("gateway", "ls"):
+        code, _, errors = await ended(verb, *settings)
+        assert code == 2, errors
+        assert f"{site.directory / 'hall-1' / file}: {problem}" in errors
+        assert "transport/link/tls/" in errors
+    code, _, errors = await ended("router", "-c", str(site.file()))
+    assert code == 2, errors
+    assert f"{path}: {problem}" in errors
+
+
 async def test_a_gateway_keeps_to_its_blocks(site: Site) -> None:
     """A second gateway with the same certificate finds no block that it may have."""
     settings = str(site.directory / "hall-1" / "macs.toml")
@@ -834,6 +901,21 @@ async def test_a_check_that_was_stopped_is_none_that_went_well(how: signal.Signa
         begun.close()
 
 
+async def test_a_check_without_a_router_gives_up(tmp_path: Path) -> None:
+    """Where nobody listens, a check ends after its time with one line, however many sessions it would have made."""
+    found = made(tmp_path / "pki")
+    nowhere = found.router("site")[0]
+    plan_file = tmp_path / "plan.yaml"
+    plan_file.write_text(f"routers: [{{name: site, addresses: [127.0.0.1], listen: ['{nowhere}']}}]" + CLIENTS)
+    began = time.monotonic()
+    code, out, errors = await run(
+        "security", "check", str(plan_file), "--dir", str(found.directory), "-e", nowhere, "--timeout", "1"
+    )
+    assert time.monotonic() - began < 10, "1 s, and the start of a program on a busy machine"
+    assert (code, out) == (1, "")
+    assert errors == f"macs security: {nowhere} cannot be reached: nobody listens there, tried for 1 s\n"
+
+
 async def test_the_command_generates_and_checks(tmp_path: Path) -> None:
     """`macs security generate` says what it made, `check` whether it holds; the exit code says it to programs."""
     found = made(tmp_path / "unused")
@@ -849,7 +931,7 @@ async def test_the_command_generates_and_checks(tmp_path: Path) -> None:
 
     code, out, errors = await run("security", "check", str(tmp_path / "plan.yaml"), "--dir", pki)
     assert (code, out) == (1, "")
-    assert "no certificate of the plan is let in" in errors
+    assert "nobody listens there" in errors
     async with Router(tmp_path / "pki" / "site" / "router.json5"):
         code, out, _ = await run("security", "check", str(tmp_path / "plan.yaml"), "--dir", pki)
         assert code == 0, out

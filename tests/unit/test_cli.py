@@ -78,6 +78,43 @@ def test_wrong_usage_is_one_line_and_exit_code_2(argv: list[str], capsys: pytest
     assert captured.err.strip().splitlines()[-1].startswith("macs")
 
 
+@pytest.mark.parametrize(
+    ("argv", "verb", "meant"),
+    [
+        (["agnet"], "macs", "invalid choice: 'agnet', did you mean agent?"),
+        (["ls", "--jsno"], "macs ls", "unrecognized arguments: --jsno, did you mean --json?"),
+        (["ls", "--timeuot=5"], "macs ls", "did you mean --timeout?"),
+        (["ls", "all"], "macs ls", "unrecognized arguments: all"),
+        (["gateway", "--prot", "7000"], "macs gateway", "did you mean --port?"),
+        (["router", "--frobnicate"], "macs router", "unrecognized arguments: --frobnicate"),
+        (["security", "chekc"], "macs security", "did you mean check?"),
+        (["headset", "127.0.0.1", "snd"], "macs headset 127.0.0.1", "did you mean send?"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_a_misspelled_word_is_told_by_its_verb(
+    argv: list[str], verb: str, meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What a verb does not know is told with that verb's usage, and with what may have been meant."""
+    with pytest.raises(SystemExit) as ended:
+        main(argv)
+    assert ended.value.code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert lines[0].startswith(f"usage: {verb.partition(' 127')[0]} ")
+    assert lines[-1].startswith(f"{verb.partition(' 127')[0]}")
+    assert lines[-1].endswith(meant)
+
+
+def test_without_a_verb_there_is_help(capsys: pytest.CaptureFixture[str]) -> None:
+    """`macs` alone shows what there is, on stderr, and is wrong usage."""
+    with pytest.raises(SystemExit) as ended:
+        main([])
+    assert ended.value.code == 2
+    shown = capsys.readouterr().err
+    assert all(f"    {verb:12}" in shown for verb in VERBS)
+    assert shown.endswith("macs: no verb was given\n")
+
+
 # -- settings --------------------------------------------------------------------------------------------------------
 
 

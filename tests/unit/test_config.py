@@ -45,7 +45,9 @@ def test_a_file_sets_its_fields(tmp_path: Path) -> None:
         ("[gateway]\nport = '7000'", "f.toml: gateway.port", "expected `int`, got `str`"),
         ("[robot]\nid = 0", "f.toml: robot.id", ">= 1"),
         ("[robot]\ngroup = 256", "f.toml: robot.group", "<= 255"),
-        ("[[robot.rules]]\nmatch = 'cmd_vel'", "f.toml: robot.rules[0].match", "matching regex"),
+        ("[[robot.rules]]\nmatch = 'cmd_vel'", "f.toml: robot.rules[0].match", "a full name that begins with /"),
+        ("[robot]\nexpose = ['cmd_vel']", "f.toml: robot.expose[0]", "a full name that begins with /"),
+        ("[robot]\nstop_topic = 'stop'", "f.toml: robot.stop_topic", "the full name of a topic, which begins with /"),
         ("[[robot.rules]]\nmatch = '/a'\nmaxhz = 5", "f.toml: robot.rules[0]", "did you mean `max_hz`?"),
         ("[[robot.rules]]\nmatch = '/a'\ndeadman_s = 1", "f.toml: robot.rules.deadman_s", "needs a deadman_message"),
         ("[[traffic]]\nmatch = 'macs/all/**'\nmax_hz = 0", "f.toml: traffic[0].max_hz", "expected `float` > 0"),
@@ -56,9 +58,23 @@ def test_a_file_sets_its_fields(tmp_path: Path) -> None:
         ("[[traffic]]\nmatch = '/cmd_vel'", "f.toml: traffic.match", "'/cmd_vel' is not a key expression"),
         ("[[traffic]]\nmatch = 'macs/nd__cam*'", "f.toml: traffic.match", "write nd__cam$*"),
         ("[trafic]\nmatch = 'macs/**'", "f.toml", "did you mean `traffic`?"),
-        ("[robot]\nstop_allow = ['someone in group 3']", "f.toml: robot.stop_allow[0]", "matching regex"),
+        ("[robot]\nstop_allow = ['someone in group 3']", "f.toml: robot.stop_allow[0]", "names no agents"),
+        ("[robot]\nstop_allow = ['bob']", "f.toml: robot.stop_allow[0]", "'bob' names no agents, as *, unity"),
+        ("[robot]\nrelease_allow = ['*', 'operator5']", "f.toml: robot.release_allow[1]", "operator/5"),
+        ("[robot]\nregister_allow = ['group/0']", "f.toml: robot.register_allow[0]", "'group/0' names no agents"),
+        ("[robot]\nregister_allow = ['block/256']", "f.toml: robot.register_allow[0]", "'block/256' names no agents"),
+        ("[robot]\nregister_allow = ['unity/']", "f.toml: robot.register_allow[0]", "'unity/' names no agents"),
+        ("[robot]\nregister_allow = ['ros/70000']", "f.toml: robot.register_allow[0]", "'ros/70000' names no agents"),
+        ("[robot]\nregister_allow = ['1']", "f.toml: robot.register_allow[0]", "'1' names no agents"),
         ("[mesh]\nconnect = ['tcp/a:1', 5]", "f.toml: mesh.connect[1]", "expected `str`"),
         ("[mesh]\nconnect = ['10.0.0.1:7447']", "f.toml: mesh.connect", "write tcp/10.0.0.1:7447"),
+        ("[mesh]\nconnect = ['tcp/127.0.0.1']", "f.toml: mesh.connect", "needs a host and a port, as in tcp/10.0.0.1"),
+        ("[mesh]\nconnect = ['foo/1.2.3.4:7530']", "f.toml: mesh.connect", "'foo', which is no protocol"),
+        ("[mesh]\nconnect = ['tcp/127.0.0.1:75300']", "f.toml: mesh.connect", "port 75300, allowed is 1..65535"),
+        ("[mesh]\nconnect = ['tls/[::1]:0#a=b:1']", "f.toml: mesh.connect", "port 0, allowed is 1..65535"),
+        ("[mesh]\nlisten = ['udp/:7447']", "f.toml: mesh.listen", "needs a host and a port"),
+        ("[operator]\nidd = 5", "f.toml: operator", "did you mean `id`?"),
+        ("[operator]\nid = 0", "f.toml: operator.id", ">= 1"),
         ("[mesh]\nlisten = ['everywhere']", "f.toml: mesh.listen", "as in tcp/"),
         ("[mesh]\ntx_queue_batches = 17", "f.toml: mesh.tx_queue_batches", "<= 16"),
         ("[mesh]\nretry_min_ms = 500", "f.toml: mesh.retry_min_ms", "above retry_max_ms, 200"),
@@ -89,6 +105,12 @@ def test_a_file_has_rules_for_traffic_and_topics() -> None:
     ]
     assert settings.traffic[0].reliable is None
     assert settings.robot.rules == [TopicRule(match="/a", priority="data_high")]
+
+
+def test_patterns_of_agents() -> None:
+    """Everybody, a type by word or number, one agent, a group and a block can be allowed."""
+    patterns = ["*", "ros", "unity", "operator", "7", "unity/5", "operator/0", "7/65535", "group/255", "block/0"]
+    assert RobotSettings(stop_allow=patterns, release_allow=[]).stop_allow == patterns
 
 
 def test_a_later_file_wins_setting_by_setting(tmp_path: Path) -> None:
@@ -172,6 +194,26 @@ def test_only_what_was_asked_for_is_chosen() -> None:
 def test_a_client_without_endpoints_uses_the_local_router(settings: MeshSettings, routers: list[str]) -> None:
     """Only a client that names no router, and no Zenoh file, falls back to the one on this host."""
     assert settings.routers == routers
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp/a.example:1",
+        "tls/[fe80::1%eth0]:7447#iface=eth0",
+        "udp/10.0.0.1:65535?rel=0",
+        "quic/10.0.0.1:7447",
+        "ws/a:80",
+        "unixsock-stream//tmp/zenoh.sock",
+        "unixpipe/zenoh.pipe",
+        "serial//dev/ttyUSB0#baudrate=115200",
+        "vsock/2:1234",
+    ],
+)
+def test_every_kind_of_link_may_be_an_endpoint(endpoint: str) -> None:
+    """Endpoints that Zenoh understands are taken as they are; to listen, any port will do."""
+    assert MeshSettings(connect=[endpoint]).routers == [endpoint]
+    assert MeshSettings(listen=[endpoint, "tcp/[::]:0"]).listen[0] == endpoint
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)

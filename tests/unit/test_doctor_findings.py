@@ -16,7 +16,7 @@ from bridge.doctor.facts import Certificate, Clock, Echo, Endpoint, Facts, Right
 from bridge.doctor.findings import found, judge, worst
 from bridge.doctor.kinds import ERROR, GROUPS, KINDS, NOTE, OK, WARNING, Severity
 from bridge.doctor.look import Who
-from macs_zenoh.config import GatewaySettings, RobotSettings, Settings
+from macs_zenoh.config import GatewaySettings, OperatorSettings, RobotSettings, Settings
 from macs_zenoh.errors import UsageError
 from macs_zenoh.keyexpr import LEASE, NAME, PRESENCE
 from macs_zenoh.ping import Pong
@@ -502,6 +502,7 @@ def test_whose_rights_are_tried() -> None:
     assert str(Who.of(Settings(robot=RobotSettings(id=7)))) == "ros/7"
     assert str(Who.of(Settings(gateway=GatewaySettings(block=3)))) == "gateway/3"
     assert str(Who.of(Settings(gateway=GatewaySettings(blocks=[4, 5])))) == "gateway/4"
+    assert str(Who.of(Settings(operator=OperatorSettings(id=5)))) == "operator/5"
     assert Who.parse("gateway/1").agent == (2, 511)
     assert Who.parse("ros/7").agent == (1, 7)
     assert not Who.parse("observer").joins

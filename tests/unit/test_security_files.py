@@ -278,6 +278,10 @@ def test_settings_say_who_somebody_is() -> None:
     assert (robot.awareness.name, robot.awareness.id, robot.awareness.beside) == ("drone 7", 7, True)
     assert made["hall-2"].gateway.blocks == [2]
     assert robot.traffic == found.traffic
+    assert made["anna"].operator.id is None
+    numbered = plan.parse((TEXT + TRAFFIC).replace("{name: anna}", "{name: anna, id: 5}"))
+    anna = next(client for client in numbered.clients if client.name == "anna")
+    assert config.parse(files.settings_toml(numbered, anna, "/etc/macs")).operator.id == 5
 
 
 def test_a_robot_knows_who_may_command_it() -> None:
