@@ -14,7 +14,8 @@ from typing import Any
 
 import zenoh
 
-from .samples import OnBatch, OnNumbered, Payload
+from .samples import AtOnce, OnBatch, OnNumbered, Payload
+from .threads import keep_attached
 
 log = logging.getLogger("macs.mesh")
 
@@ -25,6 +26,11 @@ class Arrivals:
 
     When the loop is behind, the delivering thread waits a moment, then drops: Zenoh must not be held up for long,
     or other programs' messages wait too.
+
+    A single sample need not go to the loop at all: to wake it takes longer than to pass a message on. It is offered
+    to whoever takes samples *at once*, in the thread that brought it. Whoever handles samples has the *turn*, this
+    thread or the loop, and at once is only when nothing waits before, so the order stays. Samples in quick
+    succession go to the loop, which handles many for little more than one.
     """
 
     LIMIT = 16_384
@@ -33,6 +39,10 @@ class Arrivals:
     """Of payloads that are large; the others are bounded by their number."""
     BATCH = 512
     PATIENCE_S = 0.1
+    AT_ONCE_BYTES = 128 << 10
+    """Larger ones take too long for a thread that reads from the link."""
+    CALM_S = 0.0003
+    """So long after the one before, a sample counts as a single one."""
 
     def __init__(
         self, loop: asyncio.AbstractEventLoop, wake: Callable[[Callable[[], None]], None], drops: Counter[str]
@@ -45,6 +55,10 @@ class Arrivals:
         self._waiting = False
         self._large_bytes = 0
         self._large_lock = threading.Lock()
+        self._turn = threading.Lock()
+        self._busy_until = 0.0
+        self.asked: deque[zenoh.Query] = deque()
+        """Queries on their way to the loop: an emergency stop can be among them, so no sample overtakes them."""
         self._own = threading.local()
 
     def put(self, publisher: zenoh.Publisher, payload: Payload) -> None:
@@ -64,27 +78,38 @@ class Arrivals:
         finally:
             self._own.payload = None
 
-    def receiver(self, on_batch: OnBatch, on_numbered: OnNumbered | None = None) -> Callable[[zenoh.Sample], bool]:
+    def receiver(
+        self, on_batch: OnBatch, on_numbered: OnNumbered | None = None, *, at_once: AtOnce | None = None
+    ) -> Callable[[zenoh.Sample], bool]:
         """What Zenoh calls, in whatever thread, for each sample of one subscription; whether there was room for it.
-        Samples that their source has numbered go to ``on_numbered``, if it is given."""
+        Samples that their source has numbered go to ``on_numbered``, if it is given; others are offered to
+        ``at_once`` first."""
         queue, limit, large, own = self._queue, self.LIMIT, self.LARGE_BYTES, self._own
 
         def receive(sample: zenoh.Sample) -> bool:
             if len(queue) >= limit and not self._has_room():
                 self._drops["loop_behind"] += 1
                 return False
-            payload = getattr(own, "payload", None)
-            if payload is None:
+            try:
+                payload = own.payload
+            except AttributeError:  # the first in this thread
+                payload = own.payload = None
+                keep_attached()
+            elsewhere = payload is None
+            if elsewhere:
                 payload = sample.payload.to_bytes()
+            key = str(sample.key_expr)
+            info = sample.source_info if on_numbered is not None else None
+            if at_once is not None and elsewhere and info is None and self._taken_at_once(at_once, key, payload):
+                return True
             if len(payload) > large and not self._has_room_for(len(payload)):
                 self._drops["loop_behind"] += 1
                 return False
-            info = sample.source_info if on_numbered is not None else None
             if info is None or on_numbered is None:
-                queue.append((on_batch, (str(sample.key_expr), payload)))
+                queue.append((on_batch, (key, payload)))
             else:
                 source = f"{info.source_id.zid}/{info.source_id.eid}"
-                queue.append((on_numbered, (str(sample.key_expr), payload, source, info.source_sn)))
+                queue.append((on_numbered, (key, payload, source, info.source_sn)))
             if not self._waiting:
                 self._wake_loop()
             return True
@@ -104,7 +129,25 @@ class Arrivals:
         else:
             self._wake(self._deliver)
 
+    def _taken_at_once(self, at_once: AtOnce, key: str, payload: Payload) -> bool:
+        """Whether it was taken in this thread, one of Zenoh's."""
+        if self._queue or len(payload) > self.AT_ONCE_BYTES or not self._turn.acquire(blocking=False):
+            return False
+        try:
+            calm = time.monotonic() - self._busy_until > self.CALM_S
+            return calm and not self._queue and not self.asked and at_once(key, payload)
+        except Exception:
+            log.exception("handling a sample failed")  # it may have been half done: not once more
+            return True
+        finally:
+            self._busy_until = time.monotonic()
+            self._turn.release()
+
     def _deliver(self) -> None:
+        with self._turn:
+            self._deliver_batch()
+
+    def _deliver_batch(self) -> None:
         self._waiting = False
         queue = self._queue
         arrived = [queue.popleft() for _ in range(min(len(queue), self.BATCH))]

@@ -21,6 +21,8 @@ from .samples import Payload, Traffic
 
 log = logging.getLogger("macs.mesh")
 
+CALL = Traffic.CALL  # looked up by a Python call otherwise, for each message
+
 
 class _Outlet(NamedTuple):
     """Where puts with one key go."""
@@ -97,7 +99,7 @@ class Outgoing:
             return
         if not (self.linked or kept):
             self.drops["no_route"] += 1
-        if traffic is not Traffic.CALL or (self._sender.idle and len(payload) <= self.LARGE_BYTES):
+        if traffic is not CALL or (self._sender.idle and len(payload) <= self.LARGE_BYTES):
             self._arrivals.put(publisher, payload)
         elif kept:  # one publisher numbers them all
             if not self._sender.put(publisher, payload):

@@ -14,7 +14,7 @@ import zenoh
 from macs_zenoh.recovery import Ask, Recovery
 
 from .arrivals import Arrivals
-from .samples import SOURCES, Numbered, OnBatch, OnMiss, OnNumbered, Sample, Subscription
+from .samples import SOURCES, AtOnce, Numbered, OnBatch, OnMiss, OnNumbered, Sample, Subscription
 
 log = logging.getLogger("macs.mesh")
 
@@ -35,6 +35,7 @@ class Recovered:
         on_batch: OnBatch,
         on_miss: OnMiss,
         *,
+        at_once: AtOnce | None,
         linked: bool,
         on_close: Callable[[Recovered], None],
     ) -> None:
@@ -45,6 +46,7 @@ class Recovered:
         self._on_close = on_close
         self._key = key
         self._on_batch = on_batch
+        self._at_once = at_once
         self._on_miss = on_miss
         self._recovery = Recovery()
         self._timer: asyncio.TimerHandle | None = None
@@ -55,7 +57,8 @@ class Recovered:
     def declare(self) -> Subscription:
         """Subscribe, and learn how far those sources are that exist."""
         session, arrivals = self._session, self._arrivals
-        samples = zenoh.handlers.Callback(arrivals.receiver(self._on_batch, self._on_numbered), indirect=False)
+        receive = arrivals.receiver(self._on_batch, self._on_numbered, at_once=self._at_once)
+        samples = zenoh.handlers.Callback(receive, indirect=False)
         heartbeats = zenoh.handlers.Callback(arrivals.receiver(self._on_heartbeat), indirect=False)
         declared = Subscription(
             self,

@@ -34,6 +34,9 @@ Sample = tuple[str, Payload]
 
 OnBatch = Callable[[list[Sample]], None]
 OnMiss = Callable[[str, int], None]
+AtOnce = Callable[[str, Payload], bool]
+"""Takes one sample, by key and payload, in a thread of Zenoh's: soon, and without waiting for the loop. False: it has
+done nothing, the loop shall."""
 Handler = Callable[[str, bytes], Awaitable[bytes | None]]
 """Answers a query, by its key and payload. None: not at all, as if nobody were here."""
 

@@ -25,7 +25,8 @@ from .arrivals import Arrivals
 from .opening import check_files, first_line, insert, zenoh_config
 from .outgoing import Outgoing
 from .recovered import Recovered
-from .samples import Handler, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
+from .samples import AtOnce, Handler, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
+from .threads import shared_threads
 
 log = logging.getLogger("macs.mesh")
 
@@ -197,10 +198,19 @@ class Mesh:
     # -- publish and subscribe -----------------------------------------------------------------------------------
 
     def subscribe(
-        self, key: str, on_batch: OnBatch, *, reliable: bool = False, on_miss: OnMiss | None = None
+        self,
+        key: str,
+        on_batch: OnBatch,
+        *,
+        at_once: AtOnce | None = None,
+        reliable: bool = False,
+        on_miss: OnMiss | None = None,
     ) -> Subscription:
         """Receive samples in batches. What one sender put is received in its order, over all subscriptions of this
         mesh, as long as it was put with one kind of traffic.
+
+        ``at_once`` is offered a sample that comes from elsewhere while nothing else waits, in a thread of Zenoh's,
+        which saves it the way to the loop; what it does not take goes to ``on_batch``.
 
         ``reliable``: what a source keeps (`keep`) is received in order and once, also through outages. Samples that
         it has no more are counted as ``missed``, and ``on_miss(key, count)`` hears of them. What sources do not keep
@@ -213,13 +223,14 @@ class Mesh:
                 key,
                 on_batch,
                 partial(self._lost, on_miss),
+                at_once=at_once,
                 linked=self.linked,
                 on_close=self._recovered.discard,
             )
             self._recovered.add(recovered)
             return recovered.declare()
-        callback = zenoh.handlers.Callback(self._arrivals.receiver(on_batch), indirect=False)
-        return Subscription(self._session.declare_subscriber(key, callback))
+        receive = self._arrivals.receiver(on_batch, at_once=at_once)
+        return Subscription(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
     def _lost(self, on_miss: OnMiss | None, key: str, count: int) -> None:
         self.drops["missed"] += count
@@ -312,6 +323,7 @@ class Mesh:
         """
 
         async def answer(query: zenoh.Query) -> None:
+            self._arrivals.asked.popleft()
             with query:
                 name = str(query.key_expr)
                 payload = query.payload.to_bytes() if query.payload is not None else b""
@@ -333,6 +345,7 @@ class Mesh:
             task.add_done_callback(self._tasks.discard)
 
         def on_query(query: zenoh.Query) -> None:
+            self._arrivals.asked.append(query)
             self._from_thread(spawn, query)
 
         answering = zenoh.handlers.Callback(on_query, indirect=False)
@@ -414,13 +427,18 @@ async def _open(config: zenoh.Config) -> zenoh.Session:
     Raises zenoh.ZError.
     """
     thread = ThreadPoolExecutor(1, "macs-open")
-    opened = thread.submit(zenoh.open, config)
+    opened = thread.submit(_open_now, config)
     thread.shutdown(wait=False)
     try:
         return await asyncio.wrap_future(opened)
     except asyncio.CancelledError:
         opened.add_done_callback(_close_late)
         raise
+
+
+def _open_now(config: zenoh.Config) -> zenoh.Session:
+    with shared_threads(msgspec.json.decode(config.get_json("mode"), type=str)):
+        return zenoh.open(config)
 
 
 def _close_late(opened: Future[zenoh.Session]) -> None:
