@@ -5,16 +5,19 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from typing import Protocol, cast
 
-from macs_zenoh.messages import AddNode, GoneAgent, Metadata, RemoveNode
+from macs_zenoh.messages import AddNode, GoneAgent, Metadata, NodeType, RemoveNode
 from macs_zenoh.peer import Event, Joined, Left, Peer, Rejected, Sent, State
 from macs_zenoh.queues import Chunk, Outbox
 
 from .brake import Brake
+from .shortcut import Shortcut
 
 log = logging.getLogger("macs.gateway")
 
@@ -61,6 +64,12 @@ class Connection(asyncio.BufferedProtocol):
         self._transport: asyncio.Transport
         self._ready: list[Chunk] = []
         self._ready_bytes = 0
+        self._loop = asyncio.get_running_loop()
+        self._shortcut: Shortcut | None = None
+        self._writing = threading.RLock()
+        """Held by whoever writes, the loop or a thread of Zenoh's, as long as older messages are on their way."""
+        self._rest = b""
+        """What the socket did not take of a message sent past the loop: nothing else may come before it."""
         self._paused_at: float | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._complained: set[str] = set()
@@ -106,7 +115,7 @@ class Connection(asyncio.BufferedProtocol):
         """The agent has an id: tell it, and begin to listen."""
         self.peer = peer
         self.greeted = True
-        self._transport.write(peer.welcome())
+        self._write([peer.welcome()])
         self.resume()
         self._schedule()
 
@@ -121,9 +130,10 @@ class Connection(asyncio.BufferedProtocol):
         self._schedule()
 
     def resume_writing(self) -> None:
-        self._paused_at = None
-        while self._outbox and self._paused_at is None:  # writing may pause us again
-            self._write(self._outbox.take(WRITE_BUFFER_BYTES))
+        with self._writing:
+            self._paused_at = None
+            while self._outbox and self._paused_at is None:  # writing may pause us again
+                self._write(self._outbox.take(WRITE_BUFFER_BYTES))
         if self.congested and not self._outbox:
             self.congested = False
             self.brake.release()
@@ -131,6 +141,10 @@ class Connection(asyncio.BufferedProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         if self._timer is not None:
             self._timer.cancel()
+        with self._writing:
+            shortcut, self._shortcut = self._shortcut, None
+            if shortcut is not None:
+                shortcut.close()
         if self._refused:
             return
         if self.greeted:
@@ -180,6 +194,26 @@ class Connection(asyncio.BufferedProtocol):
         for message in messages:
             self._outbox.put_stream(node, message, depth=depth, drop_new=drop_new)
 
+    @property
+    def free(self) -> bool:
+        """Whether nothing waits to be sent, so that `send_now` can be tried. From any thread."""
+        return (
+            self._shortcut is not None
+            and self._paused_at is None
+            and not (self._ready or self._rest or self._transport.is_closing())
+            and not self._transport.get_write_buffer_size()
+        )
+
+    def send_now(self, message: bytes) -> None:
+        """Send topic data in a thread of Zenoh's, after seeing that the agent is `free`: into the socket, and what it
+        does not take soon on the loop."""
+        with self._writing:
+            sent = self._shortcut.send(message) if self.free and self._shortcut is not None else 0
+            if sent == len(message):
+                return
+            self._rest += message[sent:]
+        self._loop.call_soon_threadsafe(self.flush)
+
     def _gather(self, messages: Sequence[Chunk]) -> None:
         """Keep for the flush at the end of the batch, but no more than the transport may hold."""
         if not self._ready:
@@ -192,6 +226,9 @@ class Connection(asyncio.BufferedProtocol):
     def registered(self, node_name: str, node_type: int) -> None:
         """The agent has an interface node of this name and type."""
         self._nodes.setdefault(node_name, set()).add(node_type)
+        if node_type == NodeType.SUBSCRIBER and self._shortcut is None and not self._transport.is_closing():
+            with suppress(OSError):  # without it topics take the usual way
+                self._shortcut = Shortcut(self._transport.get_extra_info("socket"))
 
     def takes(self, metadata: Metadata) -> bool:
         """Whether a node's message can be sent: an existing headset goes deaf for good on a message under the name
@@ -226,13 +263,17 @@ class Connection(asyncio.BufferedProtocol):
 
     def flush(self) -> None:
         """Write what was sent since the last flush, in one go."""
-        if self._ready:
+        with self._writing:
             ready, self._ready, self._ready_bytes = self._ready, [], 0
             self._write(ready)
 
     def _write(self, chunks: list[Chunk]) -> None:
-        if chunks and not self._transport.is_closing():
-            self._transport.writelines(chunks)
+        with self._writing:
+            rest, self._rest = self._rest, b""
+            if rest:
+                chunks = [rest, *chunks]
+            if chunks and not self._transport.is_closing():
+                self._transport.writelines(chunks)
 
     def pause(self) -> None:
         """Stop reading from the agent until as many `resume` as `pause` were called."""
@@ -265,11 +306,12 @@ class Connection(asyncio.BufferedProtocol):
         self.peer.lost()
         level = logging.INFO if reason == "went offline" else logging.WARNING
         log.log(level, "%s leaves: %s", self, reason)
-        self.flush()
-        if self._paused_at is None:
-            self._transport.close()
-        else:
-            self.abort()  # it does not read: closing politely would wait for ever
+        with self._writing:
+            self.flush()
+            if self._paused_at is None:
+                self._transport.close()
+            else:
+                self.abort()  # it does not read: closing politely would wait for ever
 
     def finish(self, reason: str) -> None:
         """Send all that waits, then FIN; `abort` whoever does not take it in time."""
@@ -278,9 +320,10 @@ class Connection(asyncio.BufferedProtocol):
         elif not self._transport.is_closing():
             self.peer.lost()
             log.info("%s leaves: %s", self, reason)
-            self.flush()
-            self._write(self._outbox.take(self._outbox.limit_bytes))
-            self._transport.close()
+            with self._writing:
+                self.flush()
+                self._write(self._outbox.take(self._outbox.limit_bytes))
+                self._transport.close()
 
     def abort(self) -> None:
         """End the connection at once; does nothing to one that has ended."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from macs_zenoh.directory import Directory
 from macs_zenoh.errors import WireError
 from macs_zenoh.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue, type_name
-from macs_zenoh.mesh import Sample
+from macs_zenoh.mesh import Payload, Sample
 from macs_zenoh.messages import ROS, Metadata, NodeType, StreamData, correct_sender, decode_management
 from macs_zenoh.registrations import AgentKey
 from macs_zenoh.routing import takes_group_copy
@@ -33,6 +33,10 @@ KNOWN = 4096
 KNOWN_BYTES = 4096
 """Longer ones are read each time: what others choose must not decide how much is kept here."""
 
+SEEN = 512
+"""How many messages are remembered by their beginnings."""
+
+SUBSCRIBER = int(NodeType.SUBSCRIBER)
 
 NOBODY: frozenset[AgentKey] = frozenset()
 
@@ -43,6 +47,18 @@ class Stream(NamedTuple):
     robot: AgentKey
     node: str
     registrants: set[AgentKey]
+
+    def carries(self, metadata: Metadata) -> bool:
+        """Whether metadata is of this node; who sent it is looked at before."""
+        return metadata.node_name == self.node and metadata.node_type == SUBSCRIBER
+
+
+class Seen(NamedTuple):
+    """A message of a topic that was read: one that is as long and begins like it differs in its data only."""
+
+    beginning: bytes
+    message_at: int
+    registrants: list[AgentKey]
 
 
 class Delivery:
@@ -64,6 +80,7 @@ class Delivery:
         self._targets: dict[str, tuple[Connection, AgentKey]] = {}
         self._metadata: dict[bytes, Metadata] = {}
         self._registrants: dict[bytes, list[AgentKey]] = {}
+        self._seen: dict[tuple[str, int], Seen] = {}
         self._dirty: list[Connection] = []
 
     def inbox(self, batch: list[Sample]) -> None:
@@ -122,8 +139,7 @@ class Delivery:
             if stream is None:
                 continue  # the last registrant has just left
             for frame, metadata in self._read(key, payload, stream.robot):
-                true = metadata.node_name == stream.node and metadata.node_type == NodeType.SUBSCRIBER
-                registered = stream.registrants if true else NOBODY
+                registered = stream.registrants if stream.carries(metadata) else NOBODY
                 for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
                     connection = self._agents.find(*registrant)
                     if connection is None:
@@ -134,6 +150,45 @@ class Delivery:
                         # a forged list; or the frame is older than the agent, which has another's id
                         self.drops["not_registered"] += frame.count
         self.flush()
+
+    def stream_at_once(self, key: str, payload: Payload) -> bool:
+        """The same for one message in a thread of Zenoh's, if nothing about it is new and all its receivers are
+        free."""
+        stream = self.streams.get(key)
+        if stream is None:
+            return False
+        seen = self._seen.get((key, len(payload)))
+        if seen is None or not payload.startswith(seen.beginning):
+            seen = self._look(key, payload, stream)
+            if seen is None:
+                return False
+        receivers = []
+        for registrant in seen.registrants:
+            connection = self._agents.find(*registrant)
+            if connection is not None:
+                if registrant not in stream.registrants or not connection.free:
+                    return False
+                receivers.append(connection)
+        message = bytes(payload[seen.message_at :])
+        for connection in receivers:
+            connection.send_now(message)
+        return True
+
+    def _look(self, key: str, payload: Payload, stream: Stream) -> Seen | None:
+        """What a message says of itself, if it is one, and `stream` has read all of that before."""
+        try:
+            frame, *others = parse_frames(payload, self._layout)
+        except (WireError, ValueError):
+            return None
+        metadata, registrants = self._metadata.get(frame.metadata), self._registrants.get(frame.management)
+        if others or metadata is None or registrants is None or not stream.carries(metadata):
+            return None
+        if stream.robot != (metadata.sender_agent_type, metadata.sender_agent_id):
+            return None
+        if len(self._seen) >= SEEN:
+            self._seen.clear()
+        seen = self._seen[key, len(payload)] = Seen(frame.beginning, frame.message_at, registrants)
+        return seen
 
     def dirty(self, connection: Connection) -> None:
         """A connection has messages to flush."""

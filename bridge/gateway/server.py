@@ -16,11 +16,11 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from macs_zenoh.config import GatewaySettings
-from macs_zenoh.directory import Change, Directory
+from macs_zenoh.directory import Change
 from macs_zenoh.errors import Refused, Unreachable
 from macs_zenoh.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
 from macs_zenoh.managers import Asker, Managers
-from macs_zenoh.mesh import Mesh, OnBatch, Payload, Subscription, Traffic
+from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Payload, Subscription, Traffic
 from macs_zenoh.messages import (
     ROS,
     UNITY,
@@ -37,7 +37,7 @@ from macs_zenoh.peer import Asked, AskedOnline, Event, Joined, Limits, Peer, Reg
 from macs_zenoh.presence import Presence
 from macs_zenoh.registrations import AgentKey, Streams
 from macs_zenoh.routing import keys_of
-from macs_zenoh.wire import FrameDecoder, Header, Layout, encode_message
+from macs_zenoh.wire import FrameDecoder, Layout, encode_message
 
 from .agents import Agents, Group
 from .brake import Brake
@@ -52,6 +52,7 @@ from .robots import RobotCalls
 log = logging.getLogger("macs.gateway")
 
 PUBLISHER = int(NodeType.PUBLISHER)
+COMMAND, CALL = Traffic.COMMAND, Traffic.CALL  # looked up by a Python call otherwise, for each message
 KNOWN_ROUTES = 4096
 FLUSH_S = 1.0
 NO_MANAGERS: Managers = {}
@@ -61,7 +62,8 @@ class Route(NamedTuple):
     """Where frames with one destination go: worked out once per connection and destination."""
 
     keys: list[str]
-    header: Header
+    agents: list[AgentKey]
+    """Whom the frames name by id."""
     limited: bool = False
     """Whether a traffic rule limits one of the keys, so that frames count one by one."""
 
@@ -76,7 +78,7 @@ class Run:
     bytes: int = 0
 
 
-NO_RUN = Run(Route([], Header(0, (), (), 0, 0)), Traffic.CALL)
+NO_RUN = Run(Route([], []), Traffic.CALL)
 
 
 class Gateway:
@@ -109,6 +111,8 @@ class Gateway:
         self._run = NO_RUN
         self._brake = Brake()
         mesh.on_room(self._brake.release)
+        self.directory = self._presence.directory
+        """Who is online."""
         self._delivery = Delivery(self.agents, self.directory, self._layout)
         self._own_keys = OwnKeys(mesh, self.agents, self._delivery, self._layout)
         self._leases = Leases(
@@ -132,11 +136,6 @@ class Gateway:
             on_change=self._id_changes,
             on_block_left=lambda block: self._unsubscribe(UNICAST.every(type=UNITY, block=block)),
         )
-
-    @property
-    def directory(self) -> Directory:
-        """Who is online."""
-        return self._presence.directory
 
     @property
     def blocks(self) -> list[int]:
@@ -286,17 +285,17 @@ class Gateway:
                 routes.clear()
             header = frame.header
             keys = keys_of(header, *connection.key)
-            route = routes[destination] = Route(keys, header, any(self.mesh.limited(key) for key in keys))
+            # type 0 goes to everybody, whatever ids it names
+            agents = [(header.agent_type, agent_id) for agent_id in header.ids] if header.agent_type else []
+            route = routes[destination] = Route(keys, agents, any(self.mesh.limited(key) for key in keys))
         if not route.keys:
             connection.complain("no_destination", "a message names no agent and no group", frame.count)
             return
-        kind = route.header.agent_type
-        if kind:
-            for agent_id in route.header.ids:
-                if (kind, agent_id) not in self.directory:
-                    problem = f"a message goes to {type_name(kind)}/{agent_id}, not online"
-                    connection.complain("unknown_agent", problem, frame.count)
-        traffic = Traffic.COMMAND if sent.metadata.node_type == PUBLISHER else Traffic.CALL
+        for agent in route.agents:
+            if agent not in self.directory:
+                problem = f"a message goes to {type_name(agent[0])}/{agent[1]}, not online"
+                connection.complain("unknown_agent", problem, frame.count)
+        traffic = COMMAND if sent.metadata.node_type == PUBLISHER else CALL
         if route.limited:
             self._put_run()
             for single in frame.each():
@@ -399,13 +398,15 @@ class Gateway:
         before, self._delivery.streams = self._delivery.streams, wanted
         for key in wanted.keys() - before.keys():
             # whether a robot keeps a stream for recovery is seen from its messages: others cost nothing more
-            self._subscribe(key, self._delivery.stream, reliable=True)
+            self._subscribe(key, self._delivery.stream, at_once=self._delivery.stream_at_once, reliable=True)
         for key in before.keys() - wanted.keys():
             self._unsubscribe(key)
 
-    def _subscribe(self, key: str, on_batch: OnBatch, *, reliable: bool = False) -> None:
+    def _subscribe(
+        self, key: str, on_batch: OnBatch, *, at_once: AtOnce | None = None, reliable: bool = False
+    ) -> None:
         if key not in self._subscriptions:
-            self._subscriptions[key] = self.mesh.subscribe(key, on_batch, reliable=reliable)
+            self._subscriptions[key] = self.mesh.subscribe(key, on_batch, at_once=at_once, reliable=reliable)
 
     def _unsubscribe(self, key: str) -> None:
         subscription = self._subscriptions.pop(key, None)
