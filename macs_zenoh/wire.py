@@ -200,6 +200,16 @@ class Frame:
         return bytes(self.data[self._message_at + 4 : self._body_at - 4])
 
     @property
+    def beginning(self) -> bytes:
+        """All before the data, with every size: a payload as long that begins like this differs in its data only."""
+        return bytes(self.data[: self._body_at])
+
+    @property
+    def message_at(self) -> int:
+        """Where the message begins, in a frame by itself."""
+        return self._message_at
+
+    @property
     def body(self) -> memoryview:
         """The data part of the message, of the first frame."""
         return memoryview(self.data)[self._body_at : self._size]
@@ -214,9 +224,13 @@ class Frame:
             yield self
             return
         for start in range(0, len(self.data), self._size):
-            frame = Frame(self.data[start : start + self._size], self.layout, self._message_at, self._size)
-            frame._body_at = self._body_at
-            yield frame
+            yield self.with_data_of(self.data[start : start + self._size])
+
+    def with_data_of(self, data: bytes | bytearray) -> Frame:
+        """A frame that is as long and has the same `beginning`; checked like this one."""
+        frame = Frame(data, self.layout, self._message_at, self._size)
+        frame._body_at = self._body_at
+        return frame
 
     def with_metadata(self, metadata: bytes) -> Frame:
         """The same, checked, with other metadata in each message."""
@@ -420,6 +434,13 @@ class FrameDecoder:
                 self._begin(received, wanted, self.layout.header_bytes + management_bytes)
                 return []
         return self._cut(bytes(received))
+
+    def again(self, size: int, beginning: bytes) -> bytes | None:
+        """`advance` for bytes that are a whole frame of this size with this `Frame.beginning`. None when they are
+        not, or when they may not be a frame at all: then nothing has happened."""
+        if self._wanted or self._partial or self.error or self._scratch[: len(beginning)] != beginning:
+            return None
+        return bytes(self._scratch[:size])
 
     def _cut(self, data: bytes) -> list[Frame]:
         """Cut whole frames off ``data`` and keep the rest as the beginning of the next one."""
