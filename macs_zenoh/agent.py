@@ -24,7 +24,7 @@ from .directory import AgentInfo, Change, Directory
 from .errors import CallTimeout, OutOfRange, Unreachable, UsageError, WireError
 from .identity import Identity
 from .keyexpr import BROADCAST, CALL, GROUP, STREAM, type_name, type_number
-from .mesh import Handler, Mesh, Sample, Subscription, Traffic
+from .mesh import Handler, Mesh, Payload, Sample, Subscription, Traffic
 from .messages import BROADCAST as EVERYBODY
 from .messages import Metadata, NodeType
 from .presence import Presence
@@ -58,8 +58,27 @@ class Call(NamedTuple):
 
 
 CallHandler = Callable[[Call], Awaitable[bytes]]
+OnMessage = Callable[[Message], None]
+MessageAtOnce = Callable[[Message], bool]
 OnPresence = Callable[[AgentInfo, bool], None]
 OnId = Callable[[int, int], None]
+
+
+class _Sender(NamedTuple):
+    """What the key of a sample says about it."""
+
+    type: int
+    id: int
+    type_name: str
+    broadcasts: bool
+
+
+class _Seen(NamedTuple):
+    """A message that was read: one that is as long and begins like it differs in its data only."""
+
+    sender: _Sender
+    metadata: Metadata
+    beginning: bytes
 
 
 class Agent:
@@ -70,6 +89,10 @@ class Agent:
     """
 
     INBOX = 4096
+    KNOWN = 1024
+    """How many keys and metadata are remembered as already read."""
+    KNOWN_BYTES = 4096
+    """Longer ones are read each time: what others choose must not decide how much is kept here."""
 
     def __init__(self, mesh: Mesh, agent_type: int, group: int) -> None:
         self.mesh = mesh
@@ -83,6 +106,11 @@ class Agent:
         self._stream_keys: dict[str, str] = {}
         self._inbox: deque[Message] = deque()
         self._arrived = asyncio.Event()
+        self._on_message: OnMessage = self._keep_message
+        self._at_once: MessageAtOnce | None = None
+        self._senders: dict[str, _Sender] = {}
+        self._metadata: dict[tuple[_Sender, bytes], Metadata] = {}
+        self._seen: dict[tuple[str, int], _Seen] = {}
         self._closed = False
         self._declared: list[Subscription] = []
         self._on_presence: list[OnPresence] = []
@@ -191,6 +219,26 @@ class Agent:
             except Unreachable:
                 return
 
+    def on_message(self, handler: OnMessage, *, at_once: MessageAtOnce | None = None) -> None:
+        """Pass messages to ``handler``, on the loop, instead of keeping them for `receive`; it should not raise.
+
+        A message to this agent's id that comes while no other waits is offered to ``at_once`` first, in a thread of
+        Zenoh's, which saves it the way to the loop. That must be quick and not wait for the loop; False: it has done
+        nothing, and the message goes to ``handler``.
+        """
+        self._at_once = None
+        self._on_message = handler
+        while self._inbox:
+            handler(self._inbox.popleft())
+        self._at_once = at_once
+
+    def _keep_message(self, message: Message) -> None:
+        if len(self._inbox) >= self.INBOX:
+            self._inbox.popleft()
+            self.drops["inbox_full"] += 1
+        self._inbox.append(message)
+        self._arrived.set()
+
     def _receive(self, batch: list[Sample], *, by_group: bool = False) -> None:
         for key, payload in batch:
             try:
@@ -200,28 +248,71 @@ class Agent:
                 log.warning("a frame on %s cannot be used: %s", key, error)
                 continue
             for message in messages:
-                if len(self._inbox) >= self.INBOX:
-                    self._inbox.popleft()
-                    self.drops["inbox_full"] += 1
-                self._inbox.append(message)
-        self._arrived.set()
+                self._on_message(message)
 
-    def _read(self, key: str, payload: bytes | bytearray, *, by_group: bool) -> list[Message]:
-        parsed = keyexpr.parse(key)
-        if parsed is None:
-            return []
-        plane, fields = parsed
-        sender = (int(fields["from_type"]), int(fields["from_id"]))
-        if plane == "broadcast" and sender == (self.type_number, self.id):
+    def _receive_at_once(self, key: str, payload: Payload) -> bool:
+        """A sample in a thread of Zenoh's, of which only the data is new."""
+        at_once = self._at_once
+        if at_once is None:
+            return False
+        seen = self._seen.get((key, len(payload)))
+        if seen is None or not payload.startswith(seen.beginning):
+            seen = self._look(key, payload)
+            if seen is None:
+                return False
+        sender, metadata, beginning = seen
+        return at_once(Message(sender.type_name, sender.id, metadata, bytes(payload[len(beginning) :])))
+
+    def _look(self, key: str, payload: Payload) -> _Seen | None:
+        """What a message says of itself, if it is one, and all of that was read before."""
+        sender = self._senders.get(key)
+        if sender is None:
+            return None
+        try:
+            frame, *others = parse_frames(payload, self._layout)
+        except (WireError, ValueError):
+            return None
+        metadata = self._metadata.get((sender, frame.metadata))
+        if others or metadata is None:
+            return None
+        seen = _Seen(sender, metadata, frame.beginning)
+        if len(seen.beginning) <= self.KNOWN_BYTES:
+            if len(self._seen) >= self.KNOWN:
+                self._seen.clear()
+            self._seen[key, len(payload)] = seen
+        return seen
+
+    def _read(self, key: str, payload: Payload, *, by_group: bool) -> list[Message]:
+        sender = self._senders.get(key) or self._read_sender(key)
+        if sender is None or (sender.broadcasts and sender[:2] == (self.type_number, self.id)):
             return []
         messages = []
         for frame in parse_frames(payload, self._layout):
-            if by_group and not takes_group_copy(frame.header, self.id, sender, self.type_number):
+            if by_group and not takes_group_copy(frame.header, self.id, sender[:2], self.type_number):
                 continue
             raw = frame.metadata
-            metadata = (Metadata.decode(raw) if raw else Metadata()).sent_by(*sender)
-            messages.append(Message(type_name(sender[0]), sender[1], metadata, bytes(frame.body)))
+            metadata = self._metadata.get((sender, raw)) or self._read_metadata(sender, raw)
+            messages.append(Message(sender.type_name, sender.id, metadata, bytes(frame.body)))
         return messages
+
+    def _read_sender(self, key: str) -> _Sender | None:
+        parsed = keyexpr.parse(key)
+        if parsed is None:
+            return None
+        plane, fields = parsed
+        kind = int(fields["from_type"])
+        if len(self._senders) >= self.KNOWN:
+            self._senders.clear()
+        sender = self._senders[key] = _Sender(kind, int(fields["from_id"]), type_name(kind), plane == "broadcast")
+        return sender
+
+    def _read_metadata(self, sender: _Sender, raw: bytes) -> Metadata:
+        metadata = (Metadata.decode(raw) if raw else Metadata()).sent_by(sender.type, sender.id)
+        if len(raw) <= self.KNOWN_BYTES:
+            if len(self._metadata) >= self.KNOWN:
+                self._metadata.clear()
+            self._metadata[sender, raw] = metadata
+        return metadata
 
     # -- call and serve ------------------------------------------------------------------------------------------
 
@@ -328,7 +419,7 @@ class Agent:
         self.serve("ping", _echo)
 
     def _listen(self, agent_id: int) -> Subscription:
-        return self.mesh.subscribe(inbox(self.type_number, agent_id), self._receive)
+        return self.mesh.subscribe(inbox(self.type_number, agent_id), self._receive, at_once=self._receive_at_once)
 
     def _keep(self, declared: Subscription) -> Subscription:
         self._declared.append(declared)

@@ -88,25 +88,25 @@ class RobotAgent:
             ("stop", self._stop),
         ):
             self.agent.serve(verb, handler)
+        self.agent.on_message(self._receive, at_once=self.nodes.deliver_at_once)
 
-    async def work(self) -> None:
-        """Pass messages to their nodes until the agent leaves the mesh."""
-        async for message in self.agent:
-            try:
-                if message.metadata.node_name:
-                    self.nodes.deliver(message)
-                elif message.metadata.message_manager in self._managers:
-                    self._manage(message)
-                elif message.metadata.message_manager in REQUESTS:
-                    # an answer may take a while; an emergency stop behind it must not wait
-                    self._answering.add(answer := asyncio.create_task(self._answer(message)))
-                    answer.add_done_callback(self._answering.discard)
-            except Exception:
-                # a message that hits a fault of ours must not make the robot deaf for all that follow
-                log.exception("a message from %s/%d failed", message.sender_type, message.sender_id)
+    def _receive(self, message: Message) -> None:
+        try:
+            if message.metadata.node_name:
+                self.nodes.deliver(message)
+            elif message.metadata.message_manager in self._managers:
+                self._manage(message)
+            elif message.metadata.message_manager in REQUESTS:
+                # an answer may take a while; an emergency stop behind it must not wait
+                self._answering.add(answer := asyncio.create_task(self._answer(message)))
+                answer.add_done_callback(self._answering.discard)
+        except Exception:
+            # a message that hits a fault of ours must not make the robot deaf for all that follow
+            log.exception("a message from %s/%d failed", message.sender_type, message.sender_id)
 
     def close(self) -> None:
         """End everything that is open."""
+        self.agent.on_message(_ignore)
         self.offers.close()
         for answer in self._answering:
             answer.cancel()
@@ -216,6 +216,10 @@ class RobotAgent:
             self.offers.forget(gone)
 
 
+def _ignore(_: Message) -> None:
+    """What comes while the robot ends."""
+
+
 def _own(request: _Registration, call: Call) -> _Registration:
     """A registration by the agent that it is for."""
     check_own(request, (type_number(call.sender_type), call.sender_id))
@@ -257,12 +261,10 @@ async def open_robot(
         ) as agent:
             ros_agent = RobotAgent(agent, session, robot, own)
             await ros_agent.start()
-            work = asyncio.create_task(ros_agent.work())
             log.info("robot %d serves %s", agent.id, session.full_name)
             try:
                 yield ros_agent
             finally:
-                work.cancel()
                 ros_agent.close()
                 await asyncio.sleep(STOP_MESSAGES_S)
     finally:

@@ -116,6 +116,10 @@ class Intake:
             in_use.enter_context(changed)
             wanted = self._enter(in_use)
             handles = [subscription.handle for subscription, _ in wanted.values()]
+            takers = {
+                pointer: (subscription.handle.take_message, subscription.msg_type, on_raw)
+                for pointer, (subscription, on_raw) in wanted.items()
+            }
             events = [event for subscription, _ in wanted.values() for event in subscription.event_handlers]
             for event in events:
                 in_use.enter_context(event)
@@ -128,11 +132,11 @@ class Intake:
                 for event in events:
                     event.add_to_wait_set(wait_set)
                 wait_set.wait(-1)
-                happened = [event for event in events if event.is_ready(wait_set)]
                 for pointer in wait_set.get_ready_entities("subscription"):
-                    _take(*wanted[pointer])
-                for event in happened:
-                    _call(event.callback, event.take_data())
+                    _take(*takers[pointer])
+                for event in events:
+                    if event.is_ready(wait_set):
+                        _call(event.callback, event.take_data())
 
     def _enter(self, in_use: ExitStack) -> dict[int, tuple[Subscription, OnRaw]]:
         """The subscriptions that exist, by the pointers under which the wait set knows them."""
@@ -148,8 +152,7 @@ class Intake:
         return existing
 
 
-def _take(subscription: Subscription, on_raw: OnRaw) -> None:
-    take, message = subscription.handle.take_message, subscription.msg_type
+def _take(take: Callable[[type[Any], bool], tuple[bytes, Any] | None], message: type[Any], on_raw: OnRaw) -> None:
     for _ in range(BURST):
         taken = take(message, True)
         if taken is None:

@@ -186,6 +186,10 @@ class InterfaceNode(ABC):
     def receive(self, message: Message) -> None:
         """Take a message that names this node. On the loop."""
 
+    def receive_at_once(self, message: Message) -> bool:
+        """The same in a thread of Zenoh's, for a message that is as usual; False: it is for `receive`."""
+        return False
+
     def left(self, agent: Registrant) -> None:  # noqa: B027 - only some nodes care
         """An agent left the mesh, registered here or not. On the loop."""
 

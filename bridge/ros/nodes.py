@@ -122,6 +122,12 @@ class InterfaceNodes:
             self.drops.note("held_full", key.node_name[:80], "more data before the registration than can be kept")
         self._schedule_expiry()
 
+    def deliver_at_once(self, message: Message) -> bool:
+        """The same in a thread of Zenoh's, for nodes that can; False: it is for `deliver`."""
+        metadata = message.metadata
+        node = self._nodes.get((metadata.node_type, metadata.node_name))  # type: ignore[call-overload]
+        return node is not None and node.is_open and node.receive_at_once(message)
+
     def close(self) -> None:
         """Remove all nodes."""
         for node in self:
@@ -163,10 +169,12 @@ class InterfaceNodes:
             raise
         if self._nodes.get(node.key) is not node:  # its registrants left meanwhile
             return
-        node.is_open = True
         log.info("%s: %s %s", node.topic, node.ROLE, node.interface)
-        for message in self._early.take(node.key):
-            node.receive(message)
+        try:
+            for message in self._early.take(node.key):
+                node.receive(message)
+        finally:
+            node.is_open = True  # not sooner: no message may overtake these
 
     def _linger(self, node: InterfaceNode, registrant: Registrant) -> None:
         """Its gateway may only have lost the way to us: what it will ask for then has to be there."""

@@ -49,13 +49,14 @@ def control(nodes: InterfaceNodes, sender: Registrant, request: ControlRequest, 
         raise Refused(f"nobody registered a publisher of {request.topic[:80]}")
     if node.control is None:
         raise Refused(f"{node.topic} is not under exclusive control on this robot")
-    if request.action == "take":
-        done = node.control.take(sender, now)
-    elif request.action == "release":
-        done = node.control.release(sender)
-    else:
-        done = node.control.give(sender, Registrant(request.to_type, request.to), now)
-    holder = node.control.holder(now)
+    with node.lock:
+        if request.action == "take":
+            done = node.control.take(sender, now)
+        elif request.action == "release":
+            done = node.control.release(sender)
+        else:
+            done = node.control.give(sender, Registrant(request.to_type, request.to), now)
+        holder = node.control.holder(now)
     reason = "" if done else f"{holder or 'nobody'} has control"
     return ControlReply(done, str(holder) if holder else "", reason)
 

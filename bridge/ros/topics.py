@@ -267,6 +267,8 @@ class PublisherNode(InterfaceNode):
         self._expected = 0
         self._matched = asyncio.Event()
         self._loop = asyncio.get_running_loop()
+        self.lock = threading.RLock()
+        """Held while something is judged and published: no command that came before a stop message may follow it."""
 
     def open(self) -> None:
         message = resolve(str(self.interface))
@@ -306,10 +308,11 @@ class PublisherNode(InterfaceNode):
             self._loop.call_soon_threadsafe(self._matched.set)
 
     def retire(self) -> None:
-        if self._watch is not None:
-            self._watch.cancel()
-        if self.deadman is not None and self.deadman.disarm("the node was removed"):
-            self._publish_stop(self.deadman.why)
+        with self.lock:
+            if self._watch is not None:
+                self._watch.cancel()
+            if self.deadman is not None and self.deadman.disarm("the node was removed"):
+                self._publish_stop(self.deadman.why)
 
     def close(self) -> None:
         publisher, self._publisher = self._publisher, None
@@ -322,20 +325,38 @@ class PublisherNode(InterfaceNode):
             node.destroy_publisher(publisher)
 
     def receive(self, message: Message) -> None:
-        sender = Registrant.of(message)
-        problem = cdr_problem(message.data, self._least_bytes)
-        if problem is not None:
-            text = f"refused {len(message.data)} bytes for {self.interface}: {problem}"
-            self.robot.drops.note("bad_cdr", f"{self.topic} from {sender}", text)
-        elif self.robot.stop.stopped:
-            self.robot.drops.note("stopped", f"{self.topic} from {sender}", "the emergency stop holds")
-        elif self.control is not None and not self.control.take(sender, self._loop.time()):
-            holder = self.control.holder(self._loop.time())
-            self.robot.drops.note("not_in_control", f"{self.topic} from {sender}", f"{holder} has control")
-        elif self._publish(message.data) and self.deadman is not None:
-            self.deadman.command(sender, self._loop.time())
+        with self.lock:
+            refusal = self._refusal(message)
+            if refusal is not None:
+                name, why = refusal
+                self.robot.drops.note(name, f"{self.topic} from {Registrant.of(message)}", why)
+                return
+            self._command(message)
             if self._watch is None:
                 self._watch_silence()
+
+    def receive_at_once(self, message: Message) -> bool:
+        with self.lock:
+            unwatched = self._watch is None and self.deadman is not None and self.deadman.silence_s is not None
+            if not self.is_open or unwatched or self._refusal(message) is not None:
+                return False
+            self._command(message)
+            return True
+
+    def _refusal(self, message: Message) -> tuple[str, str] | None:
+        """The name of the drop and why, when a message may not pass now."""
+        problem = cdr_problem(message.data, self._least_bytes)
+        if problem is not None:
+            return "bad_cdr", f"refused {len(message.data)} bytes for {self.interface}: {problem}"
+        if self.robot.stop.stopped:
+            return "stopped", "the emergency stop holds"
+        if self.control is not None and not self.control.take(Registrant.of(message), time.monotonic()):
+            return "not_in_control", f"{self.control.holder(time.monotonic())} has control"
+        return None
+
+    def _command(self, message: Message) -> None:
+        if self._publish(message.data) and self.deadman is not None:
+            self.deadman.command(Registrant.of(message), time.monotonic())
 
     def _publish(self, cdr: bytes) -> bool:
         try:
@@ -348,14 +369,16 @@ class PublisherNode(InterfaceNode):
     # -- safety, on the loop -------------------------------------------------------------------------------------
 
     def left(self, agent: Registrant) -> None:
-        if self.control is not None:
-            self.control.release(agent)
-        if self.deadman is not None and self.deadman.left(agent):
-            self._publish_stop(self.deadman.why)
+        with self.lock:
+            if self.control is not None:
+                self.control.release(agent)
+            if self.deadman is not None and self.deadman.left(agent):
+                self._publish_stop(self.deadman.why)
 
     def cut_off(self) -> None:
-        if self.deadman is not None and self.deadman.disarm("the mesh is lost"):
-            self._publish_stop(self.deadman.why)
+        with self.lock:
+            if self.deadman is not None and self.deadman.disarm("the mesh is lost"):
+                self._publish_stop(self.deadman.why)
 
     def deregister(self, registrant: Registrant) -> None:
         super().deregister(registrant)
@@ -363,20 +386,21 @@ class PublisherNode(InterfaceNode):
 
     def emergency_stop(self, by: str) -> None:
         # whether commands were under way or not
-        if self.deadman is not None:
-            self.deadman.disarm(f"emergency stop by {by}")
-            self._publish_stop(f"emergency stop by {by}")
+        with self.lock:
+            if self.deadman is not None:
+                self.deadman.disarm(f"emergency stop by {by}")
+                self._publish_stop(f"emergency stop by {by}")
 
     def _watch_silence(self) -> None:
         """Look when the dead-man may be due; a command in between costs nothing."""
-        self._watch = None
         if self.deadman is None:
             return
-        now = self._loop.time()
-        if self.deadman.tick(now):
-            self._publish_stop(self.deadman.why)
-        elif (deadline := self.deadman.deadline()) is not None:
-            self._watch = self._loop.call_at(deadline, self._watch_silence)
+        with self.lock:
+            self._watch = None
+            if self.deadman.tick(time.monotonic()):
+                self._publish_stop(self.deadman.why)
+            elif (deadline := self.deadman.deadline()) is not None:
+                self._watch = self._loop.call_at(deadline, self._watch_silence)
 
     def _publish_stop(self, why: str) -> None:
         if self._publisher is not None and self._publish(self._stop_cdr):
@@ -386,7 +410,7 @@ class PublisherNode(InterfaceNode):
     def status(self) -> dict[str, Any]:
         status = super().status()
         if self.control is not None:
-            now = self._loop.time()
+            now = time.monotonic()
             holder = self.control.holder(now)
             status["control"] = {
                 "holder": str(holder) if holder else None,
