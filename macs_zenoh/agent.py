@@ -269,11 +269,11 @@ class Agent:
         if sender is None:
             return None
         try:
-            frame, *others = parse_frames(payload, self._layout)
-        except (WireError, ValueError):
+            frame = parse_frame(payload, self._layout)
+        except WireError:
             return None
         metadata = self._metadata.get((sender, frame.metadata))
-        if others or metadata is None:
+        if metadata is None:
             return None
         seen = _Seen(sender, metadata, frame.beginning)
         if len(seen.beginning) <= self.KNOWN_BYTES:

@@ -17,7 +17,7 @@ from macs_zenoh.mesh import Payload, Sample
 from macs_zenoh.messages import ROS, Metadata, NodeType, StreamData, correct_sender, decode_management
 from macs_zenoh.registrations import AgentKey
 from macs_zenoh.routing import takes_group_copy
-from macs_zenoh.wire import Frame, Layout, is_probe, parse_frames
+from macs_zenoh.wire import Frame, Layout, is_probe, parse_frame, parse_frames
 
 from .agents import Agents
 from .connection import Connection
@@ -177,11 +177,11 @@ class Delivery:
     def _look(self, key: str, payload: Payload, stream: Stream) -> Seen | None:
         """What a message says of itself, if it is one, and `stream` has read all of that before."""
         try:
-            frame, *others = parse_frames(payload, self._layout)
-        except (WireError, ValueError):
+            frame = parse_frame(payload, self._layout)
+        except WireError:
             return None
         metadata, registrants = self._metadata.get(frame.metadata), self._registrants.get(frame.management)
-        if others or metadata is None or registrants is None or not stream.carries(metadata):
+        if metadata is None or registrants is None or not stream.carries(metadata):
             return None
         if stream.robot != (metadata.sender_agent_type, metadata.sender_agent_id):
             return None
