@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from geometry_msgs.msg import Twist
 from rclpy.serialization import serialize_message
 
 from bridge.ros.session import RosSession
@@ -81,3 +82,10 @@ def command(topic: str, data: Any, data_type: str = "std_msgs/String") -> Messag
     cdr = data if isinstance(data, bytes) else bytes(serialize_message(data))
     metadata = Metadata(2, 5, node_type=NodeType.PUBLISHER, node_name=node_name(topic), data_exchange_type=data_type)
     return Message("unity", 5, metadata, cdr)
+
+
+def drive(x: float, sender: int = 5, topic: str = "/cmd_vel") -> Message:
+    """A headset's command to drive at this speed."""
+    twist = Twist()
+    twist.linear.x = x
+    return command(topic, twist, "geometry_msgs/Twist")._replace(sender_id=sender)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from geometry_msgs.msg import Twist
-from ros_peer import Peer, adding, command, until
+from ros_peer import Peer, adding, command, drive, until
 from std_msgs.msg import Bool
 
 from bridge.ros.agent import open_robot
@@ -38,12 +38,6 @@ async def nodes(session: RosSession) -> AsyncIterator[InterfaceNodes]:
     await nodes.open_stop("/emergency_stop")
     yield nodes
     nodes.close()
-
-
-def drive(x: float, sender: int = 5, topic: str = "/cmd_vel") -> Message:
-    twist = Twist()
-    twist.linear.x = x
-    return command(topic, twist, "geometry_msgs/Twist")._replace(sender_id=sender)
 
 
 def pressed(stop: bool) -> Message:

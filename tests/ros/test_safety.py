@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from geometry_msgs.msg import Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_peer import Peer, adding, command, get, until
+from ros_peer import Peer, adding, command, drive, get, until
 from std_msgs.msg import Bool
 
 from bridge.ros.interface import Registrant, Robot
@@ -19,7 +19,6 @@ from bridge.ros.requests import ControlRequest, control
 from bridge.ros.rules import Rules
 from bridge.ros.safety import Control, DeadMan, EmergencyStop
 from bridge.ros.session import RosSession
-from macs_zenoh.agent import Message
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
 from macs_zenoh.messages import NodeType
@@ -118,12 +117,6 @@ async def nodes(session: RosSession) -> AsyncIterator[InterfaceNodes]:
     await nodes.open_stop("/emergency_stop")
     yield nodes
     nodes.close()
-
-
-def drive(x: float, sender: int = 5, topic: str = "/cmd_vel") -> Message:
-    twist = Twist()
-    twist.linear.x = x
-    return command(topic, twist, "geometry_msgs/Twist")._replace(sender_id=sender)
 
 
 async def driving(nodes: InterfaceNodes, peer: Peer, topic: str = "/cmd_vel") -> asyncio.Queue[Any]:
