@@ -52,7 +52,7 @@ class RawZenoh:
                 self._ended = time.monotonic()
                 self._all_here.set()
 
-        self._declare(key, take, direct=direct)
+        self.declare(key, take, direct=direct)
         return {}
 
     def publish(self, key: str, size: int, count: int) -> dict[str, Any]:
@@ -84,7 +84,7 @@ class RawZenoh:
             sample.payload.to_bytes()
             arrived.release()
 
-        subscriber = self._declare("bench/pong", take)
+        subscriber = self.declare("bench/pong", take)
         publisher = self.session.declare_publisher("bench/ping", express=True)
         payload = bytes(size)
         times = []
@@ -102,10 +102,11 @@ class RawZenoh:
         """Answer every ``bench/ping`` with a ``bench/pong`` of the same bytes, from now on."""
         publisher = self.session.declare_publisher("bench/pong", express=True)
         self._declared.append(publisher)
-        self._declare("bench/ping", lambda sample: publisher.put(sample.payload.to_bytes()))
+        self.declare("bench/ping", lambda sample: publisher.put(sample.payload.to_bytes()))
         return {}
 
-    def _declare(self, key: str, take: Callable[[zenoh.Sample], None], *, direct: bool = False) -> Any:
+    def declare(self, key: str, take: Callable[[zenoh.Sample], None], *, direct: bool = False) -> Any:
+        """Call ``take`` for what comes on a key; ``direct``: in Zenoh's own threads, without its default handler."""
         subscriber = self.session.declare_subscriber(
             key, zenoh.handlers.Callback(take, indirect=False) if direct else take
         )

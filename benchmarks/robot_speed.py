@@ -8,10 +8,14 @@ what it took in the same round.
 from __future__ import annotations
 
 import os
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
+
+from macs_zenoh.mesh.awake import Awake
 
 from .figures import Figure
 from .plan import KIB, Case, Plan, Run, in_turn
@@ -19,6 +23,8 @@ from .processes import Program, Stage
 
 IMAGE = 900_000
 QUIET_S = 2.0
+WITHOUT_US = ("plain", "to topic, bare")
+"""The ways that no program of ours takes part in, but for the router: they say what a machine can do."""
 RATES = (500, 1000, 1500, 2000, 2500, 3000, 3500, 4000, 5000, 6000)
 IDLE_S = 10.0
 
@@ -39,18 +45,25 @@ Ways = Sequence[str]
 class Site:
     """Everything that runs, and the topics in it: ``/plain`` has no robot agent, ``/robot`` and ``/command`` do."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: Stage, *, awake: bool = False) -> None:
+        self._awake = awake
         os.environ.setdefault("ROS_DOMAIN_ID", str(50 + os.getpid() % 50))
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         router = stage.router()
         gateway = stage.gateway(router)
-        arguments = ("-m", "bridge", "agent", "--id", "1", "-e", f"tcp/127.0.0.1:{router}")
-        self.agent = stage._start("agent", *arguments)
-        self.agent.line()
+        with tempfile.NamedTemporaryFile("w", suffix=".toml") as settings:
+            settings.write("mesh.awake_us = 0" if awake else "")
+            settings.flush()
+            arguments = ("-m", "bridge", "agent", "--id", "1", "-e", f"tcp/127.0.0.1:{router}")
+            self.agent = stage._start("agent", *arguments, "--settings", settings.name)
+            self.agent.line()
         self.publisher, _ = stage.worker("robot_ends", "ros")
         self.subscriber, _ = stage.worker("robot_ends", "ros")
         self.headset, _ = stage.worker("robot_ends", "headset", gateway, 1)
         self.five, _ = stage.worker("robot_ends", "headset", gateway, 5)
+        _, bare = stage.worker("bare", "gateway", router)
+        stage.worker("bare", "robot", router, "/bare")
+        self.bare, _ = stage.worker("bare", "headset", bare["port"])
         self.depth = 1000  # a machine that others use stalls for tens of ms: that is not what is measured
         self.subscriber.ask("subscribe", topic="/plain", depth=self.depth)
         self.publisher.ask("advertise", topic="/plain", depth=self.depth, matched=1)
@@ -59,7 +72,8 @@ class Site:
         self.publisher.ask("advertise", topic="/robot", depth=self.depth, matched=1)
         self.five.ask("register", topic="/five", kind=1, buffer=self.depth)
         self.publisher.ask("advertise", topic="/five", depth=self.depth, matched=1)
-        self.subscriber.ask("subscribe", topic="/command", depth=self.depth)
+        for topic in ("/command", "/bare"):
+            self.subscriber.ask("subscribe", topic=topic, depth=self.depth)
         time.sleep(0.5)
         self.headset.ask("register", topic="/command", kind=2, buffer=self.depth)
         time.sleep(1.5)
@@ -68,9 +82,10 @@ class Site:
         """Send on a path at a rate: how many were sent and arrived, and the latencies there."""
         sender, receiver, topic = self._ends(path)
         count = max(10, int(hz * seconds))
-        receiver.tell("collect", count=count, quiet_s=QUIET_S + size / 1e6)
-        took = sender.ask("publish", topic=topic, size=size, hz=hz, count=count)
-        answer = receiver.answer()
+        with self._awake_without_us(path):
+            receiver.tell("collect", count=count, quiet_s=QUIET_S + size / 1e6)
+            took = sender.ask("publish", topic=topic, size=size, hz=hz, count=count)
+            answer = receiver.answer()
         return {**answer, "sent": count, "lost": count - answer["got"], "hz": count / max(took["took_s"], 1e-9)}
 
     def _ends(self, path: str) -> tuple[Program, Program, str]:
@@ -79,7 +94,18 @@ class Site:
             "to headset": (self.publisher, self.headset, "/robot"),
             "to five": (self.publisher, self.five, "/five"),
             "to topic": (self.headset, self.subscriber, "/command"),
+            "to topic, bare": (self.bare, self.subscriber, "/bare"),
         }[path]
+
+    @contextmanager
+    def _awake_without_us(self, path: str) -> Iterator[None]:
+        """Where our robot agent keeps the cores awake for its messages, others' messages have them awake too."""
+        if not self._awake or path not in WITHOUT_US:
+            yield
+            return
+        with open(Awake.DEVICE, "wb", buffering=0) as request:  # noqa: PTH123
+            request.write(bytes(4))
+            yield
 
 
 def latencies(
@@ -98,7 +124,8 @@ def latencies(
     values = in_turn(rounds, {path: run(path) for path in ("plain", *ways)})
     baseline = [room.factor * plain + room.ms for plain in values["plain"]]
     for path in ways:
-        yield Figure(f"ROS {path}, {what}, p50", values[path], baseline, f"rclpy {room}", "ms", at_most=1.0)
+        most = 1.0 if path not in WITHOUT_US else None
+        yield Figure(f"ROS {path}, {what}, p50", values[path], baseline, f"rclpy {room}", "ms", at_most=most)
     yield Figure(f"plain rclpy, {what}, p50", values["plain"], baseline, "the same with room", "ms")
 
 
@@ -135,10 +162,18 @@ def idle(agent: Program) -> dict[str, float]:
 
 def robot(stage: Stage, plan: Plan) -> Iterator[Figure]:
     """A ROS topic of 1 KiB at 100 Hz to one headset and to five, and a headset's commands, against plain rclpy."""
-    ways = ("to headset", "to topic", "to five")
-    yield from latencies(
-        Site(stage), plan, "1 KiB, 100 Hz", KIB, 100, 3, rounds=plan.rounds, room=Room(1, 0.6), ways=ways
-    )
+    yield from small(Site(stage), plan, "1 KiB, 100 Hz")
+
+
+def robot_awake(stage: Stage, plan: Plan) -> Iterator[Figure]:
+    """The same on cores that are kept awake, by the robot agent and for plain rclpy. Needs the right to do so."""
+    yield from small(Site(stage, awake=True), plan, "1 KiB, 100 Hz, awake")
+
+
+def small(site: Site, plan: Plan, what: str) -> Iterator[Figure]:
+    """Small messages one by one, on every way."""
+    ways = ("to headset", "to topic", "to topic, bare", "to five")
+    yield from latencies(site, plan, what, KIB, 100, 3, rounds=plan.rounds, room=Room(1, 0.6), ways=ways)
 
 
 def robot_large(stage: Stage, plan: Plan) -> Iterator[Figure]:
@@ -168,6 +203,7 @@ def robot_idle(stage: Stage, plan: Plan) -> Iterator[Figure]:
 
 CASES: dict[str, Case] = {
     "robot": robot,
+    "robot-awake": robot_awake,
     "robot-large": robot_large,
     "robot-rate": robot_rate,
     "robot-idle": robot_idle,

@@ -60,6 +60,7 @@ class Arrivals:
         self.asked: deque[zenoh.Query] = deque()
         """Queries on their way to the loop: an emergency stop can be among them, so no sample overtakes them."""
         self._own = threading.local()
+        self._passed = False
 
     def put(self, publisher: zenoh.Publisher, payload: Payload) -> None:
         """Publish. Zenoh calls our own subscriptions back within this, and they take the payload as it is."""
@@ -70,6 +71,7 @@ class Arrivals:
         self._put(publisher, payload, b"")
 
     def _put(self, publisher: zenoh.Publisher, payload: Payload, zenohs: Payload) -> None:
+        self._passed = True
         self._own.payload = payload
         try:
             publisher.put(zenohs)
@@ -87,6 +89,7 @@ class Arrivals:
         queue, limit, large, own = self._queue, self.LIMIT, self.LARGE_BYTES, self._own
 
         def receive(sample: zenoh.Sample) -> bool:
+            self._passed = True
             if len(queue) >= limit and not self._has_room():
                 self._drops["loop_behind"] += 1
                 return False
@@ -115,6 +118,11 @@ class Arrivals:
             return True
 
         return receive
+
+    def passed(self) -> bool:
+        """Whether a sample has come or gone since this was asked last."""
+        passed, self._passed = self._passed, False
+        return passed
 
     def mark(self, on_mark: OnBatch) -> None:
         """Call ``on_mark`` on the loop after all that has arrived so far. From any thread."""

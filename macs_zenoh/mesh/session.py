@@ -22,6 +22,7 @@ from macs_zenoh.shaping import Shaper
 from macs_zenoh.versions import installed
 
 from .arrivals import Arrivals
+from .awake import Awake
 from .opening import check_files, first_line, insert, zenoh_config
 from .outgoing import Outgoing
 from .recovered import Recovered
@@ -57,6 +58,8 @@ class Mesh:
         self._session = session
         self._loop = asyncio.get_running_loop()
         self._arrivals = Arrivals(self._loop, self._from_thread, self.drops)
+        us = settings.awake_us
+        self._awake = Awake(us, self._arrivals.passed, self._loop) if us is not None else None
         self._missed: set[str] = set()
         self._recovered: set[Recovered] = set()
         self._needs_router = settings.mode == "client"
@@ -147,6 +150,8 @@ class Mesh:
         """Leave the mesh: what was put is sent first, tokens end. A process must not exit without it."""
         for task in self._tasks:
             task.cancel()
+        if self._awake is not None:
+            self._awake.close()
         closing = asyncio.ensure_future(asyncio.to_thread(self._close))
         cancelled = False
         while not closing.done():

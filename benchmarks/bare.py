@@ -1,0 +1,84 @@
+"""The hops from a headset to a ROS topic with nothing in them: what no program on this way can be faster than.
+
+``python -m benchmarks.bare gateway PORT`` puts on the mesh what it receives from one socket; ``... robot PORT TOPIC``
+publishes what comes from there; ``... headset PORT`` sends. PORT is the router's, for the headset the bare gateway's.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+import threading
+import time
+from typing import Any
+
+import zenoh
+
+from .raw import RawZenoh
+from .robot_ends import pace, stamped
+from .worker import serve
+
+KEY = "bench/bare"
+RECEIVE_BYTES = 64 << 10
+
+
+def gateway(raw: RawZenoh) -> None:
+    """One socket, read by a thread that waits for it."""
+    publisher = raw.session.declare_publisher(KEY, express=True)
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def work() -> None:
+        connection, _ = server.accept()
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        while received := connection.recv(RECEIVE_BYTES):
+            publisher.put(received)
+
+    threading.Thread(target=work, daemon=True).start()
+    serve({"port": server.getsockname()[1]}, {})
+
+
+def robot(raw: RawZenoh, topic: str) -> None:
+    """Published in the thread of Zenoh's that brings it."""
+    import rclpy
+    from std_msgs.msg import UInt8MultiArray
+
+    rclpy.init()
+    publisher = rclpy.create_node("bare").create_publisher(UInt8MultiArray, topic, 1000)
+
+    def take(sample: zenoh.Sample) -> None:
+        publisher.publish(sample.payload.to_bytes())
+
+    raw.declare(KEY, take, direct=True)
+    serve({}, {})
+
+
+class Headset:
+    """A socket whose frames are the data itself."""
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.create_connection(("127.0.0.1", port))
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def publish(self, topic: str, size: int, hz: float, count: int) -> dict[str, Any]:
+        """Send at a rate."""
+        began = time.monotonic()
+        pace(count, hz, self._socket.sendall, stamped(size))
+        return {"took_s": time.monotonic() - began}
+
+
+def main() -> None:
+    """Run the worker."""
+    role, port = sys.argv[1], int(sys.argv[2])
+    if role == "headset":
+        serve({}, {"publish": Headset(port).publish})
+        return
+    raw = RawZenoh(port)
+    if role == "gateway":
+        gateway(raw)
+    else:
+        robot(raw, sys.argv[3])
+    raw.session.close()  # type: ignore[no-untyped-call]
+
+
+if __name__ == "__main__":
+    main()
