@@ -18,7 +18,6 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import NamedTuple
 
-from . import keyexpr
 from .config import MeshSettings, Priority, TrafficRule, changed
 from .directory import AgentInfo, Change, Directory
 from .errors import CallTimeout, OutOfRange, Unreachable, UsageError, WireError
@@ -28,23 +27,14 @@ from .mesh import Handler, Mesh, Payload, Sample, Subscription, Traffic
 from .messages import BROADCAST as EVERYBODY
 from .messages import Metadata, NodeType
 from .presence import Presence
-from .routing import call, inbox, keys_of, takes_group_copy
-from .wire import Layout, encode_frame, encode_message, parse_frame, parse_frames
+from .reading import Message, Reader
+from .routing import call, inbox, keys_of
+from .wire import Layout, encode_frame, encode_message, parse_frame
 
 log = logging.getLogger("macs.agent")
 
 RETRY_S = 0.05
 """How long a call waits before it asks again an agent that is online and does not serve it yet."""
-
-
-class Message(NamedTuple):
-    """What an agent receives. The sender comes from the key, which a router can hold it to, not from the JSON; in
-    ``metadata`` it is put right."""
-
-    sender_type: str
-    sender_id: int
-    metadata: Metadata
-    data: bytes
 
 
 class Call(NamedTuple):
@@ -64,23 +54,6 @@ OnPresence = Callable[[AgentInfo, bool], None]
 OnId = Callable[[int, int], None]
 
 
-class _Sender(NamedTuple):
-    """What the key of a sample says about it."""
-
-    type: int
-    id: int
-    type_name: str
-    broadcasts: bool
-
-
-class _Seen(NamedTuple):
-    """A message that was read: one that is as long and begins like it differs in its data only."""
-
-    sender: _Sender
-    metadata: Metadata
-    beginning: bytes
-
-
 class Agent:
     """One agent. Made by `join`; all methods belong to its event loop, except `publish_stream`.
 
@@ -89,10 +62,6 @@ class Agent:
     """
 
     INBOX = 4096
-    KNOWN = 1024
-    """How many keys and metadata are remembered as already read."""
-    KNOWN_BYTES = 4096
-    """Longer ones are read each time: what others choose must not decide how much is kept here."""
 
     def __init__(self, mesh: Mesh, agent_type: int, group: int) -> None:
         self.mesh = mesh
@@ -103,14 +72,12 @@ class Agent:
         self._presence = Presence(mesh, self._presence_changed, lambda contested: self._identity.contested(contested))
         self._identity = Identity(mesh, self._presence, agent_type, group, listen=self._listen, on_id=self._id_changed)
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
+        self._reader = Reader(self._layout, self._bad_frame)
         self._stream_keys: dict[str, str] = {}
         self._inbox: deque[Message] = deque()
         self._arrived = asyncio.Event()
         self._on_message: OnMessage = self._keep_message
         self._at_once: MessageAtOnce | None = None
-        self._senders: dict[str, _Sender] = {}
-        self._metadata: dict[tuple[_Sender, bytes], Metadata] = {}
-        self._seen: dict[tuple[str, int], _Seen] = {}
         self._closed = False
         self._declared: list[Subscription] = []
         self._on_presence: list[OnPresence] = []
@@ -240,79 +207,23 @@ class Agent:
         self._arrived.set()
 
     def _receive(self, batch: list[Sample], *, by_group: bool = False) -> None:
+        me = (self.type_number, self.id)
         for key, payload in batch:
-            try:
-                messages = self._read(key, payload, by_group=by_group)
-            except WireError as error:
-                self.drops["bad_frame"] += 1
-                log.warning("a frame on %s cannot be used: %s", key, error)
-                continue
-            for message in messages:
+            for message in self._reader.read(key, payload, me, by_group=by_group):
                 self._on_message(message)
 
     def _receive_at_once(self, key: str, payload: Payload) -> bool:
-        """A sample in a thread of Zenoh's, of which only the data is new."""
+        """A sample in a thread of Zenoh's."""
         at_once = self._at_once
         if at_once is None:
             return False
-        seen = self._seen.get((key, len(payload)))
-        if seen is None or not payload.startswith(seen.beginning):
-            seen = self._look(key, payload)
-            if seen is None:
-                return False
-        sender, metadata, beginning = seen
-        return at_once(Message(sender.type_name, sender.id, metadata, bytes(payload[len(beginning) :])))
+        message = self._reader.reread(key, payload)
+        return message is not None and at_once(message)
 
-    def _look(self, key: str, payload: Payload) -> _Seen | None:
-        """What a message says of itself, if it is one, and all of that was read before."""
-        sender = self._senders.get(key)
-        if sender is None:
-            return None
-        try:
-            frame = parse_frame(payload, self._layout)
-        except WireError:
-            return None
-        metadata = self._metadata.get((sender, frame.metadata))
-        if metadata is None:
-            return None
-        seen = _Seen(sender, metadata, frame.beginning)
-        if len(seen.beginning) <= self.KNOWN_BYTES:
-            if len(self._seen) >= self.KNOWN:
-                self._seen.clear()
-            self._seen[key, len(payload)] = seen
-        return seen
-
-    def _read(self, key: str, payload: Payload, *, by_group: bool) -> list[Message]:
-        sender = self._senders.get(key) or self._read_sender(key)
-        if sender is None or (sender.broadcasts and sender[:2] == (self.type_number, self.id)):
-            return []
-        messages = []
-        for frame in parse_frames(payload, self._layout):
-            if by_group and not takes_group_copy(frame.header, self.id, sender[:2], self.type_number):
-                continue
-            raw = frame.metadata
-            metadata = self._metadata.get((sender, raw)) or self._read_metadata(sender, raw)
-            messages.append(Message(sender.type_name, sender.id, metadata, bytes(frame.body)))
-        return messages
-
-    def _read_sender(self, key: str) -> _Sender | None:
-        parsed = keyexpr.parse(key)
-        if parsed is None:
-            return None
-        plane, fields = parsed
-        kind = int(fields["from_type"])
-        if len(self._senders) >= self.KNOWN:
-            self._senders.clear()
-        sender = self._senders[key] = _Sender(kind, int(fields["from_id"]), type_name(kind), plane == "broadcast")
-        return sender
-
-    def _read_metadata(self, sender: _Sender, raw: bytes) -> Metadata:
-        metadata = (Metadata.decode(raw) if raw else Metadata()).sent_by(sender.type, sender.id)
-        if len(raw) <= self.KNOWN_BYTES:
-            if len(self._metadata) >= self.KNOWN:
-                self._metadata.clear()
-            self._metadata[sender, raw] = metadata
-        return metadata
+    def _bad_frame(self, key: str, error: WireError) -> None:
+        self.drops["bad_frame"] += 1
+        if self.drops["bad_frame"] == 1:
+            log.warning("a frame on %s cannot be used: %s (logged once, counted as bad_frame)", key, error)
 
     # -- call and serve ------------------------------------------------------------------------------------------
 

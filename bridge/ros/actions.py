@@ -21,8 +21,8 @@ from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.services import ABSENT_S, Search, first_line
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import resolve
-from macs_zenoh.agent import Message
 from macs_zenoh.messages import ActionVerb, AddNode, NodeType
+from macs_zenoh.reading import Message
 
 log = logging.getLogger("macs.ros")
 

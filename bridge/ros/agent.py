@@ -22,13 +22,14 @@ from bridge.ros.requests import STATUS, ControlReply, ControlRequest, control, s
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from macs_zenoh import managers
-from macs_zenoh.agent import Agent, Call, Message
+from macs_zenoh.agent import Agent, Call
 from macs_zenoh.config import RobotSettings, Settings
 from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import MacsError, Refused, WireError
 from macs_zenoh.keyexpr import type_name, type_number
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.messages import AddNode, FunctionalityRequest, Metadata, RemoveNode, decode_data, encode_data
+from macs_zenoh.reading import Message
 from macs_zenoh.registrations import check_own
 from macs_zenoh.wire import Layout
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-from macs_zenoh.agent import Message
+from macs_zenoh.reading import Message
 
 
 class NodeKey(NamedTuple):

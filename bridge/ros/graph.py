@@ -21,9 +21,9 @@ from bridge.ros import qos
 from bridge.ros.interface import PublishStream, Registrant, Robot
 from bridge.ros.rules import Rules
 from bridge.ros.stream import StreamFraming
-from macs_zenoh.agent import Message
 from macs_zenoh.errors import MacsError
 from macs_zenoh.messages import ROS, Functionality, FunctionalityRequest, Metadata, encode_data
+from macs_zenoh.reading import Message
 
 log = logging.getLogger("macs.ros")
 

@@ -19,11 +19,11 @@ from bridge.ros.rules import Rules
 from bridge.ros.safety import EmergencyStop
 from bridge.ros.session import RosSession
 from bridge.ros.types import InterfaceName
-from macs_zenoh.agent import Message
 from macs_zenoh.config import Priority
 from macs_zenoh.errors import Refused
 from macs_zenoh.keyexpr import type_name, type_number
 from macs_zenoh.messages import ROS, AddNode, Metadata, NodeType, RemoveNode
+from macs_zenoh.reading import Message
 from macs_zenoh.wire import MACS, Layout
 
 log = logging.getLogger("macs.ros")

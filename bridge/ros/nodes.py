@@ -16,10 +16,10 @@ from bridge.ros.rules import names_agent
 from bridge.ros.services import ClientNode, ServiceNode, tell_failure
 from bridge.ros.stop import StopNode
 from bridge.ros.topics import PublisherNode, SubscriberNode
-from macs_zenoh.agent import Message
 from macs_zenoh.errors import Refused
 from macs_zenoh.keyexpr import type_name
 from macs_zenoh.messages import AddNode, NodeType, RemoveNode
+from macs_zenoh.reading import Message
 
 log = logging.getLogger("macs.ros")
 

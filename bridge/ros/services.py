@@ -19,9 +19,9 @@ from bridge.ros import fields
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import InterfaceName, resolve
-from macs_zenoh.agent import Message
 from macs_zenoh.errors import WireError
 from macs_zenoh.messages import ROS, AddNode, CallFailure, Metadata, NodeType, decode_data, encode_data
+from macs_zenoh.reading import Message
 
 log = logging.getLogger("macs.ros")
 

@@ -19,10 +19,10 @@ from bridge.ros.rules import names_agent
 from bridge.ros.stream import cdr_problem
 from bridge.ros.topics import check_topic_type
 from bridge.ros.types import resolve
-from macs_zenoh.agent import Message
 from macs_zenoh.errors import Refused
 from macs_zenoh.keyexpr import type_name
 from macs_zenoh.messages import ROS, AddNode, NodeType, node_name
+from macs_zenoh.reading import Message
 
 log = logging.getLogger("macs.ros")
 

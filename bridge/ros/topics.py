@@ -24,9 +24,9 @@ from bridge.ros.rules import DEFAULT_HOLD_S
 from bridge.ros.safety import Control, DeadMan
 from bridge.ros.stream import StreamFraming, cdr_problem
 from bridge.ros.types import InterfaceName, least_cdr_bytes, resolve
-from macs_zenoh.agent import Message
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.messages import AddNode, NodeType, StreamData
+from macs_zenoh.reading import Message
 from macs_zenoh.recovery import SILENT_S
 
 log = logging.getLogger("macs.ros")

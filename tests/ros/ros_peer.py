@@ -11,8 +11,8 @@ from geometry_msgs.msg import Twist
 from rclpy.serialization import serialize_message
 
 from bridge.ros.session import RosSession
-from macs_zenoh.agent import Message
 from macs_zenoh.messages import AddNode, Metadata, NodeType, RemoveNode, node_name
+from macs_zenoh.reading import Message
 
 
 class Peer:

@@ -22,10 +22,10 @@ from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
-from macs_zenoh.agent import Message
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.messages import ActionVerb, Metadata, NodeType
+from macs_zenoh.reading import Message
 from macs_zenoh.wire import MACS, split_message
 
 COUNT = "macs_test_msgs/Count"

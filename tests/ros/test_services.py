@@ -20,10 +20,10 @@ from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
-from macs_zenoh.agent import Message
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
 from macs_zenoh.messages import CallFailure, Metadata, NodeType, decode_data, encode_data, node_name
+from macs_zenoh.reading import Message
 
 DEADLINE_S = 0.5
 SET = "std_srvs/SetBool"
