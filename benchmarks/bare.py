@@ -1,7 +1,8 @@
-"""The hops from a headset to a ROS topic with nothing in them: what no program on this way can be faster than.
+"""The hops from a headset to a ROS topic with nothing in them but Zenoh, with its threads as we have them, and rclpy.
 
-``python -m benchmarks.bare gateway PORT`` puts on the mesh what it receives from one socket; ``... robot PORT TOPIC``
-publishes what comes from there; ``... headset PORT`` sends. PORT is the router's, for the headset the bare gateway's.
+``python -m benchmarks.bare gateway PORT SIZE`` puts on the mesh what it receives from one socket, so many bytes each;
+``... robot PORT TOPIC`` publishes what comes from there; ``... headset PORT`` sends. PORT is the router's, for the
+headset the bare gateway's.
 """
 
 from __future__ import annotations
@@ -14,15 +15,16 @@ from typing import Any
 
 import zenoh
 
+from macs_zenoh.mesh.threads import keep_attached, shared_threads
+
 from .raw import RawZenoh
 from .robot_ends import pace, stamped
 from .worker import serve
 
 KEY = "bench/bare"
-RECEIVE_BYTES = 64 << 10
 
 
-def gateway(raw: RawZenoh) -> None:
+def gateway(raw: RawZenoh, size: int) -> None:
     """One socket, read by a thread that waits for it."""
     publisher = raw.session.declare_publisher(KEY, express=True)
     server = socket.create_server(("127.0.0.1", 0))
@@ -30,7 +32,7 @@ def gateway(raw: RawZenoh) -> None:
     def work() -> None:
         connection, _ = server.accept()
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        while received := connection.recv(RECEIVE_BYTES):
+        while received := connection.recv(size, socket.MSG_WAITALL):
             publisher.put(received)
 
     threading.Thread(target=work, daemon=True).start()
@@ -46,6 +48,7 @@ def robot(raw: RawZenoh, topic: str) -> None:
     publisher = rclpy.create_node("bare").create_publisher(UInt8MultiArray, topic, 1000)
 
     def take(sample: zenoh.Sample) -> None:
+        keep_attached()
         publisher.publish(sample.payload.to_bytes())
 
     raw.declare(KEY, take, direct=True)
@@ -72,9 +75,10 @@ def main() -> None:
     if role == "headset":
         serve({}, {"publish": Headset(port).publish})
         return
-    raw = RawZenoh(port)
+    with shared_threads("client"):
+        raw = RawZenoh(port)
     if role == "gateway":
-        gateway(raw)
+        gateway(raw, int(sys.argv[3]))
     else:
         robot(raw, sys.argv[3])
     raw.session.close()  # type: ignore[no-untyped-call]

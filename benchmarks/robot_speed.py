@@ -19,7 +19,8 @@ from macs_zenoh.mesh.awake import Awake
 
 from .figures import Figure
 from .plan import KIB, Case, Plan, Run, in_turn
-from .processes import Program, Stage
+from .processes import Program, ProgramFailed, Stage
+from .robot_ends import stamped
 
 IMAGE = 900_000
 QUIET_S = 2.0
@@ -61,7 +62,7 @@ class Site:
         self.subscriber, _ = stage.worker("robot_ends", "ros")
         self.headset, _ = stage.worker("robot_ends", "headset", gateway, 1)
         self.five, _ = stage.worker("robot_ends", "headset", gateway, 5)
-        _, bare = stage.worker("bare", "gateway", router)
+        _, bare = stage.worker("bare", "gateway", router, len(stamped(KIB)))
         stage.worker("bare", "robot", router, "/bare")
         self.bare, _ = stage.worker("bare", "headset", bare["port"])
         self.depth = 1000  # a machine that others use stalls for tens of ms: that is not what is measured
@@ -103,7 +104,11 @@ class Site:
         if not self._awake or path not in WITHOUT_US:
             yield
             return
-        with open(Awake.DEVICE, "wb", buffering=0) as request:  # noqa: PTH123
+        try:
+            request = open(Awake.DEVICE, "wb", buffering=0)  # noqa: PTH123, SIM115 - closed below
+        except OSError as error:
+            raise ProgramFailed(f"cores cannot be kept awake: {error}") from error
+        with request:
             request.write(bytes(4))
             yield
 

@@ -385,6 +385,7 @@ async def join(
     if connect:
         settings = changed(settings, connect=list(connect))
     async with await Mesh.open(settings, traffic=traffic, on_waiting=on_waiting) as mesh:
+        mesh.keep_awake()
         agent = Agent(mesh, kind, group)
         try:
             await agent._join(id)

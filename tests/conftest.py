@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -35,5 +36,8 @@ class _RosTests:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        # a shell starts what it runs in the background so; programs that are tested with Ctrl-C would inherit it
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if os.environ.get(NEED_ROS_TESTS):
         config.pluginmanager.register(_RosTests())

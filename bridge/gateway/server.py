@@ -154,6 +154,7 @@ class Gateway:
 
         Raises ConfigError when the block is somebody else's, Unreachable when the port cannot be had.
         """
+        self.mesh.keep_awake()
         await self._presence.start()
         self.mesh.on_link(lambda up: self._robots.repeat_all() if up else None)
         await self._leases.take()

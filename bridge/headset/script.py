@@ -25,6 +25,7 @@ from macs_zenoh.errors import CallTimeout, MacsError, Unreachable, UsageError, W
 from macs_zenoh.keyexpr import type_name
 
 from .client import Headset
+from .hints import Role, hints
 from .nodes import Incoming, Service, ServiceRequest, Subscription
 from .typed import Types, request_of, response_of
 from .verbs import MAX_BYTES, agent_type, json_object, script_parser
@@ -36,6 +37,8 @@ _LISTEN = "listen"
 _LAST_MESSAGES_S = 0.2
 """How long `pub` stays after its last message: leaving at once takes the publisher off the robot before ROS has
 carried the message."""
+_SILENCE_S = 2.0
+"""How long `sub` waits for a first message before it says where nobody publishes the topic."""
 _RETRY_S = 0.1
 """How often `pub` looks whether a lost connection is back."""
 
@@ -160,8 +163,12 @@ class Session:
             drop_new=args.drop_new,
         )
         log.info("subscribed to %s of robots %s", args.topic, _where(subscription))
-        work = self._take(subscription, args.topic, args, lambda message: self._shown_topic(args, message))
-        return Job(work, endless=not (args.count or args.timeout))
+
+        async def work() -> int:
+            async with self._hint(args.topic, subscription.agents, "publishers", after_s=_SILENCE_S):
+                return await self._take(subscription, args.topic, args, lambda item: self._shown_topic(args, item))
+
+        return Job(work(), endless=not (args.count or args.timeout))
 
     async def _pub(self, args: argparse.Namespace) -> Job:
         agents = await self._robots(args)
@@ -173,6 +180,12 @@ class Session:
         settle_s = 0.0 if args.topic in known else args.settle
 
         async def work() -> int:
+            if args.topic in known:
+                return await publish()
+            async with self._hint(args.topic, publisher.agents, "subscribers"):
+                return await publish()
+
+        async def publish() -> int:
             await asyncio.sleep(settle_s)
             sent = 0
             began = time.monotonic()
@@ -241,6 +254,24 @@ class Session:
         return Job(work, endless=not (args.count or args.timeout))
 
     # --- inside ---
+
+    @contextlib.asynccontextmanager
+    async def _hint(
+        self, topic: str, robots: Collection[int], role: Role, *, after_s: float = 0
+    ) -> AsyncIterator[None]:
+        """Meanwhile, if nothing has been received by then, say what may be wrong."""
+
+        async def hint() -> None:
+            await asyncio.sleep(after_s)
+            if not self._received[topic]:
+                for line in await hints(self.headset, robots, topic, role):
+                    log.warning("%s", line)
+
+        hinting = asyncio.get_running_loop().create_task(hint())
+        try:
+            yield
+        finally:
+            hinting.cancel()
 
     async def _take(
         self, source: AsyncIterator[Any], what: str, args: argparse.Namespace, show: Callable[[Any], dict[str, Any]]

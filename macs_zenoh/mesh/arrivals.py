@@ -60,7 +60,8 @@ class Arrivals:
         self.asked: deque[zenoh.Query] = deque()
         """Queries on their way to the loop: an emergency stop can be among them, so no sample overtakes them."""
         self._own = threading.local()
-        self._passed = False
+        self.stirred = False
+        """Whether a message or a question has come or gone since somebody took this back."""
 
     def put(self, publisher: zenoh.Publisher, payload: Payload) -> None:
         """Publish. Zenoh calls our own subscriptions back within this, and they take the payload as it is."""
@@ -71,7 +72,7 @@ class Arrivals:
         self._put(publisher, payload, b"")
 
     def _put(self, publisher: zenoh.Publisher, payload: Payload, zenohs: Payload) -> None:
-        self._passed = True
+        self.stirred = True
         self._own.payload = payload
         try:
             publisher.put(zenohs)
@@ -81,15 +82,20 @@ class Arrivals:
             self._own.payload = None
 
     def receiver(
-        self, on_batch: OnBatch, on_numbered: OnNumbered | None = None, *, at_once: AtOnce | None = None
+        self,
+        on_batch: OnBatch,
+        on_numbered: OnNumbered | None = None,
+        *,
+        at_once: AtOnce | None = None,
+        stirs: bool = True,
     ) -> Callable[[zenoh.Sample], bool]:
         """What Zenoh calls, in whatever thread, for each sample of one subscription; whether there was room for it.
         Samples that their source has numbered go to ``on_numbered``, if it is given; others are offered to
-        ``at_once`` first."""
+        ``at_once`` first. Heartbeats do not count as messages: they do not ``stir``."""
         queue, limit, large, own = self._queue, self.LIMIT, self.LARGE_BYTES, self._own
 
         def receive(sample: zenoh.Sample) -> bool:
-            self._passed = True
+            self.stirred |= stirs
             if len(queue) >= limit and not self._has_room():
                 self._drops["loop_behind"] += 1
                 return False
@@ -118,11 +124,6 @@ class Arrivals:
             return True
 
         return receive
-
-    def passed(self) -> bool:
-        """Whether a sample has come or gone since this was asked last."""
-        passed, self._passed = self._passed, False
-        return passed
 
     def mark(self, on_mark: OnBatch) -> None:
         """Call ``on_mark`` on the loop after all that has arrived so far. From any thread."""

@@ -15,7 +15,7 @@ class Awake:
     """Asks Linux, while messages pass, to let no core of this machine sleep so deeply that it needs more than
     ``latency_us`` to wake; 0: not to let them sleep at all.
 
-    A request of PM QoS, which Linux drops when whoever made it is gone, however that came about. ``passed`` says
+    A request of PM QoS, which Linux drops when whoever made it is gone, however that came about. ``stirred`` says
     whether a message has passed since it was asked last.
     """
 
@@ -24,9 +24,9 @@ class Awake:
     QUIET_S = 2.0
     """Without a message for so long, cores may sleep again."""
 
-    def __init__(self, latency_us: int, passed: Callable[[], bool], loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, latency_us: int, stirred: Callable[[], bool], loop: asyncio.AbstractEventLoop) -> None:
         self._latency_us = latency_us
-        self._passed = passed
+        self._stirred = stirred
         self._loop = loop
         self._request: int | None = None
         self._quiet_s = 0.0
@@ -43,7 +43,7 @@ class Awake:
 
     def _look(self) -> None:
         self._timer = self._loop.call_later(self.LOOK_S, self._look)
-        self._quiet_s = 0.0 if self._passed() else self._quiet_s + self.LOOK_S
+        self._quiet_s = 0.0 if self._stirred() else self._quiet_s + self.LOOK_S
         if self._quiet_s == 0.0 and self._request is None:
             self._hold()
         elif self._quiet_s >= self.QUIET_S:

@@ -59,7 +59,8 @@ class Recovered:
         session, arrivals = self._session, self._arrivals
         receive = arrivals.receiver(self._on_batch, self._on_numbered, at_once=self._at_once)
         samples = zenoh.handlers.Callback(receive, indirect=False)
-        heartbeats = zenoh.handlers.Callback(arrivals.receiver(self._on_heartbeat), indirect=False)
+        beat = arrivals.receiver(self._on_heartbeat, stirs=False)
+        heartbeats = zenoh.handlers.Callback(beat, indirect=False)
         declared = Subscription(
             self,
             session.declare_subscriber(self._key, samples),

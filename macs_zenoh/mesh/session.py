@@ -58,8 +58,7 @@ class Mesh:
         self._session = session
         self._loop = asyncio.get_running_loop()
         self._arrivals = Arrivals(self._loop, self._from_thread, self.drops)
-        us = settings.awake_us
-        self._awake = Awake(us, self._arrivals.passed, self._loop) if us is not None else None
+        self._awake: Awake | None = None
         self._missed: set[str] = set()
         self._recovered: set[Recovered] = set()
         self._needs_router = settings.mode == "client"
@@ -137,6 +136,16 @@ class Mesh:
     def backlogged(self) -> bool:
         """Whether so much waits to be sent that callers should slow down; `on_room` tells when it is over."""
         return self._outgoing.backlogged
+
+    def keep_awake(self) -> None:
+        """Keep this machine's cores awake while messages or questions pass, if the settings ask for it: for programs
+        that pass them on, not for those that only look, or route."""
+        if self.settings.awake_us is not None and self._awake is None:
+            self._awake = Awake(self.settings.awake_us, self._stirred, self._loop)
+
+    def _stirred(self) -> bool:
+        stirred, self._arrivals.stirred = self._arrivals.stirred, False
+        return stirred
 
     async def __aenter__(self) -> Mesh:
         return self
@@ -287,6 +296,7 @@ class Mesh:
         def on_end() -> None:
             self._from_thread(settle, None, NotServed(key))
 
+        self._arrivals.stirred = True
         priority, congestion, express = self._outgoing.way(key, traffic)
         self._session.get(
             key,
@@ -350,6 +360,7 @@ class Mesh:
             task.add_done_callback(self._tasks.discard)
 
         def on_query(query: zenoh.Query) -> None:
+            self._arrivals.stirred = True
             self._arrivals.asked.append(query)
             self._from_thread(spawn, query)
 

@@ -20,11 +20,24 @@ from bridge.gateway import Gateway
 from bridge.headset.typed import Types, request_of, response_of
 from macs_zenoh.config import GatewaySettings, MeshSettings
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import AddNode, Metadata, NodeType, RemoveNode, StreamData, decode_data, encode_management
+from macs_zenoh.messages import (
+    AddNode,
+    Functionality,
+    FunctionalityRequest,
+    Metadata,
+    NodeType,
+    RemoveNode,
+    StreamData,
+    decode_data,
+    encode_data,
+    encode_management,
+    node_name,
+)
 from macs_zenoh.wire import encode_frame, encode_message
 
 ROOT = Path(__file__).parents[2]
 SET_BOOL = "std_srvs/SetBool"
+STRING = "std_msgs/String"
 TYPES = Types()
 
 
@@ -35,6 +48,9 @@ class EchoRobot:
         self.agent = agent
         self.nodes: dict[tuple[int, str], dict[int, AddNode]] = {}
         self.answers: asyncio.Queue[bytes] = asyncio.Queue()
+        self.offers: Functionality | None = None
+        """What it says that it has; None: it does not answer."""
+        self.asked = 0
         self._changed = asyncio.Event()
         agent.serve("add_node", self._add)
         agent.serve("remove_node", self._remove)
@@ -52,6 +68,11 @@ class EchoRobot:
                 self.agent.send(data, to="unity", ids=[message.sender_id], metadata=metadata)
             elif metadata.node_type == NodeType.SERVICE:
                 self.answers.put_nowait(message.data)
+            elif metadata.message_manager == FunctionalityRequest.manager:
+                self.asked += 1
+                if self.offers is not None:
+                    answer = Metadata(request_id=metadata.request_id)
+                    self.agent.send(encode_data(self.offers), to="unity", ids=[message.sender_id], metadata=answer)
 
     def stream(self, node: str, data_type: str, cdr: bytes) -> None:
         """Put topic data for everybody who registered."""
@@ -389,3 +410,40 @@ async def test_a_subscription_survives_its_gateway(
         robot.stream("nd__talk", "std_msgs/String", TYPES.serialize("std_msgs/String", {"data": "again"}))
         code, lines, log = await staying.end()
     assert (code, lines) == (0, [{"topic": "/talk", "from": 1, "message": {"data": "again"}}]), log
+
+
+# --- hints ---
+
+OFFERED = Functionality({"/cmd_vel": "geometry_msgs/msg/Twist"}, {"/chatter": "std_msgs/msg/String"})
+
+
+@pytest.mark.parametrize("offers", [OFFERED, None])
+@pytest.mark.parametrize("topic", ["/chatter", "/chater"])
+async def test_who_hears_nothing_learns_why(
+    start: Start, robot: EchoRobot, topic: str, offers: Functionality | None
+) -> None:
+    robot.offers = offers
+    sub = await start("sub", topic, STRING, "--timeout", "3")
+    code, _, log = await sub.end()
+    hint = "robot 1 offers no publisher of /chater; did you mean /chatter?"
+    assert (code, hint in log, "offers no" in log) == (1, *([topic == "/chater" and offers is not None] * 2))
+    assert robot.asked == 1
+
+
+async def test_who_hears_something_is_told_nothing(start: Start, robot: EchoRobot) -> None:
+    robot.offers = OFFERED
+    sub = await start("sub", "/talk", STRING, "--timeout", "3")
+    await robot.registered(NodeType.SUBSCRIBER, node_name("/talk"))
+    robot.stream(node_name("/talk"), STRING, TYPES.serialize(STRING, {"data": "here"}))
+    code, _, log = await sub.end()
+    assert (code, robot.asked, "offers no" in log) == (0, 0, False)
+
+
+async def test_who_drives_nothing_is_told_once(start: Start, robot: EchoRobot) -> None:
+    robot.offers = OFFERED
+    script = await start("run", "-")
+    for _ in range(3):
+        script.say(f"pub /cmdvel {STRING} '{{}}'")
+    code, _, log = await script.end()
+    assert (code, robot.asked) == (0, 1)
+    assert log.count("robot 1 offers no subscriber to /cmdvel; did you mean /cmd_vel?") == 1

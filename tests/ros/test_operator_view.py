@@ -146,3 +146,25 @@ async def test_stop_holds_until_it_is_released(site: Site) -> None:
     assert (code, out) == (0, "robot 7 is released\n")
     await site.drive(0.7)
     assert (await get(site.driven)).linear.x == 0.7
+
+
+async def test_a_misspelled_topic_is_told(site: Site) -> None:
+    """Who listens where nobody publishes, or drives what nobody hears, learns what may have been meant."""
+    code, _, log = await ended("headset", site.headset.target, "sub", "/chater", "std_msgs/String", "--timeout", "4")
+    assert code == 1
+    assert "robot 7 offers no publisher of /chater; did you mean /chatter?" in log
+    code, _, log = await ended(
+        "headset", site.headset.target, "pub", "/cmdvel", "geometry_msgs/Twist", "{}", "--settle", "3"
+    )
+    assert code == 0
+    assert "robot 7 offers no subscriber to /cmdvel; did you mean /cmd_vel?" in log
+
+
+async def test_nothing_is_told_of_topics_that_are_there(site: Site) -> None:
+    """A topic on which nothing happens is not a wrong one."""
+    _, _, log = await ended("headset", site.headset.target, "sub", "/chatter", "std_msgs/String", "--timeout", "3")
+    assert "offers no" not in log
+    _, _, log = await ended(
+        "headset", site.headset.target, "pub", "/cmd_vel", "geometry_msgs/Twist", "{}", "--settle", "3"
+    )
+    assert "offers no" not in log

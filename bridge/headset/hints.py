@@ -1,0 +1,50 @@
+"""What may be wrong when nothing comes, or nobody hears: the name of a topic, against those that robots have."""
+
+from __future__ import annotations
+
+import asyncio
+import difflib
+from collections.abc import Collection
+from typing import Literal
+
+from macs_zenoh.errors import MacsError
+from macs_zenoh.messages import Functionality, FunctionalityRequest, decode_data
+
+from .client import Headset
+
+Role = Literal["publishers", "subscribers"]
+
+PATIENCE_S = 2.0
+ALIKE = 0.7
+"""How alike names are that may be meant by each other, from 0 to 1."""
+
+
+async def hints(headset: Headset, robots: Collection[int], topic: str, role: Role) -> list[str]:
+    """A line for each robot where something seems to be wrong; none for robots that do not tell what they have."""
+    asked = (_hint(headset, robot, topic, role) for robot in sorted(robots))
+    return [line for line in await asyncio.gather(*asked) if line]
+
+
+async def _hint(headset: Headset, robot: int, topic: str, role: Role) -> str:
+    try:
+        answer = await headset.ask(robot, FunctionalityRequest.manager, timeout_s=PATIENCE_S)
+        return judge(robot, topic, role, decode_data(Functionality, answer))
+    except MacsError:  # not every program answers, and the user has not asked this
+        return ""
+
+
+def judge(robot: int, topic: str, role: Role, offered: Functionality) -> str:
+    """What seems to be wrong, given what a robot offers; nothing when the topic is there, or may well come.
+
+    A robot does not tell of its own nodes, nor of what its rules hide or remapping renames: what no ROS node
+    subscribes to, another headset may.
+    """
+    there = offered.publishers if role == "publishers" else offered.subscribers
+    name = topic if topic.startswith("/") else f"/{topic}"
+    if name in there:
+        return ""
+    nobody = f"robot {robot} offers no {'publisher of' if role == 'publishers' else 'subscriber to'} {name}"
+    near = difflib.get_close_matches(name, there, n=1, cutoff=ALIKE)
+    if near:
+        return f"{nobody}; did you mean {near[0]}?"
+    return nobody if role == "publishers" else ""
