@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -258,6 +260,8 @@ class ServiceNode(InterfaceNode):
 
     TURN = 64
     """Requests taken in one turn of the executor."""
+    LINGER_S = 0.25
+    """How long a service stays after its last response: destroyed at once, it takes unread responses with it."""
 
     def __init__(self, robot: Robot, request: AddNode) -> None:
         super().__init__(robot, request)
@@ -268,6 +272,7 @@ class ServiceNode(InterfaceNode):
         self._open_calls: dict[int, OpenCall] = {}
         self._next_request = 0
         self._failed: deque[tuple[Any, str]] = deque()
+        self._answered_at = -math.inf
         self._closing = False
         self._loop = asyncio.get_running_loop()
 
@@ -275,7 +280,8 @@ class ServiceNode(InterfaceNode):
         self._types = resolve(str(self.interface), "srv")
         fields.failure(self._types.Response, "", self.rule.error_response, "error_response")
         node = self.robot.session.node
-        if check_service_type(node, self.topic, self.interface):
+        lingers = any(service.service_name == self.topic for service in node.services)
+        if check_service_type(node, self.topic, self.interface) and not lingers:
             # not refused: after a crash of ours ROS knows our own old service for a while
             log.warning("%s: another ROS node serves it too; a call goes to both", self.topic)
         with ros_errors(self.request.tos_name):
@@ -291,10 +297,16 @@ class ServiceNode(InterfaceNode):
 
     def close(self) -> None:
         self._closing = True
-        if not self._failed:
-            self._destroy()
+        self._end_when_read()
 
-    def _destroy(self) -> None:
+    def _end_when_read(self) -> None:
+        """Destroy the service once what it has answered is taken."""
+        if self._failed:
+            return  # this is called again when they are answered
+        wait_s = self._answered_at + self.LINGER_S - time.monotonic()
+        if wait_s > 0:
+            self.robot.session.later(wait_s, self._end_when_read)
+            return
         service, self._service = self._service, None
         if service is not None:
             self.robot.session.node.destroy_service(service)
@@ -375,6 +387,8 @@ class ServiceNode(InterfaceNode):
                 self._pass_on(request, header)
 
     def _pass_on(self, request: Any, header: Any) -> None:
+        if self._closing and self.robot.session.node.count_services(self.topic) > 1:
+            return  # whoever serves it now has got it too
         self._loop.call_soon_threadsafe(self._ask, bytes(serialize_message(request)), header)
 
     def _send(self, request_id: int, sender: Registrant, header: Any, answer: bytes) -> None:
@@ -405,11 +419,12 @@ class ServiceNode(InterfaceNode):
         if self._failed:
             self.robot.session.later(PACE_FAILURES_S, self._send_failures)
         elif self._closing:
-            self._destroy()
+            self._end_when_read()
 
     def _answer(self, response: Any, header: Any) -> None:
         if self._service is None:
             return
+        self._answered_at = time.monotonic()
         try:
             self._respond(response, header)
         except RuntimeError as error:  # the caller is gone
