@@ -72,8 +72,8 @@ AgentPattern = str
 """``*``, a type of agents, one of them (``unity/5``), a group (``group/3``) or a block of headsets (``block/1``)."""
 
 ROUTER_RETRY_MS = 500
-"""A router waits at least so long before it dials another one again: a link between routers that is back within 100 ms
-of its loss may stay dead (seen with Zenoh 1.10.2): connected, but without tokens and data."""
+"""A router waits at least so long between attempts to reach another one: a link between routers that is back within
+100 ms of its loss may stay dead (seen with Zenoh 1.10.2): connected, but without tokens and data."""
 
 LOCAL_ROUTER = "tcp/127.0.0.1:7447"
 EVERY_INTERFACE = "tcp/[::]:7447"

@@ -121,6 +121,8 @@ class Endpoint(msgspec.Struct, kw_only=True):
     meets: list[str] = []
     """The other endpoints whose sessions see a token that was declared through this one."""
     presence: list[str] = []
+    misses: list[str] = []
+    """Presence keys that an endpoint shows which it meets, and this one does not, both asked twice."""
     leases: list[str] = []
     names: list[str] = []
     elsewhere: list[str] = []

@@ -135,6 +135,9 @@ def _linked(facts: Facts) -> Iterator[Finding]:
             if one.router != other.router and _apart(one, other):
                 yield found("split", one.endpoint, other=other.endpoint)
     for endpoint in there:
+        if endpoint.misses:
+            count, others = len(endpoint.misses), " and ".join(endpoint.meets)
+            yield found("link_stale", endpoint.endpoint, others=others, count=count, one=endpoint.misses[0])
         for info in endpoint.routers:
             if info.zid == endpoint.router and info.routers:
                 dead = {session.zid for session in info.sessions if session.whatami == "router"} - set(info.routers)

@@ -77,7 +77,13 @@ KINDS: dict[str, Kind] = {
         "routers",
         ERROR,
         "connected with router {other}, and nothing passes",
-        "restart one of the two, and let routers wait longer before they try again: connect/retry/period_init_ms 1000",
+        "restart one of the two; `macs router` does so by itself when a link is back and carries nothing",
+    ),
+    "link_stale": Kind(
+        "routers",
+        ERROR,
+        "linked with {others}, and does not show {count} of those online there, as {one}",
+        "restart one of the two (`macs router` does so by itself); if that does not help, compare their access rules",
     ),
     "slow": Kind(
         "routers",

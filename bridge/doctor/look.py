@@ -176,6 +176,7 @@ class Examination:
             self._say("who is there, and what these settings may do")
             await asyncio.gather(*(self._survey(place) for place in places))
             await self._meet(places)
+            await self._compare(places)
             for place in places:
                 self._say(f"the way to {place.facts.endpoint}")
                 await self._measure(place)
@@ -356,6 +357,18 @@ class Examination:
                 if await self._shows_up(place.first, PRESENCE.every(), other.mark, wait_s):
                     place.facts.meets.append(other.facts.endpoint)
 
+    async def _compare(self, places: list[_Place]) -> None:
+        """What an endpoint does not show of what others do that it meets. Who just comes or leaves does not count."""
+        suspected = _missing(places)
+        if not any(suspected):
+            return
+        await asyncio.sleep(SETTLE_S)
+        answers = await asyncio.gather(*(self._tokens(place.first, PRESENCE.every()) for place in places))
+        for place, presence in zip(places, answers, strict=True):
+            place.facts.presence = presence
+        for place, before, now in zip(places, suspected, _missing(places), strict=True):
+            place.facts.misses = sorted(before & now)
+
     # -- measurements --------------------------------------------------------------------------------------------
 
     async def _measure(self, place: _Place) -> None:
@@ -523,3 +536,12 @@ async def _until(condition: Callable[[], bool], timeout_s: float) -> bool:
             return False
         await asyncio.sleep(0.002)
     return True
+
+
+def _missing(places: list[_Place]) -> list[set[str]]:
+    """For each endpoint what it does not show of what those show that it meets."""
+    return [
+        {key for other in places if other.facts.endpoint in place.facts.meets for key in other.facts.presence}
+        - set(place.facts.presence)
+        for place in places
+    ]

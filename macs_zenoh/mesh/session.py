@@ -79,6 +79,7 @@ class Mesh:
         self.on_room = outgoing.on_room
         self._routers: set[str] = set()
         self._on_link: list[Callable[[bool], None]] = []
+        self._on_neighbour: list[Callable[[str], None]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         # links, not transports, and directly: Zenoh tells of a lost link before it tells that everybody behind it
         # left, and of the lost transport only after that
@@ -190,10 +191,21 @@ class Mesh:
         """Call ``callback(up)`` whenever the connection to the routers is lost or back."""
         self._on_link.append(callback)
 
+    def neighbours(self) -> set[str]:
+        """Zenoh ids of the routers to which this program has a connection now, in Zenoh's own words."""
+        return {str(zid) for zid in self._session.info.routers_zid()}
+
+    def on_neighbour(self, callback: Callable[[str], None]) -> None:
+        """Call ``callback(zid)`` whenever a connection to a router has come about, or has come back."""
+        self._on_neighbour.append(callback)
+
     def _link_changed(self, event: zenoh.LinkEvent) -> None:
         self._from_thread(self._set_link, str(event.link.zid), event.kind == zenoh.SampleKind.PUT)
 
     def _set_link(self, zid: str, up: bool) -> None:
+        if up and self._on_neighbour and zid in self.neighbours():
+            for told in self._on_neighbour:
+                told(zid)
         before = self.linked
         (self._routers.add if up else self._routers.discard)(zid)
         self.linked = bool(self._routers) or not self._needs_router

@@ -52,8 +52,8 @@ RIGHT_S = 3.0
 SOON = "connect/retry:{period_init_ms:500,period_max_ms:500,period_increase_factor:1}"
 """A router that lost the other one tries again at once, and then so often."""
 FORGOTTEN_S = 0.25
-"""Zenoh 1.10.2 works out its routes at most every 100 ms. A link that is lost and back in between is taken for one that
-was never lost: nothing is declared on it, until it is lost again (docs/deploy.md)."""
+"""Zenoh 1.10.2 works out its routes at most every 100 ms. A link that is lost and back in between is taken for one
+that was never lost: nothing is declared on it, until it is lost again (docs/doctor.md)."""
 
 
 WATCHERS = [(9, 60001), (9, 60002)]

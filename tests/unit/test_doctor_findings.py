@@ -137,6 +137,11 @@ def _(facts: Facts) -> None:
         router.sessions.append(Session(zid="cc", whatami="router", shared_memory=False, address="tcp/10.0.0.9:1"))
 
 
+@makes("link_stale", ERROR)
+def _(facts: Facts) -> None:
+    facts.endpoints[0].misses = facts.endpoints[1].presence[:1]
+
+
 @makes("slow", NOTE)
 def _(facts: Facts) -> None:
     facts.endpoints[0].way.round_trips_ms = [210.0, 205.0, 300.0]
