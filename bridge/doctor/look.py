@@ -359,14 +359,12 @@ class Examination:
 
     async def _compare(self, places: list[_Place]) -> None:
         """What an endpoint does not show of what others do that it meets. Who just comes or leaves does not count."""
-        suspected = _missing(places)
+        suspected = _missing(places, [place.facts.presence for place in places])
         if not any(suspected):
             return
-        await asyncio.sleep(SETTLE_S)
-        answers = await asyncio.gather(*(self._tokens(place.first, PRESENCE.every()) for place in places))
-        for place, presence in zip(places, answers, strict=True):
-            place.facts.presence = presence
-        for place, before, now in zip(places, suspected, _missing(places), strict=True):
+        await asyncio.sleep(max(place.waited_s for place in places))
+        shown = await asyncio.gather(*(self._tokens(place.first, PRESENCE.every()) for place in places))
+        for place, before, now in zip(places, suspected, _missing(places, shown), strict=True):
             place.facts.misses = sorted(before & now)
 
     # -- measurements --------------------------------------------------------------------------------------------
@@ -538,10 +536,13 @@ async def _until(condition: Callable[[], bool], timeout_s: float) -> bool:
     return True
 
 
-def _missing(places: list[_Place]) -> list[set[str]]:
-    """For each endpoint what it does not show of what those show that it meets."""
-    return [
-        {key for other in places if other.facts.endpoint in place.facts.meets for key in other.facts.presence}
-        - set(place.facts.presence)
-        for place in places
-    ]
+def _missing(places: list[_Place], shown: list[list[str]]) -> list[set[str]]:
+    """For each endpoint what it does not show of what those of other routers show that it meets."""
+    missing = []
+    for place, own in zip(places, shown, strict=True):
+        there: set[str] = set()
+        for other, keys in zip(places, shown, strict=True):
+            if other.facts.endpoint in place.facts.meets and other.facts.router != place.facts.router:
+                there.update(keys)
+        missing.append(there.difference(own))
+    return missing

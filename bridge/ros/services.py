@@ -273,7 +273,7 @@ class ServiceNode(InterfaceNode):
         self._next_request = 0
         self._failed: deque[tuple[Any, str]] = deque()
         self._answered_at = -math.inf
-        self._closing = False
+        self._closing = self._ending = False
         self._loop = asyncio.get_running_loop()
 
     def open(self) -> None:
@@ -297,16 +297,21 @@ class ServiceNode(InterfaceNode):
 
     def close(self) -> None:
         self._closing = True
-        self._end_when_read()
+        if not self._failed:
+            self._end_when_read()
 
     def _end_when_read(self) -> None:
-        """Destroy the service once what it has answered is taken."""
-        if self._failed:
-            return  # this is called again when they are answered
+        """Destroy the service once what it has answered is taken; who calls it until then hears that it is over."""
+        if self._ending:
+            return
+        self._ending = True
         wait_s = self._answered_at + self.LINGER_S - time.monotonic()
         if wait_s > 0:
-            self.robot.session.later(wait_s, self._end_when_read)
-            return
+            self.robot.session.later(wait_s, self._destroy)
+        else:
+            self._destroy()
+
+    def _destroy(self) -> None:
         service, self._service = self._service, None
         if service is not None:
             self.robot.session.node.destroy_service(service)
@@ -387,8 +392,6 @@ class ServiceNode(InterfaceNode):
                 self._pass_on(request, header)
 
     def _pass_on(self, request: Any, header: Any) -> None:
-        if self._closing and self.robot.session.node.count_services(self.topic) > 1:
-            return  # whoever serves it now has got it too
         self._loop.call_soon_threadsafe(self._ask, bytes(serialize_message(request)), header)
 
     def _send(self, request_id: int, sender: Registrant, header: Any, answer: bytes) -> None:

@@ -1,0 +1,94 @@
+"""A Zenoh router that notices when the link with another one is back and carries nothing, and starts again."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.errors import MacsError
+from macs_zenoh.mesh import Mesh
+
+log = logging.getLogger("macs.router")
+
+SETTLE_S = 1.0
+"""How long after a link is back all must be known that is behind it."""
+ANSWER_S = 2.0
+FORGOTTEN_S = 0.3
+"""How long a router is away that starts again: other routers have to notice."""
+AGAIN_S = 1.0
+
+
+async def serve(settings: MeshSettings, *, on_ready: Callable[[], None]) -> None:
+    """Be a router until cancelled. Raises what `Mesh.open` raises, at the start."""
+    known: set[str] = set()
+    mesh, ready = await Mesh.open(settings), False
+    while True:
+        async with mesh:
+            if not ready:
+                on_ready()
+                ready = True
+            router = await _dead_link(mesh, known)
+            log.warning("the link with router %s is back and carries nothing; starting again", router[:8])
+        await asyncio.sleep(FORGOTTEN_S)
+        mesh = await _opened_again(settings)
+
+
+async def _opened_again(settings: MeshSettings) -> Mesh:
+    """The router once more. What has changed meanwhile in its files must not end what was running."""
+    problem = ""
+    while True:
+        try:
+            return await Mesh.open(settings)
+        except MacsError as error:
+            if str(error) != problem:
+                problem = str(error)
+                log.error("cannot start again yet: %s", problem)
+            await asyncio.sleep(AGAIN_S)
+
+
+async def _dead_link(mesh: Mesh, known: set[str]) -> str:
+    """Wait until a link with another router is back and carries nothing; the router's Zenoh id.
+
+    Zenoh 1.10.2 works out its routes at most every 100 ms. A link that is lost and back in between is taken for one
+    that was never lost: nothing that exists is declared on it again, for as long as it lasts.
+
+    ``known`` are routers that have answered before: one that never does may not be allowed to.
+    """
+    dead: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    checks: dict[str, asyncio.Task[None]] = {}
+
+    async def check(router: str) -> None:
+        for _ in range(2):
+            await asyncio.sleep(SETTLE_S)
+            if await _reached(mesh, router):
+                known.add(router)
+                return
+        if router in known and router in mesh.neighbours() and not dead.done():
+            known.discard(router)  # should it be something else, once is enough
+            dead.set_result(router)
+
+    def look(router: str) -> None:
+        if router in checks:
+            checks[router].cancel()  # the link is newer than that
+        checks[router] = asyncio.create_task(check(router))
+
+    mesh.on_neighbour(look)
+    for router in mesh.neighbours():  # those that were faster
+        look(router)
+    try:
+        return await dead
+    finally:
+        for task in checks.values():
+            task.cancel()
+
+
+async def _reached(mesh: Mesh, router: str) -> bool:
+    """Whether a router can be asked about itself. Where nothing leads to it, Zenoh says so at once; what takes long is
+    only slow."""
+    began = time.monotonic()
+    return (
+        bool(await mesh.ask_all(f"@/{router}/router", timeout_s=ANSWER_S)) or time.monotonic() - began > ANSWER_S / 2
+    )
