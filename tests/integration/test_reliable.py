@@ -10,6 +10,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -24,7 +25,7 @@ from macs_zenoh.keyexpr import NAMED_ALL
 from macs_zenoh.mesh import Mesh, Sample, Traffic, recovered
 from macs_zenoh.mesh.arrivals import Arrivals
 from macs_zenoh.mesh.outgoing import Outgoing
-from macs_zenoh.mesh.samples import AtOnce, OnBatch, OnNumbered
+from macs_zenoh.mesh.samples import OnBatch
 from macs_zenoh.messages import AddNode, Metadata, NodeType, StreamData, decode_data, encode_management
 from macs_zenoh.named import Outcome
 from macs_zenoh.wire import encode_frame, encode_message
@@ -196,14 +197,8 @@ async def test_replies_that_there_was_no_room_for_are_asked_for_again(
     """When the first replies to a question are dropped because the receiver is behind, nothing counts as missed."""
     really, dropped = Arrivals.receiver, [3]
 
-    def receiver(
-        arrivals: Arrivals,
-        on_batch: OnBatch,
-        on_numbered: OnNumbered | None = None,
-        *,
-        at_once: AtOnce | None = None,
-    ) -> Callable[[zenoh.Sample], bool]:
-        receive = really(arrivals, on_batch, on_numbered, at_once=at_once)
+    def receiver(arrivals: Arrivals, on_batch: OnBatch, *args: Any, **options: Any) -> Callable[[zenoh.Sample], bool]:
+        receive = really(arrivals, on_batch, *args, **options)
 
         def behind(sample: zenoh.Sample) -> bool:
             if dropped[0] == 3:
