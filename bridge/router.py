@@ -69,7 +69,7 @@ async def _dead_link(mesh: Mesh, known: set[str]) -> str:
                 return
             if time.monotonic() - began > ANSWER_S / 2:
                 return  # it is only slow: where nothing leads to it, Zenoh says so at once
-        if router in known and router in mesh.neighbours() and not dead.done():
+        if router in known and router in mesh.routers and not dead.done():
             known.discard(router)  # should it be something else, once is enough
             dead.set_result(router)
 
@@ -78,8 +78,8 @@ async def _dead_link(mesh: Mesh, known: set[str]) -> str:
             checks[router].cancel()  # the link is newer than that
         checks[router] = asyncio.create_task(check(router))
 
-    mesh.on_neighbour(look)
-    for router in mesh.neighbours():  # those that were faster
+    mesh.on_router(look)
+    for router in mesh.routers:  # those that were faster
         look(router)
     try:
         return await dead

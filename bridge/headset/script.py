@@ -177,12 +177,11 @@ class Session:
             args.topic, args.type, agents=agents, groups=args.groups, latched=args.latched
         )
         count = args.count or (0 if args.rate else 1)
-        settle_s = 0.0 if args.topic in known else args.settle
+        new = args.topic not in known
+        settle_s = args.settle if new else 0.0
 
         async def work() -> int:
-            if args.topic in known:
-                return await publish()
-            async with self._hint(args.topic, publisher.agents, "subscribers"):
+            async with self._hint(args.topic, publisher.agents if new else (), "subscribers"):
                 return await publish()
 
         async def publish() -> int:

@@ -95,7 +95,8 @@ class Arrivals:
         queue, limit, large, own = self._queue, self.LIMIT, self.LARGE_BYTES, self._own
 
         def receive(sample: zenoh.Sample) -> bool:
-            self.stirred |= stirs
+            if stirs:
+                self.stirred = True
             if len(queue) >= limit and not self._has_room():
                 self._drops["loop_behind"] += 1
                 return False

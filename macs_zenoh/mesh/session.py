@@ -77,9 +77,9 @@ class Mesh:
         self.put, self.put_unasked = outgoing.put, outgoing.put_unasked
         self.limited, self.prioritise, self.keep = outgoing.limited, outgoing.prioritise, outgoing.keep
         self.on_room = outgoing.on_room
-        self._routers: set[str] = set()
+        self._linked_with: set[str] = set()
         self._on_link: list[Callable[[bool], None]] = []
-        self._on_neighbour: list[Callable[[str], None]] = []
+        self._on_router: list[Callable[[str], None]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         # links, not transports, and directly: Zenoh tells of a lost link before it tells that everybody behind it
         # left, and of the lost transport only after that
@@ -185,30 +185,26 @@ class Mesh:
     @property
     def routers(self) -> list[str]:
         """Zenoh ids of the routers connected now."""
-        return sorted(self._routers)
+        return sorted(str(zid) for zid in self._session.info.routers_zid())
 
     def on_link(self, callback: Callable[[bool], None]) -> None:
         """Call ``callback(up)`` whenever the connection to the routers is lost or back."""
         self._on_link.append(callback)
 
-    def neighbours(self) -> set[str]:
-        """Zenoh ids of the routers to which this program has a connection now, in Zenoh's own words."""
-        return {str(zid) for zid in self._session.info.routers_zid()}
-
-    def on_neighbour(self, callback: Callable[[str], None]) -> None:
+    def on_router(self, callback: Callable[[str], None]) -> None:
         """Call ``callback(zid)`` whenever a connection to a router has come about, or has come back."""
-        self._on_neighbour.append(callback)
+        self._on_router.append(callback)
 
     def _link_changed(self, event: zenoh.LinkEvent) -> None:
         self._from_thread(self._set_link, str(event.link.zid), event.kind == zenoh.SampleKind.PUT)
 
     def _set_link(self, zid: str, up: bool) -> None:
-        if up and self._on_neighbour and zid in self.neighbours():
-            for told in self._on_neighbour:
+        if up and self._on_router and zid in self.routers:
+            for told in self._on_router:
                 told(zid)
         before = self.linked
-        (self._routers.add if up else self._routers.discard)(zid)
-        self.linked = bool(self._routers) or not self._needs_router
+        (self._linked_with.add if up else self._linked_with.discard)(zid)
+        self.linked = bool(self._linked_with) or not self._needs_router
         if before != self.linked:
             log.info("router %s", "connected" if self.linked else "lost; reconnecting")
         self._outgoing.link_changed(self.linked)

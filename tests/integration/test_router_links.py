@@ -16,7 +16,7 @@ from tests.links import Link, counted
 from tests.programs import Program, free_port
 
 MENDED_S = 20.0
-"""A second until it is looked at, twice two seconds for an answer, the restart, and room for a busy machine."""
+"""Two looks a second apart, the restart, and room for a busy machine."""
 
 
 @dataclass
