@@ -33,6 +33,9 @@ OPERATOR = 255
 NOBODY = 254
 """Agent type of nobody: with an operator's certificate `macs doctor` tries as one whether tokens are seen."""
 
+EXTENSIONS = 1
+"""The version of our extensions of the protocol that this package's agents understand; existing programs: 0."""
+
 AgentType = Annotated[int, Meta(ge=0, le=255)]
 AgentId = Annotated[int, Meta(ge=0, le=0xFFFF)]
 GroupId = Annotated[int, Meta(ge=0, le=255)]
@@ -128,7 +131,11 @@ class Welcome(Management, frozen=True):
 
 
 class Configuration(Management, frozen=True):
-    """Agent → router: the answer to Welcome. ``request_id`` echoes it; robots add what they offer."""
+    """Agent → router: the answer to Welcome. ``request_id`` echoes it; robots add what they offer.
+
+    ``extensions`` is the version of our extensions that the agent understands. Without it, it is an existing program:
+    its gateway sends it only what those are known to survive. Existing routers ignore the key.
+    """
 
     manager: ClassVar[str] = "AgentclientConfigurer"
     agent_type: AgentType
@@ -136,6 +143,7 @@ class Configuration(Management, frozen=True):
     group_id: GroupId = 0
     request_id: RequestId = 0
     functionality: Functionality | None = None
+    extensions: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0
 
 
 class Heartbeat(Management, frozen=True):
@@ -297,7 +305,10 @@ def decode_management(data: bytes, custom: Mapping[str, type[Struct]] = NO_CUSTO
 
 def encode_management(value: Management) -> bytes:
     """Write management data: the value's fields and its manager's name."""
-    return msgspec.json.encode({**_fields(value), "messageManager": value.manager})
+    fields = {**_fields(value), "messageManager": value.manager}
+    if isinstance(value, Configuration) and not value.extensions:
+        del fields["extensions"]  # as existing programs write it
+    return msgspec.json.encode(fields)
 
 
 def decode_data(kind: type[StructT], data: bytes | bytearray | memoryview) -> StructT:

@@ -160,6 +160,10 @@ class Peer:
         self.connection_number = connection_number
         self.agent_type = 0
         self.group = 0
+        self.extensions = 0
+        """Version of our extensions that the agent says it understands; 0 is an existing program."""
+        self.functionality: Functionality | None = None
+        """What a robot last said that it offers."""
         self.state = GREETED
         self.drops: Counter[str] = Counter()
         self.corrected = 0
@@ -312,11 +316,12 @@ class Peer:
             raise BadField("configuration", "agent type 0 is no agent")
         if kind == OPERATOR:
             raise NotAllowed("operators come over Zenoh, where a router can check who they are")
-        if self.state is ONLINE:
-            if kind != self.agent_type:
-                raise NotAllowed(f"a configured agent of type {self.agent_type} cannot become type {kind}")
-            if group == self.group:
-                return
+        if self.state is ONLINE and kind != self.agent_type:
+            raise NotAllowed(f"a configured agent of type {self.agent_type} cannot become type {kind}")
+        self.extensions = configuration.extensions
+        self.functionality = configuration.functionality or self.functionality
+        if self.state is ONLINE and group == self.group:
+            return
         self.state = ONLINE
         self._decoder.runs = not self._limits.frames_per_s  # a rate limit is for each frame
         self.agent_type, self.group = kind, group

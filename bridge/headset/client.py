@@ -30,6 +30,7 @@ from types import TracebackType
 from macs_zenoh.errors import CallTimeout, Unreachable, UsageError, WireError
 from macs_zenoh.messages import (
     BROADCAST,
+    EXTENSIONS,
     ROS,
     Metadata,
     NodeRefused,
@@ -94,6 +95,7 @@ class Headset:
         handshake_s: float = HANDSHAKE_S,
         heartbeat_s: float = HEARTBEAT_S,
         max_message_bytes: int = MAX_FRAME_BYTES,
+        extensions: int = EXTENSIONS,
         on_link: Callable[[Link], object] | None = None,
     ) -> None:
         self.host = host
@@ -105,6 +107,7 @@ class Headset:
         self._handshake_s = handshake_s
         self._heartbeat_s = heartbeat_s
         self._max_message_bytes = max_message_bytes
+        self._extensions = extensions
         self._on_link = on_link
         self._nodes: dict[tuple[int, str], Node] = {}
         self._inbox: Mailbox[Incoming] = Mailbox(INBOX_MESSAGES)
@@ -130,12 +133,15 @@ class Headset:
         handshake_s: float = HANDSHAKE_S,
         heartbeat_s: float = HEARTBEAT_S,
         max_message_bytes: int = MAX_FRAME_BYTES,
+        extensions: int = EXTENSIONS,
         on_link: Callable[[Link], object] | None = None,
     ) -> Headset:
         """Connect, wait for the router's first message and answer it.
 
         ``group`` 0 is none. With ``reconnect`` a lost connection is made again and again until `close`, and every
-        node is registered anew; the first connection is tried once. ``on_link`` hears every start and end.
+        node is registered anew; the first connection is tried once. ``extensions`` is the version of our extensions
+        of the protocol that it says it understands; with 0 it is an existing program to its gateway. ``on_link`` hears
+        every start and end.
 
         Raises Unreachable when there is no connection, or no id as its first message within ``handshake_s``.
         """
@@ -147,6 +153,7 @@ class Headset:
             handshake_s=handshake_s,
             heartbeat_s=heartbeat_s,
             max_message_bytes=max_message_bytes,
+            extensions=extensions,
             on_link=on_link,
         )
         await headset._join()
@@ -368,7 +375,7 @@ class Headset:
     async def set_group(self, group: int) -> None:
         """Move to another group: a second configuration reply on the same connection."""
         self.group = group
-        await self.tell(lambda own_id: frames.configuration(own_id, group, self._welcome_request))
+        await self.tell(self._configuration)
 
     # --- what a headset hears ---
 
@@ -453,7 +460,7 @@ class Headset:
             first = await asyncio.wait_for(connection.receive(), self._handshake_s)
             metadata, data = split_message(first)
             self._take_id(Metadata.decode(metadata), bytes(data))
-            await connection.send(frames.configuration(self.id, self.group, self._welcome_request))
+            await connection.send(self._configuration(self.id))
         except asyncio.TimeoutError as error:
             connection.abort()
             raise Unreachable(self.target, f"it sent no id within {self._handshake_s:g} s") from error
@@ -472,6 +479,9 @@ class Headset:
             raise WireError(f"it is {metadata.message_manager or metadata.node_name!r}, not {Welcome.manager!r}")
         self.id = decode_data(Welcome, data).agent_id
         self._welcome_request = metadata.request_id
+
+    def _configuration(self, own_id: int) -> bytes:
+        return frames.configuration(own_id, self.group, self._welcome_request, self._extensions)
 
     async def _live(self) -> None:
         """Read until the end; with ``reconnect`` join again and register everything."""
@@ -535,7 +545,7 @@ class Headset:
             mailbox = self._take_node_message(message)
         elif metadata.message_manager == Welcome.manager:
             self._take_id(metadata, message.data)
-            await self.send_frame(frames.configuration(self.id, self.group, self._welcome_request))
+            await self.send_frame(self._configuration(self.id))
             return
         elif not metadata.message_manager and self._take_answer(message):
             return

@@ -53,17 +53,19 @@ class NodeSpec:
         object.__setattr__(self, "name", node_name(self.tos_name))
 
 
-def configuration(agent_id: int, group: int, request_id: int) -> bytes:
-    """The answer to the router's first message: who I am. ``request_id`` is that message's."""
-    return _management_frame(
-        {
-            "agentType": UNITY,
-            "agentId": agent_id,
-            "groupId": group,
-            "requestId": request_id,
-            "messageManager": Configuration.manager,
-        }
-    )
+def configuration(agent_id: int, group: int, request_id: int, extensions: int = 0) -> bytes:
+    """The answer to the router's first message: who I am. ``request_id`` is that message's.
+
+    ``extensions`` is what the C# program does not say: the version of our extensions that this headset understands.
+    """
+    management: dict[str, object] = {
+        "agentType": UNITY,
+        "agentId": agent_id,
+        "groupId": group,
+        "requestId": request_id,
+        "messageManager": Configuration.manager,
+    }
+    return _management_frame({**management, "extensions": extensions} if extensions else management)
 
 
 def heartbeat() -> bytes:

@@ -13,7 +13,7 @@ from scripted_router import WELCOME, ScriptedRouter, recorded, welcome
 from bridge.headset.client import Headset, Link
 from bridge.headset.nodes import ServiceRequest
 from macs_zenoh.errors import CallTimeout, TooManyDestinations, Unreachable, UsageError
-from macs_zenoh.messages import Metadata, NodeType, node_name
+from macs_zenoh.messages import EXTENSIONS, Metadata, NodeType, node_name
 from macs_zenoh.wire import Frame, encode_message, parse_frame
 
 STRING = "std_msgs/String"
@@ -28,7 +28,7 @@ async def router() -> AsyncIterator[ScriptedRouter]:
 
 @pytest.fixture
 async def headset(router: ScriptedRouter) -> AsyncIterator[Headset]:
-    async with await Headset.connect("127.0.0.1", router.port) as headset:
+    async with await Headset.connect("127.0.0.1", router.port, extensions=0) as headset:  # as in the recordings
         await router.until(lambda: bool(router.frames))
         yield headset
 
@@ -50,10 +50,19 @@ def plain_message(data: bytes, *, sender: int | None = 3, sender_type: int | Non
 @pytest.mark.parametrize("group", [0, 3])
 async def test_the_handshake_is_the_recorded_one(router: ScriptedRouter, group: int) -> None:
     """The headset takes the id it is given and answers with its group, as recorded."""
-    async with await Headset.connect("127.0.0.1", router.port, group=group) as headset:
+    async with await Headset.connect("127.0.0.1", router.port, group=group, extensions=0) as headset:
         await router.until(lambda: bool(router.frames))
         assert headset.id == 7
         assert router.frames == recorded(f"handshake_group{group}", "agent->router")
+
+
+async def test_it_says_that_it_is_newer(router: ScriptedRouter) -> None:
+    """Unless told otherwise the headset says which extensions it understands, and again with every other group."""
+    async with await Headset.connect("127.0.0.1", router.port) as headset:
+        await headset.set_group(3)
+        await router.until(lambda: len(router.frames) == 2)
+        said = [json.loads(parse_frame(frame).management) for frame in router.frames]
+        assert [(frame["groupId"], frame["extensions"]) for frame in said] == [(0, EXTENSIONS), (3, EXTENSIONS)]
 
 
 async def test_going_offline_is_the_recorded_frame(router: ScriptedRouter, headset: Headset) -> None:

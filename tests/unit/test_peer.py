@@ -350,7 +350,36 @@ def test_a_robot_tells_what_it_offers() -> None:
     """The functionality in a robot's configuration is part of its joining."""
     offers = Functionality(publishers={"/cmd_vel": "geometry_msgs/msg/Twist"})
     raw = encode_management(Configuration(ROS, 7, 0, 42, offers))
-    assert Peer(7, 42, 0.0).receive(encode_frame(management=raw), 1.0) == [Joined(ROS, 0, offers)]
+    peer = Peer(7, 42, 0.0)
+    assert peer.receive(encode_frame(management=raw), 1.0) == [Joined(ROS, 0, offers)]
+    assert peer.functionality == offers
+
+
+def test_a_later_configuration_may_change_what_a_robot_offers() -> None:
+    """What a robot says last is kept, also when nothing else has changed; saying nothing takes nothing back."""
+    peer = online(ROS)
+    offers = Functionality(services={"/set": "std_srvs/srv/SetBool"})
+    for functionality in (offers, None):
+        raw = encode_management(Configuration(ROS, 7, 0, 42, functionality))
+        assert peer.receive(encode_frame(management=raw), 1.0) == []
+        assert peer.functionality == offers
+
+
+def test_who_does_not_say_that_it_is_newer_is_an_existing_program() -> None:
+    """An agent understands the extensions that its last configuration names, and none without a word of them."""
+    peer = online()
+    assert peer.extensions == 0
+    peer.receive(encode_frame(management=encode_management(Configuration(UNITY, 7, extensions=1))), 1.0)
+    assert peer.extensions == 1
+    peer.receive(configuration(), 2.0)
+    assert peer.extensions == 0
+
+
+@pytest.mark.parametrize("extensions", ["-1", "65536", "1.5", '"1"', "null", "[]", "true"])
+def test_a_version_that_is_none_is_refused(extensions: str) -> None:
+    """Extensions are a number from 0 to 65535; anything else costs the configuration."""
+    raw = b'{"messageManager":"AgentclientConfigurer","agentType":2,"agentId":7,"extensions":%s}' % extensions.encode()
+    assert errors(Peer(7, 42, 0.0).receive(encode_frame(management=raw), 1.0)) == [BadField]
 
 
 # -- leaving ---------------------------------------------------------------------------------------------------------
