@@ -16,7 +16,7 @@ class InterfacesMissing(MacsError, ImportError):
     def __init__(self, problem: str) -> None:
         super().__init__(
             f"the ROS package as2_ca_msgs is not installed ({problem}); with ROS from pip: "
-            "macs interfaces build interfaces/as2_ca_msgs --install, else build that folder with colcon"
+            "macs interfaces build as2_ca_msgs --install, else build the folder interfaces/as2_ca_msgs with colcon"
         )
 
 

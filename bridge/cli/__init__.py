@@ -20,6 +20,7 @@ from bridge.cli import (
     doctor,
     gateway,
     headset,
+    init,
     interfaces,
     keys,
     ls,
@@ -44,6 +45,7 @@ VERBS = {
     "stop": stop,
     "doctor": doctor,
     "security": security,
+    "init": init,
     "keys": keys,
     "interfaces": interfaces,
 }

@@ -5,7 +5,7 @@ result is a wheel for this Python. It needs g++ and Python's headers, and nothin
 With a ROS installation, build the same folder with colcon instead.
 
 examples:
-  macs interfaces build interfaces/as2_ca_msgs --install
+  macs interfaces build as2_ca_msgs --install                 one that comes with macs, by its name
   macs interfaces build my_msgs --into dist && pip install --no-deps dist/my_msgs-*.whl
   macs interfaces build my_msgs --json | jq .hashes"""
 
@@ -24,16 +24,18 @@ SUMMARY = "build ROS interface packages where ROS comes from pip"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=["build"], help="what to do")
-    parser.add_argument("path", metavar="PATH", type=Path, help="the package's folder")
+    parser.add_argument("path", metavar="PATH", type=Path, help="the package's folder, or the name of a shipped one")
     parser.add_argument("--into", metavar="DIR", type=Path, default=Path("dist"), help="for the wheel (default: dist)")
     parser.add_argument("--install", action="store_true", help="install the wheel into this Python as well")
     parser.add_argument("--json", action="store_true", help="for programs: wheel and type hashes")
 
 
 def run(args: argparse.Namespace) -> int:
+    from bridge import shipped
     from bridge.interfaces import build
 
-    built = build(args.path, args.into)
+    ours = str(args.path) in shipped.interface_packages() and not args.path.exists()
+    built = build(shipped.interface_package(str(args.path)) if ours else args.path, args.into)
     if args.install:
         _install(built.wheel)
     if args.json:
