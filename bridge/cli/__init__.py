@@ -66,21 +66,32 @@ examples:
 `macs VERB --help` explains one verb."""
 
 
+NEVER_MEANT = frozenset({"stop"})
+"""Verbs that are not offered for a misspelled one: who types what was offered without thinking stops every robot."""
+
+
 class Parser(argparse.ArgumentParser):
-    """Wrong words are told by the parser of the verb that they were said to, with what may have been meant."""
+    """Wrong words are told by the parser of the verb that they were said to, with what may have been meant. Options
+    are never guessed from their first letters: ``--worker`` is not ``--workers``."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **{"allow_abbrev": False, **kwargs})
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         """As argparse's, but whatever is left over is an error here and not in the parser above."""
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             option = unknown[0].partition("=")[0]
-            known = self._option_string_actions if option.startswith("-") else ()
+            shown = (action for action in self._actions if action.help != argparse.SUPPRESS)
+            known = [name for action in shown for name in action.option_strings] if option.startswith("-") else []
             self.error(f"unrecognized arguments: {' '.join(unknown)}{_meant(option, known)}")
         return found, unknown
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        if action.choices is not None and value not in action.choices and (meant := _meant(value, action.choices)):
-            raise argparse.ArgumentError(action, f"invalid choice: {value!r}{meant}")
+        if action.choices is not None and value not in action.choices:
+            meant = _meant(value, [choice for choice in action.choices if choice not in NEVER_MEANT])
+            if meant:
+                raise argparse.ArgumentError(action, f"invalid choice: {value!r}{meant}")
         super()._check_value(action, value)
 
 
@@ -135,6 +146,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_help(sys.stderr)
         parser.exit(2, "\nmacs: no verb was given\n")
     args = parser.parse_args(words)
+    args.words = list(words)
     options.start_logging(args)
     try:
         code: int = args.run(args)

@@ -14,7 +14,7 @@ import argparse
 import asyncio
 import resource
 import socket
-import sys
+from collections.abc import Sequence
 from contextlib import suppress
 
 from bridge.cli import options, running
@@ -23,6 +23,9 @@ from macs_zenoh.config import GatewaySettings, Settings, changed
 from macs_zenoh.errors import UsageError
 
 SUMMARY = "where headsets connect over TCP"
+
+WORKER_ON = "--be-worker-on-port"
+"""Said to a worker by who starts it, before the words that were said to that one: a worker never starts others."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--workers", type=int, default=1, metavar="N", help="processes that share the port (default: 1)"
     )
-    parser.add_argument("--reuse-port", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument(WORKER_ON, type=int, metavar="PORT", help=argparse.SUPPRESS)
     options.add_mesh_options(parser)
 
 
@@ -44,26 +47,27 @@ def run(args: argparse.Namespace) -> int:
     listen_on = changed(
         settings.gateway,
         host=args.host,
-        port=args.port,
+        port=args.port if args.be_worker_on_port is None else args.be_worker_on_port,
         allow=args.allow,
         block=args.block,
-        reuse_port=args.reuse_port or None,
+        reuse_port=None if args.be_worker_on_port is None else True,
     )
     if args.workers < 1:
         raise UsageError(f"--workers is {args.workers}, at least 1 is needed")
-    if args.workers > 1:
+    if args.workers > 1 and args.be_worker_on_port is None:
         if listen_on.block is not None:
             raise UsageError("--block and --workers exclude each other: every worker leases a block of its own")
-        return running.until_stopped(lambda: _supervise(args.workers, listen_on))
+        return running.until_stopped(lambda: _supervise(args.workers, listen_on, args.words))
     return running.until_stopped(lambda: _serve(changed(settings, gateway=listen_on)))
 
 
-async def _supervise(workers: int, settings: GatewaySettings) -> int:
-    """Run several gateways on one port, each with ids of its own; one that ends is started again."""
+async def _supervise(workers: int, settings: GatewaySettings, words: Sequence[str]) -> int:
+    """Run several gateways on one port, each with ids of its own; one that ends is started again. ``words``: what was
+    said to this one, beginning with the verb."""
     with _reserve(settings) as reserved:
         port = str(reserved.getsockname()[1])
-        argv = [*_without_workers(sys.argv[1:]), "--reuse-port", "--port", port]
-        children = [Child(f"gw{number}", ["bridge", *argv]) for number in range(1, workers + 1)]
+        argv = ["bridge", words[0], WORKER_ON, port, *words[1:]]
+        children = [Child(f"gw{number}", argv) for number in range(1, workers + 1)]
         tasks = [asyncio.create_task(child.run()) for child in children]
         try:
             announcing = asyncio.create_task(_announce(children, f"gateway on {settings.host}:{port}"))
@@ -91,15 +95,6 @@ def _reserve(settings: GatewaySettings) -> socket.socket:
         reserved.close()
         raise UsageError(f"cannot listen on {settings.host}:{settings.port}: {error.strerror}") from error
     return reserved
-
-
-def _without_workers(argv: list[str]) -> list[str]:
-    """The command line as one worker needs it."""
-    kept = list(argv)
-    if "--workers" in kept:
-        at = kept.index("--workers")
-        del kept[at : at + 2]
-    return [word for word in kept if not word.startswith("--workers=")]
 
 
 def _raise_descriptor_limit() -> None:

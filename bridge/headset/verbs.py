@@ -19,6 +19,9 @@ _AGENT_TYPES = {"all": 0, "ros": 1, "unity": 2}
 class ScriptParser(argparse.ArgumentParser):
     """A parser for one line of a script: a wrong line is a UsageError, not the end of the process."""
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **{"allow_abbrev": False, **kwargs})
+
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{self.prog}: {message}")
 

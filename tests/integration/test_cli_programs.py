@@ -8,6 +8,8 @@ import os
 import signal
 import socket
 import sys
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -75,6 +77,28 @@ async def test_servers_stop_on_a_signal(endpoint: str, number: signal.Signals) -
     async with router, gateway:
         assert await asyncio.wait_for(router.stop(number), 2) == 0
         assert await asyncio.wait_for(gateway.stop(number), 2) == 0
+
+
+@pytest.mark.parametrize("workers", [["--workers", "2"], ["--workers=2"]], ids=" ".join)
+async def test_a_worker_starts_no_workers(endpoint: str, workers: list[str]) -> None:
+    """However it is spelled: as many processes as were asked for, and each serves the one port."""
+    async with (
+        Program("router", "-l", endpoint),
+        Program("gateway", *workers, "-v", "--port", "0", "-e", endpoint) as gateway,
+    ):
+        assert {len(children_of(pid)) for pid in children_of(gateway.pid)} == {0}
+        assert len(children_of(gateway.pid)) == 2
+        async with await Headset.connect("127.0.0.1", gateway.port) as headset:
+            assert headset.id in (await headset.online()).unity_agent_ids
+
+
+def children_of(pid: int) -> list[int]:
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == pid:
+                found.append(int(stat.parent.name))
+    return found
 
 
 async def test_a_gateway_waits_for_its_router(endpoint: str) -> None:

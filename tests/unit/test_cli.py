@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import socket
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from bridge.cli import VERBS, build_parser, children, main, options, up
+from bridge.headset.verbs import script_parser
 from macs_zenoh.config import MeshSettings, Settings
 from macs_zenoh.errors import ConfigError
 from macs_zenoh.keyexpr import KEYS
@@ -103,6 +105,58 @@ def test_a_misspelled_word_is_told_by_its_verb(
     assert lines[0].startswith(f"usage: {verb.partition(' 127')[0]} ")
     assert lines[-1].startswith(f"{verb.partition(' 127')[0]}")
     assert lines[-1].endswith(meant)
+
+
+@pytest.mark.parametrize("word", ["top", "tops", "sop", "shop", "step", "stopp", "sto", "stp", "Stop"])
+def test_stop_is_never_offered_for_another_word(word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Who misspells a verb is never led to the one that stops every robot."""
+    with pytest.raises(SystemExit) as ended:
+        main([word])
+    assert ended.value.code == 2
+    assert "did you mean stop" not in capsys.readouterr().err
+
+
+def parsers_below(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                yield from parsers_below(below)
+
+
+@pytest.mark.parametrize("top", [build_parser, script_parser])
+def test_no_parser_guesses_options(top: Callable[[], argparse.ArgumentParser]) -> None:
+    """An option is what is spelled out, in each verb, each verb's verb and each line of a script."""
+    found = list(parsers_below(top()))
+    assert len(found) > 10
+    assert [parser.prog for parser in found if parser.allow_abbrev] == []
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["gateway", "--worker", "2"],
+        ["gateway", "--work=2"],
+        ["stop", "--rel", "--all"],
+        ["stop", "--gr", "3"],
+        ["agent", "--name", "here"],
+        ["headset", "127.0.0.1", "pub", "/t", "std_msgs/String", "{}", "--cou", "1"],
+    ],
+    ids=" ".join,
+)
+def test_the_beginning_of_an_option_is_no_option(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """What argparse would complete is refused."""
+    with pytest.raises(SystemExit) as ended:
+        main(argv)
+    assert ended.value.code == 2
+    assert "unrecognized arguments" in capsys.readouterr().err
+
+
+def test_what_is_internal_is_not_offered(capsys: pytest.CaptureFixture[str]) -> None:
+    """Options between our own programs are in no help and meant by nobody."""
+    with pytest.raises(SystemExit):
+        main(["gateway", "--be-worker-on-prt", "7000"])
+    assert "did you mean" not in capsys.readouterr().err
 
 
 def test_without_a_verb_there_is_help(capsys: pytest.CaptureFixture[str]) -> None:
@@ -270,8 +324,11 @@ def test_what_next_names_the_addresses_in_use() -> None:
     """The closing hints work as they are printed."""
     here = plan("--demo")
     hints = up.what_next(here)
-    assert f"macs ls -e tcp/127.0.0.1:{here.router_port}" in hints
+    assert f"macs ls -e tcp/127.0.0.1:{here.router_port} --namespace demo" in hints
     assert f"macs headset 127.0.0.1:{here.gateway.port} sub /pose" in hints
+    assert here.apart is not None
+    assert f"ROS_DOMAIN_ID={here.apart.domain} " in hints
+    here.apart.close()
 
 
 # -- children --------------------------------------------------------------------------------------------------------
