@@ -7,7 +7,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 
 from bridge.cli.running import READY, STOP_WITH_STDIN
@@ -47,9 +47,10 @@ def prefix(name: str) -> str:
 class Child:
     """One program: this Python again with another verb, kept alive until `stop`."""
 
-    def __init__(self, name: str, argv: Sequence[str]) -> None:
-        """``argv`` follows ``python -m``."""
+    def __init__(self, name: str, argv: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
+        """``argv`` follows ``python -m``. ``environment``: None is ours."""
         self.name = name
+        self.environment = environment
         self.argv = [sys.executable, "-m", *argv]
         self.ready = asyncio.Event()
         """Set by the line `READY`, and never cleared."""
@@ -95,6 +96,7 @@ class Child:
     async def _run_once(self) -> int:
         self.starts += 1
         # Its own session: Ctrl-C reaches only us, so that the router goes last. Its stdin ends when we do.
+        environment = os.environ if self.environment is None else self.environment
         self._process = process = await asyncio.create_subprocess_exec(
             *self.argv,
             stdin=asyncio.subprocess.PIPE,
@@ -102,7 +104,11 @@ class Child:
             stderr=asyncio.subprocess.STDOUT,
             start_new_session=True,
             limit=LONGEST_LINE,
-            env={**os.environ, STOP_WITH_STDIN: "1", "PYTHONUNBUFFERED": "1"},
+            env={
+                **environment,
+                STOP_WITH_STDIN: "1",
+                "PYTHONUNBUFFERED": "1",
+            },
         )
         assert process.stdout is not None
         async for line in process.stdout:

@@ -178,8 +178,7 @@ def robot() -> int:
 
     if os.environ.pop(STOP_WITH_STDIN, None):
         threading.Thread(target=_stop_at_end_of_stdin, daemon=True).start()
-    say_ready("demo robot")
-    return demo.main([])
+    return demo.main([], alone=True, on_ready=lambda: say_ready("demo robot"))
 
 
 def _stop_at_end_of_stdin() -> None:

@@ -4,8 +4,9 @@ Each is a program of its own, started again when it ends; their logs come with t
 front. Ctrl-C stops them all. Without rclpy the robot is left out.
 
 --demo adds a robot without hardware (a camera image, a pose, /cmd_vel) and a headset that
-shows what it receives and drives it. The demo has a ROS domain of its own, so that it never
-moves a real robot.
+shows what it receives and drives it. So that it never moves a real robot, the demo has a ROS
+domain of its own on this machine only, chosen free whatever ROS_DOMAIN_ID says, and a namespace
+of its own on the mesh; both are printed, and where a usual port is taken, the free one it took.
 
 examples:
   macs up --demo
@@ -25,6 +26,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from bridge.cli import children, options, running
+from bridge.cli.apart import Apart
 from bridge.cli.children import Child, stop_in_order
 from macs_zenoh.config import GatewaySettings, RobotSettings, Settings, changed
 from macs_zenoh.errors import MacsError, Unreachable, UsageError
@@ -34,7 +36,9 @@ log = logging.getLogger("macs.up")
 SUMMARY = "all of it on this machine: router, gateway, robot"
 
 DEFAULT_ROBOT = 1
-DEMO_DOMAIN = "42"
+ROUTER_PORT = 7447
+DEMO_BLOCK = 1
+"""Of ids for those who connect over TCP: none of them gets the demo robot's, should it be a robot, too."""
 READY_S = 20.0
 """How long the programs may take to be ready for a show that nobody watches (``--once``); others press Ctrl-C."""
 DRIVE = """'{"linear": {"x": 0.2}}' --rate 10"""
@@ -63,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--once", action="store_true", help="with --demo: end after the show, 0 if all of it worked")
     parser.add_argument("--host", help="where gateway and router listen (default: 127.0.0.1; 0.0.0.0: network)")
     parser.add_argument("--port", type=int, help="TCP port for headsets (default: 7000; 0: a free one)")
-    parser.add_argument("--router-port", type=int, default=7447, help="port of the router (default: 7447; 0: free)")
+    parser.add_argument("--router-port", type=int, help=f"port of the router (default: {ROUTER_PORT}; 0: free)")
     parser.add_argument("--id", type=int, help=f"id of the robot (default: {DEFAULT_ROBOT})")
     parser.add_argument("--group", type=int, help="group of the robot (default: none)")
     parser.add_argument(
@@ -77,7 +81,11 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--once belongs to --demo")
     options.prefix_logs(children.prefix("up"))
     plan = make_plan(args, options.settings_file(args))
-    return running.until_stopped(lambda: _up(plan), interrupted=running.INTERRUPTED if plan.once else 0)
+    try:
+        return running.until_stopped(lambda: _up(plan), interrupted=running.INTERRUPTED if plan.once else 0)
+    finally:
+        if plan.apart is not None:
+            plan.apart.close()
 
 
 @dataclass(frozen=True)
@@ -90,9 +98,15 @@ class Plan:
     """None: there is a router already."""
     routers: list[str]
     settings_files: list[str]
-    demo: bool
+    apart: Apart | None
+    """Where the demo is alone; None without it."""
     once: bool
     verbose: bool
+
+    @property
+    def demo(self) -> bool:
+        """Whether there is a demo robot, and a headset that drives it."""
+        return self.apart is not None
 
     def router_child(self) -> Child | None:
         """The router, on the same addresses as the gateway: nothing is open to the network unless asked for."""
@@ -102,60 +116,92 @@ class Plan:
         return self._child("router", ["-l", f"tcp/{host}:{self.router_port}"])
 
     def gateway_child(self) -> Child:
-        return self._child("gateway", [*self._mesh(), "--host", self.gateway.host, "--port", str(self.gateway.port)])
+        block = [] if self.gateway.block is None else ["--block", str(self.gateway.block)]
+        where = ["--host", self.gateway.host, "--port", str(self.gateway.port)]
+        return self._child("gateway", [*self._mesh(), *where, *block])
 
     def robot_children(self) -> list[Child]:
         robot = ["--id", str(self.robot.id), "--group", str(self.robot.group)]
         agent = self._child("agent", [*self._mesh(), *robot])
-        return [Child("demo", ["bridge.cli.demo"]), agent] if self.demo else [agent]
+        return [Child("demo", ["bridge.cli.demo"], self._environment()), agent] if self.demo else [agent]
 
     def _mesh(self) -> list[str]:
-        return [word for router in self.routers for word in ("-e", router)]
+        namespace = [] if self.apart is None else ["--namespace", self.apart.namespace]
+        return [*(word for router in self.routers for word in ("-e", router)), *namespace]
 
     def _child(self, verb: str, argv: list[str]) -> Child:
         common = [word for file in self.settings_files for word in ("--settings", file)]
-        return Child(verb, ["bridge", verb, *common, *(["-v"] if self.verbose else []), *argv])
+        argv = ["bridge", verb, *common, *(["-v"] if self.verbose else []), *argv]
+        return Child(verb, argv, self._environment())
+
+    def _environment(self) -> dict[str, str] | None:
+        return None if self.apart is None else self.apart.environment(os.environ)
 
 
 def make_plan(args: argparse.Namespace, settings: Settings) -> Plan:
-    """Settle every choice. Raises ConfigError for what is out of range, PortTaken."""
+    """Settle every choice. Raises ConfigError for what is out of range, PortTaken, Unreachable."""
     gateway = changed(settings.gateway, host=args.host, port=args.port)
-    gateway = changed(gateway, port=_port(gateway.host, gateway.port, "choose another one with --port"))
     routers = args.connect or settings.mesh.connect
-    router_port = None
-    if not routers:
-        advice = "join the router there with -e tcp/127.0.0.1:{0}, or choose another port with --router-port"
-        router_port = _port(gateway.host, args.router_port, advice.format(args.router_port))
-        routers = [f"tcp/127.0.0.1:{router_port}"]
+    robot = changed(settings.robot, id=args.id or settings.robot.id or DEFAULT_ROBOT, group=args.group)
+    apart = None
+    if args.demo:
+        apart = Apart.of(settings.mesh, own_router=not routers)
+        if gateway.block is None and not gateway.blocks:
+            gateway = changed(gateway, block=DEMO_BLOCK)
+    try:
+        chosen = gateway.port != GatewaySettings().port
+        port = _port(gateway.host, gateway.port, "choose another one with --port", apart, chosen=chosen)
+        router_port = None if routers else _router_port(gateway.host, args.router_port, apart)
+    except BaseException:
+        if apart is not None:
+            apart.close()
+        raise
     return Plan(
-        gateway=gateway,
-        robot=changed(settings.robot, id=args.id or settings.robot.id or DEFAULT_ROBOT, group=args.group),
+        gateway=changed(gateway, port=port),
+        robot=robot,
         router_port=router_port,
-        routers=routers,
+        routers=routers or [f"tcp/127.0.0.1:{router_port}"],
         settings_files=args.settings or [],
-        demo=args.demo,
+        apart=apart,
         once=args.once,
         verbose=args.verbose,
     )
 
 
-def _port(host: str, port: int, advice: str) -> int:
+def _router_port(host: str, wanted: int | None, apart: Apart | None) -> int:
+    port = ROUTER_PORT if wanted is None else wanted
+    advice = f"join the router there with -e tcp/127.0.0.1:{port}, or choose another port with --router-port"
+    return _port(host, port, advice, apart, chosen=wanted is not None)
+
+
+def _port(host: str, port: int, advice: str, apart: Apart | None, *, chosen: bool) -> int:
+    """The port, if it can be listened on; a free one for 0, or for a demo whose port nobody chose. Raises
+    PortTaken."""
+    found = _free(host, port)
+    if found is not None and (apart is None or apart.take_port(found) or chosen):
+        return found
+    if apart is None or (chosen and port):
+        raise PortTaken(host, port, advice)
+    return _port(host, 0, advice, apart, chosen=False)
+
+
+def _free(host: str, port: int) -> int | None:
     """The port, if it can be listened on; a free one for 0."""
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))
-        except OSError as error:
-            raise PortTaken(host, port, advice) from error
+        except OSError:
+            return None
         number: int = probe.getsockname()[1]
         return number
 
 
 async def _up(plan: Plan) -> int:
-    if plan.demo:
-        # The scripted headset drives: in the default domain that could be somebody's real robot.
-        os.environ.setdefault("ROS_DOMAIN_ID", DEMO_DOMAIN)
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    if plan.apart is not None:
+        _say(
+            f"The demo is alone: ROS domain {plan.apart.domain}, on this machine only; mesh {plan.apart.namespace!r}."
+        )
     router, gateway, robot = plan.router_child(), plan.gateway_child(), _robot_if_possible(plan)
     needed = [router] if router else []
     others = [gateway, *robot]
@@ -215,7 +261,10 @@ def what_next(plan: Plan) -> str:
     """What to type now, and where to point a headset."""
     host = "127.0.0.1" if plan.gateway.host in EVERYWHERE else plan.gateway.host
     target = f"{host}:{plan.gateway.port}"
-    endpoint = "" if plan.routers == ["tcp/127.0.0.1:7447"] else "".join(f" -e {router}" for router in plan.routers)
+    local = plan.routers == [f"tcp/127.0.0.1:{ROUTER_PORT}"]
+    endpoint = "" if local else "".join(f" -e {router}" for router in plan.routers)
+    if plan.apart is not None:
+        endpoint += f" --namespace {plan.apart.namespace}"
     seen_from_outside = plan.gateway.host in EVERYWHERE
     topic = "/pose geometry_msgs/PoseStamped" if plan.demo else "/TOPIC pkg/Type"
     where = f"{_own_address()}:{plan.gateway.port}" if seen_from_outside else f"{target}, from this machine only"
@@ -229,8 +278,8 @@ def what_next(plan: Plan) -> str:
     ]
     if not seen_from_outside:
         lines.append("To let headsets and robots in from the network, start with --host 0.0.0.0.")
-    if plan.demo:
-        lines.append(f"Its ROS side: ROS_DOMAIN_ID={os.environ.get('ROS_DOMAIN_ID', DEMO_DOMAIN)} ros2 topic list")
+    if plan.apart is not None:
+        lines.append(f"Its ROS side: {plan.apart.shown} ros2 topic list")
     return "\n".join(lines)
 
 

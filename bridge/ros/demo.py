@@ -13,8 +13,9 @@ import logging
 import math
 import struct
 import sys
+import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -30,6 +31,9 @@ log = logging.getLogger("macs.demo")
 IMAGE_HZ = 10.0
 POSE_HZ = 20.0
 COMMAND_TIMEOUT_S = 0.5
+COMMANDS = "/cmd_vel"
+DISCOVERY_S = 1.0
+"""How long nodes of one domain take to find each other, at most; on one machine a third of that."""
 
 
 class Unicycle:
@@ -119,7 +123,7 @@ class DemoRobot:
         self._driven = False
         self._pose = node.create_publisher(PoseStamped, "/pose", 10)
         self._image = node.create_publisher(CompressedImage, "/camera/image/compressed", qos_profile_sensor_data)
-        node.create_subscription(Twist, "/cmd_vel", self._drive, 10)
+        node.create_subscription(Twist, COMMANDS, self._drive, 10)
         node.create_service(SetBool, "/set_lights", self._set_lights)
         node.create_timer(1 / POSE_HZ, self._publish_pose)
         node.create_timer(1 / IMAGE_HZ, self._publish_image)
@@ -179,14 +183,32 @@ def _spin(node: Any) -> None:
         # a callback that published in the moment in which a signal ended ROS
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the demo robot until SIGINT or SIGTERM. ``args`` may hold ROS arguments (``--ros-args ...``)."""
+def _others(node: Any) -> int:
+    """How many nodes beside ours take the commands that are meant for us, once they had time to be found."""
+    others, until = 0, time.monotonic() + DISCOVERY_S
+    while not others and time.monotonic() < until:
+        rclpy.spin_once(node, timeout_sec=0.1)
+        others = node.count_subscribers(COMMANDS) - 1
+    return others
+
+
+def main(
+    args: Sequence[str] | None = None, *, alone: bool = False, on_ready: Callable[[], None] = lambda: None
+) -> int:
+    """Run the demo robot until SIGINT or SIGTERM. ``args`` may hold ROS arguments (``--ros-args ...``).
+
+    ``alone``: for who will be driven without anybody looking: 1 when another node of this domain would drive, too.
+    """
     logging.basicConfig(format="%(asctime)s %(levelname).1s %(name)s: %(message)s", datefmt="%H:%M:%S")
     log.setLevel(logging.INFO)
     rclpy.init(args=list(args) if args is not None else sys.argv)
     node = rclpy.create_node("demo_robot")
     try:
         DemoRobot(node)
+        if alone and _others(node):
+            log.error("another node of this ROS domain takes %s: it would drive, too", COMMANDS)
+            return 1
+        on_ready()
         log.info("demo robot: picture on /camera/image/compressed, /pose; drive it on /cmd_vel; service /set_lights")
         with suppress(KeyboardInterrupt, ExternalShutdownException):
             _spin(node)
