@@ -9,8 +9,10 @@ Two parts of a mesh that could not see each other may have chosen the same; `Con
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Generic, NamedTuple, TypeVar
 
 from .keyexpr import BLOCK_SIZE, block_of
@@ -30,9 +32,9 @@ BLOCKS = 256
 """Blocks on one mesh: ids are 16 bits."""
 
 
-def free_block(taken: Collection[int]) -> int | None:
-    """The lowest block that nobody holds; None when all 256 are taken."""
-    return next((block for block in range(BLOCKS) if block not in taken), None)
+def free_blocks(taken: Collection[int], count: int = 1) -> list[int]:
+    """The lowest ``count`` blocks that nobody holds; fewer when there are not so many."""
+    return list(islice((block for block in range(BLOCKS) if block not in taken), count))
 
 
 def keeps(mine: str, claimants: Iterable[str]) -> bool:
@@ -40,10 +42,64 @@ def keeps(mine: str, claimants: Iterable[str]) -> bool:
     return all(mine <= other for other in claimants)
 
 
-def free_id_in(block: int, taken: Collection[int]) -> int | None:
-    """The lowest id of a block that is not taken; None when the block is full. Id 0 is no id."""
-    first = block * BLOCK_SIZE
-    return next((i for i in range(max(1, first), first + BLOCK_SIZE) if i not in taken), None)
+class FreeIds:
+    """The ids of our blocks that nobody of ours has: those never given out first, from the lowest, then the one that
+    is free for the longest. So what is still on its way to somebody who left finds nobody, rather than the next one.
+
+    To take one costs the same however many are given out.
+    """
+
+    LOOKS = 64
+    """How many ids that others had are looked at again when there are no more: the rest when the next is wanted."""
+
+    def __init__(self) -> None:
+        self._blocks: set[int] = set()
+        self._given: set[int] = set()
+        self._fresh: deque[int] = deque()
+        self._used: deque[int] = deque()
+        self._elsewhere: deque[int] = deque()
+
+    def __len__(self) -> int:
+        """How many there are, as far as is known: of those that others had when they were looked at, none."""
+        return len(self._fresh) + len(self._used)
+
+    def add_block(self, block: int) -> None:
+        """A block is ours: its ids may be given out. Id 0 is no id. Twice changes nothing."""
+        if block not in self._blocks:
+            self._blocks.add(block)
+            first = block * BLOCK_SIZE
+            self._fresh += [i for i in range(max(1, first), first + BLOCK_SIZE) if i not in self._given]
+
+    def remove_block(self, block: int) -> None:
+        """A block is not ours any more."""
+        self._blocks.discard(block)
+        for ids in (self._fresh, self._used, self._elsewhere):
+            kept = [i for i in ids if block_of(i) != block]
+            ids.clear()
+            ids += kept
+
+    def take(self, is_elsewhere: Callable[[int], bool]) -> int | None:
+        """An id that neither we have given out nor others have, as ``is_elsewhere`` says; None when there is none."""
+        while ids := self._fresh or self._used:
+            agent_id = ids.popleft()
+            if not is_elsewhere(agent_id):
+                self._given.add(agent_id)
+                return agent_id
+            self._elsewhere.append(agent_id)
+        for _ in range(min(self.LOOKS, len(self._elsewhere))):
+            agent_id = self._elsewhere.popleft()
+            if not is_elsewhere(agent_id):
+                self._given.add(agent_id)
+                return agent_id
+            self._elsewhere.append(agent_id)
+        return None
+
+    def give_back(self, agent_id: int) -> None:
+        """Whoever had an id has it no more. One that was not given out, or is not of our blocks, is none of ours."""
+        if agent_id in self._given:
+            self._given.remove(agent_id)
+            if block_of(agent_id) in self._blocks:
+                self._used.append(agent_id)
 
 
 def free_id(taken: Collection[int], leased_blocks: Collection[int] = ()) -> int | None:

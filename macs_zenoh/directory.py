@@ -72,9 +72,11 @@ class Directory:
         """Ids of all agents of a type, ascending."""
         return sorted(self._ids.get(agent_type, ()))
 
-    def ids_elsewhere(self, zid: str) -> set[int]:
-        """Ids that an agent of any type has in another Zenoh session than this one."""
-        return {agent_id for (_, agent_id), claims in self._claims.items() if claims.keys() - {zid}}
+    def is_elsewhere(self, agent_id: int, zid: str) -> bool:
+        """Whether an agent of any type has this id in another Zenoh session than this one."""
+        return any(
+            agent_id in ids and not self._claims[kind, agent_id].keys() <= {zid} for kind, ids in self._ids.items()
+        )
 
     def of_type(self, agent_type: int) -> list[AgentInfo]:
         """All agents of a type, by id."""

@@ -26,9 +26,13 @@ class Pong(msgspec.Struct, frozen=True, kw_only=True):
     """Slots in its frame headers: the same on a whole mesh."""
     drops: dict[str, int] = {}
     """What its session lost since it started, by name."""
+    now: dict[str, int] = {}
+    """What is so at this moment and should not be, by name: ``waiting_for_id`` connections of a gateway."""
 
 
-def pong(settings: MeshSettings, *, now_s: float, macs: str, zenoh: str, drops: dict[str, int]) -> Pong:
+def pong(
+    settings: MeshSettings, *, now_s: float, macs: str, zenoh: str, drops: dict[str, int], now: dict[str, int]
+) -> Pong:
     """What a program with these settings says of itself."""
     return Pong(
         time_s=now_s,
@@ -40,6 +44,7 @@ def pong(settings: MeshSettings, *, now_s: float, macs: str, zenoh: str, drops: 
         id_slots=settings.id_slots,
         group_slots=settings.group_slots,
         drops=drops,
+        now=now,
     )
 
 

@@ -409,7 +409,13 @@ def _one_program(facts: Facts, program: Program, where: str) -> Iterator[Finding
     if pong.mode != "client":
         yield found("program_peer", where, mode=pong.mode)
     if pong.drops:
-        yield found("losses", where, drops=", ".join(f"{name} {count}" for name, count in sorted(pong.drops.items())))
+        yield found("losses", where, drops=_counts(pong.drops))
+    if pong.now:
+        yield found("in_trouble", where, now=_counts(pong.now))
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items()))
 
 
 def _clock_off(clock: Clock, where: str) -> Iterator[Finding]:

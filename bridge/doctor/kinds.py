@@ -282,6 +282,7 @@ KINDS: dict[str, Kind] = {
         "set id_slots and group_slots in [mesh] to the same everywhere",
     ),
     "losses": Kind("programs", NOTE, "it has lost messages since it started: {drops}", "its log says more"),
+    "in_trouble": Kind("programs", WARNING, "at this moment: {now}", "its log says more"),
     "program_shared_memory": Kind(
         "programs", WARNING, "implicit shared memory is on", "set shared_memory = false in its [mesh]"
     ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, KeysView
 
 from macs_zenoh.mesh import Token
 from macs_zenoh.messages import UNITY
@@ -22,7 +22,6 @@ class Agents:
         self._tokens: dict[Connection, Token] = {}
         self._groups: dict[Group, set[Connection]] = {}
         self._group_of: dict[Connection, Group] = {}
-        self._reserved: set[int] = set()
         self.former: dict[AgentKey, Connection] = {}
         """Who had an id until a moment ago: answers to it may be on their way."""
 
@@ -30,9 +29,9 @@ class Agents:
         return len(self._by_id)
 
     @property
-    def ids(self) -> set[int]:
-        """Ids given out, or about to be."""
-        return self._by_id.keys() | self._reserved
+    def ids(self) -> KeysView[int]:
+        """Ids that our connections have."""
+        return self._by_id.keys()
 
     def connections(self) -> list[Connection]:
         """All connections."""
@@ -58,14 +57,6 @@ class Agents:
             self._group_of[connection] = group
             self._groups.setdefault(group, set()).add(connection)
         return emptied if emptied not in self._groups else None
-
-    def reserve(self, agent_id: int) -> None:
-        """An id is about to be given out."""
-        self._reserved.add(agent_id)
-
-    def unreserve(self, agent_id: int) -> None:
-        """It was given out, or it will not be."""
-        self._reserved.discard(agent_id)
 
     def renumber(self, connection: Connection, agent_id: int) -> None:
         """An agent has another id from now on; its former one stays known until `forget_former`."""

@@ -110,6 +110,13 @@ class Connection(asyncio.BufferedProtocol):
         if not self.owner.opened(self):
             self._refused = True
             transport.abort()
+        elif not self.greeted:
+            self._loop.call_soon(self._still_paused)
+
+    def _still_paused(self) -> None:
+        """uvloop begins to read after `connection_made`, whatever was said in it; nothing has been read yet."""
+        if self._pauses and not self._transport.is_closing():
+            self._transport.pause_reading()
 
     def greet(self, peer: Peer) -> None:
         """The agent has an id: tell it, and begin to listen."""

@@ -1,4 +1,4 @@
-"""The blocks of agent ids that this gateway hands out: leased from the mesh one at a time, more when they run low.
+"""The blocks of agent ids that this gateway hands out: leased from the mesh, more of them before they run out.
 
 Two parts of a mesh that could not see each other may have leased the same block. When they meet, one of the gateways
 gives it up (`macs_zenoh.blocks.Contests`), unless it was configured.
@@ -9,10 +9,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 
 from macs_zenoh import blocks
-from macs_zenoh.blocks import Contests
+from macs_zenoh.blocks import Contests, FreeIds
 from macs_zenoh.errors import ConfigError, Unreachable
 from macs_zenoh.keyexpr import BLOCK_SIZE, LEASE
 from macs_zenoh.mesh import Mesh, Subscription, Token
@@ -22,8 +22,17 @@ log = logging.getLogger("macs.gateway")
 SETTLE_S = 0.3
 """How long a claimed block waits for somebody else's claim on it to show up."""
 
-LOW = 64
+LOW = 128
 """With fewer free ids than this, another block is leased ahead of need."""
+
+AT_ONCE = 16
+"""How many blocks are leased together when many wait for ids."""
+
+TRUTH_S = 2.0
+"""How long answers are not believed that leave out what we hold ourselves: a busy router may answer nothing."""
+
+AGAIN_S = 2.0
+"""Pause after an attempt in vain to lease a block."""
 
 
 class Leases:
@@ -49,15 +58,20 @@ class Leases:
         self._on_block = on_block
         self._on_ids = on_ids
         self._on_lost = on_lost
+        self._free = FreeIds()
+        self._wanting = 0
         self._tokens: dict[int, Token] = {}
+        self._claims: dict[int, Token] = {}
+        self.exhausted = False
+        """Whether the last attempt found that all blocks are leased."""
         self._holders: dict[int, set[str]] = {}
         self._contests: Contests[int] = Contests(mesh.zid, lambda block: block == wanted or block in only)
         self._watching: Subscription | None = None
         self._judging: asyncio.TimerHandle | None = None
         self._taking: asyncio.Task[None] | None = None
 
-    async def take(self) -> None:
-        """Lease one more block.
+    async def take(self, count: int = 1) -> None:
+        """Lease blocks: ``count``, or as many of them as can be had, at least one.
 
         Raises ConfigError when the configured one is another gateway's, Unreachable when all are leased.
         """
@@ -67,35 +81,51 @@ class Leases:
             held = await self._held()
             if self._watching is None:  # not before: while a watcher's first news are on their way, answers miss some
                 self._watching = self._mesh.watch_tokens(LEASE.every(), self._token)
-            block = wanted if wanted is not None else blocks.free_block(held.keys() | self._closed_to_us)
-            if block is None and self._closed_to_us and not self.blocks and time.monotonic() < patience_ends:
+            if wanted in held:
+                problem = f"block {wanted} is another gateway's; leave it out to take a free one"
+                raise ConfigError("gateway.block", problem)
+            chosen = [wanted] if wanted is not None else blocks.free_blocks(held.keys() | self._closed_to_us, count)
+            if not chosen and self._closed_to_us and not self.blocks and time.monotonic() < patience_ends:
                 await asyncio.sleep(SETTLE_S)  # the lease of an earlier life of this gateway is about to end
                 continue
-            if block is None:
+            if not chosen:
                 raise Unreachable("a free block of ids", "all that this gateway may have are leased")
-            if block in held:
-                problem = f"block {block} is another gateway's; leave it out to take a free one"
-                raise ConfigError("gateway.block", problem)
-            token = self._mesh.declare_token(LEASE.of(block=block, zid=self._mesh.zid))
+            if await self._claim(chosen):
+                return
+
+    async def _claim(self, chosen: Iterable[int]) -> bool:
+        """Lease these blocks, except those that somebody with an older right to them claims as well; whether we got
+        any."""
+        self._claims = {block: self._mesh.declare_token(LEASE.of(block=block, zid=self._mesh.zid)) for block in chosen}
+        try:
             await asyncio.sleep(SETTLE_S)
-            if blocks.keeps(self._mesh.zid, (await self._held()).get(block, [])):
-                self._tokens[block] = token
+            held = await self._held()
+            ours = [block for block in self._claims if blocks.keeps(self._mesh.zid, held.get(block, ()))]
+            for block in ours:
+                self._tokens[block] = self._claims.pop(block)
                 self.blocks.append(block)
+                self._free.add_block(block)
                 self._on_block(block)
                 log.info("giving out agent ids %d..%d", max(1, block * BLOCK_SIZE), (block + 1) * BLOCK_SIZE - 1)
-                self._look()
-                return
-            token.close()
+            self._look()
+            return bool(ours)
+        finally:
+            claims, self._claims = self._claims, {}
+            for token in claims.values():
+                token.close()
 
-    def free_id(self, taken: Collection[int]) -> int | None:
-        """The lowest free id of our blocks; leases ahead when few are left."""
-        room = len(self.blocks) * BLOCK_SIZE - sum(1 for agent_id in taken if agent_id // BLOCK_SIZE in self.blocks)
-        if room < LOW:
+    def take_id(self, is_elsewhere: Callable[[int], bool], wanting: int = 1) -> int | None:
+        """A free id of our blocks that nobody else has; None when there is none now. ``wanting`` is how many are
+        wanted in all: enough blocks are leased for them, ahead of need."""
+        agent_id = self._free.take(is_elsewhere)
+        self._wanting = wanting - (agent_id is not None)
+        if len(self._free) < self._wanting + LOW:
             self._start_taking()
-        for block in self.blocks:
-            if (agent_id := blocks.free_id_in(block, taken)) is not None:
-                return agent_id
-        return None
+        return agent_id
+
+    def give_back(self, agent_id: int) -> None:
+        """Nobody has this id any more."""
+        self._free.give_back(agent_id)
 
     def has_lease(self, zid: str) -> bool:
         """Whether a session is a gateway's."""
@@ -112,7 +142,7 @@ class Leases:
                 going_on.cancel()
         if self._watching is not None:
             self._watching.close()
-        for token in self._tokens.values():
+        for token in [*self._tokens.values(), *self._claims.values()]:
             token.close()
 
     # -- a block that others have as well ------------------------------------------------------------------------
@@ -134,6 +164,7 @@ class Leases:
             if give_way:
                 log.warning("block %d is also leased by %s, which keeps it", block, by)
                 self.blocks.remove(block)
+                self._free.remove_block(block)
                 self._tokens.pop(block).close()
                 self._on_lost(block)
             else:
@@ -150,19 +181,44 @@ class Leases:
         return self._taking
 
     async def _take_ahead(self) -> None:
+        missing = self._wanting + LOW - len(self._free)
         try:
-            await self.take()
+            await self.take(min(AT_ONCE, 1 + missing // BLOCK_SIZE))
+            self.exhausted = False
         except Unreachable as error:
-            log.warning("no more ids: %s", error)
-            await asyncio.sleep(10.0)
-        finally:
-            self._taking = None
+            if not self.exhausted:
+                log.warning("no more ids: %s", error)
+            self.exhausted = True
+        except Exception:  # whatever it was, who waits for an id must not wait for ever
+            log.exception("leasing a block of ids failed; trying again")
+        if self.exhausted:
+            self._on_ids()  # who waits can be told
+            await asyncio.sleep(AGAIN_S)
+        self._taking = None
         self._on_ids()
 
-    async def _held(self) -> dict[int, list[str]]:
-        """Every leased block and the Zenoh ids of its holders."""
-        held: dict[int, list[str]] = {}
-        for key in await self._mesh.tokens(LEASE.every()):
-            if lease := LEASE.parse(key):
-                held.setdefault(int(lease["block"]), []).append(str(lease["zid"]))
-        return held
+    async def _held(self) -> dict[int, set[str]]:
+        """Every leased block and the Zenoh ids of its holders: what routers answer, what we have been told, and what
+        we hold ourselves. An answer that leaves ours out is asked for again."""
+        deadline = time.monotonic() + TRUTH_S
+        ours = self._tokens.keys() | self._claims.keys()
+        while True:
+            held = {block: {self._mesh.zid} for block in ours}
+            told = {block: zids for block, zids in self._holders.items() if zids}
+            answered = _by_block(await self._mesh.tokens(LEASE.every()))
+            for known in (answered, told):
+                for block, zids in known.items():
+                    held.setdefault(block, set()).update(zids)
+            missing = [block for block in ours if self._mesh.zid not in answered.get(block, ())]
+            if not missing or time.monotonic() > deadline:
+                return held
+            log.debug("the routers' answer leaves out our own blocks %s: asking again", missing)
+            await asyncio.sleep(0.05)
+
+
+def _by_block(keys: Iterable[str]) -> dict[int, set[str]]:
+    holders: dict[int, set[str]] = {}
+    for lease in map(LEASE.parse, keys):
+        if lease is not None:
+            holders.setdefault(int(lease["block"]), set()).add(str(lease["zid"]))
+    return holders

@@ -171,17 +171,19 @@ class Renumbering:
         ids: list[int] = []
         try:
             while len(ids) < count:
-                agent_id = self._leases.free_id(self._agents.ids | self._presence.directory.ids_elsewhere(self._zid))
+                agent_id = self._leases.take_id(self._is_elsewhere, wanting=count - len(ids))
                 if agent_id is None:
                     await self._leases.more()
                 else:
-                    self._agents.reserve(agent_id)
                     ids.append(agent_id)
         except BaseException:
             for agent_id in ids:
-                self._agents.unreserve(agent_id)
+                self._leases.give_back(agent_id)
             raise
         return ids
+
+    def _is_elsewhere(self, agent_id: int) -> bool:
+        return self._presence.directory.is_elsewhere(agent_id, self._zid)
 
     async def _move(self, connection: Connection, new_id: int, slow: set[int], room: asyncio.Semaphore) -> None:
         async with room:
@@ -194,7 +196,8 @@ class Renumbering:
                 else:  # it has left meanwhile
                     self._robots.take_back(tasks)
             finally:
-                self._agents.unreserve(new_id)
+                if connection.agent_id != new_id:
+                    self._leases.give_back(new_id)
 
     async def _change(self, connection: Connection, new_id: int, told: list[Task], slow: set[int]) -> None:
         old = connection.key
@@ -205,7 +208,7 @@ class Renumbering:
         token = self._presence.declare(old[0], new_id, connection.peer.group)
         old_token = self._agents.replace_token(connection, token)
         log.info("%s has id %d now", before, new_id)
-        self._later(ANSWER_S, lambda: self._agents.forget_former(old, connection))
+        self._later(ANSWER_S, lambda: self._forget_former(old, connection))
         if old[0] == ROS:
             _drop_registrants(connection)
         else:
@@ -214,6 +217,10 @@ class Renumbering:
             await self._robots.rename(old, new_id, told, slow)
         self._own_keys.undeclare(old)
         old_token.close()
+
+    def _forget_former(self, old: AgentKey, connection: Connection) -> None:
+        self._agents.forget_former(old, connection)
+        self._leases.give_back(old[1])
 
     def _later(self, delay_s: float, then: Callable[[], None]) -> None:
         def run() -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections import Counter, deque
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -48,6 +48,7 @@ from .leases import Leases
 from .own_keys import OwnKeys
 from .renumbering import Renumbering
 from .robots import RobotCalls
+from .waiting import NAMED_S, WaitingRoom
 
 log = logging.getLogger("macs.gateway")
 
@@ -104,7 +105,7 @@ class Gateway:
         self._scratch = bytearray(FrameDecoder.SMALL_BYTES)  # sockets of one loop receive one after the other
         self._door = Door(settings.allow, settings.max_connections, settings.max_connections_per_address)
         self._numbers = 0
-        self._waiting: deque[Connection] = deque()  # connections for which there is no id yet
+        self._waiting = WaitingRoom(settings.handshake_s, self._no_id)
         self._routes: dict[Connection, dict[bytes, Route]] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._server: asyncio.Server | None = None
@@ -155,6 +156,7 @@ class Gateway:
         Raises ConfigError when the block is somebody else's, Unreachable when the port cannot be had.
         """
         self.mesh.keep_awake()
+        self.mesh.tells = self._now
         await self._presence.start()
         self.mesh.on_link(lambda up: self._robots.repeat_all() if up else None)
         await self._leases.take()
@@ -170,6 +172,10 @@ class Gateway:
         self.port = self._server.sockets[0].getsockname()[1]
         log.info("listening on %s:%d", host, self.port)
 
+    def _now(self) -> dict[str, int]:
+        """What `macs doctor` is told besides losses."""
+        return {"waiting_for_id": len(self._waiting)} if self._waiting.longest_s > NAMED_S else {}
+
     async def close(self) -> None:
         """Stop accepting, tell the mesh, send what waits for ``FLUSH_S`` at most, leave."""
         if self._server is not None:
@@ -177,6 +183,7 @@ class Gateway:
         self._renumbering.close()
         self._robots.close()
         connections = [*self.agents.connections(), *self._waiting]
+        self._waiting.close()
         if connections:
             for connection in connections:
                 connection.finish("the gateway stops")
@@ -207,17 +214,20 @@ class Gateway:
                 log.warning("%s is refused: %s (logged once, counted as %s)", connection.address, why, name)
             return False
         self._door.enter(connection.host)
-        self._waiting.append(connection)
+        self._waiting.enter(connection)
         self._greet_waiting()
         return True
 
     def _greet_waiting(self) -> None:
-        """Give waiting connections ids: the lowest of our blocks that no agent of any type has."""
+        """Give waiting connections ids of our blocks that no agent of any type has."""
         while self._waiting:
-            agent_id = self._leases.free_id(self.agents.ids | self.directory.ids_elsewhere(self.mesh.zid))
+            agent_id = self._leases.take_id(self._is_elsewhere, wanting=len(self._waiting))
             if agent_id is None:
+                if self._leases.exhausted:
+                    for connection in self._waiting:
+                        self._no_id(connection)
                 return
-            connection = self._waiting.popleft()
+            connection = self._waiting.next()
             self._numbers += 1
             peer = Peer(
                 agent_id,
@@ -232,6 +242,18 @@ class Gateway:
             self._routes[connection] = {}
             connection.greet(peer)
 
+    def _is_elsewhere(self, agent_id: int) -> bool:
+        return self.directory.is_elsewhere(agent_id, self.mesh.zid)
+
+    def _no_id(self, connection: Connection) -> None:
+        """There was no id for a connection in time. It cannot be told: agents give up when anything comes before their
+        id, and they are waiting for that."""
+        self._waiting.leave(connection)
+        self._drops["no_id"] += 1
+        if self._drops["no_id"] == 1:
+            log.warning("%s leaves: there is no id for it (logged once, counted as no_id)", connection.address)
+        connection.abort()
+
     def _block_leased(self, block: int) -> None:
         self._subscribe(UNICAST.every(type=UNITY, block=block), self._delivery.inbox)
 
@@ -245,12 +267,13 @@ class Gateway:
         """Forget a connection; its presence ends at once."""
         self._door.leave(connection.host)
         if not connection.greeted:
-            self._waiting.remove(connection)
+            self._waiting.leave(connection)
             return
         self._routes.pop(connection, None)
         self._drops += connection.all_drops()
         self._delivery.forget()
         was_online, empty_group = self.agents.leave(connection)
+        self._leases.give_back(connection.agent_id)
         self._group_emptied(empty_group)
         if was_online:
             self._own_keys.undeclare(connection.key)
@@ -258,6 +281,7 @@ class Gateway:
             log.debug("%s is offline", connection)
         if not self.agents:
             self._all_closed.set()
+        self._greet_waiting()
 
     def _group_emptied(self, group: Group | None) -> None:
         """Nobody of ours is in this group any more."""

@@ -77,6 +77,8 @@ class Mesh:
         self.put, self.put_unasked = outgoing.put, outgoing.put_unasked
         self.limited, self.prioritise, self.keep = outgoing.limited, outgoing.prioritise, outgoing.keep
         self.on_room = outgoing.on_room
+        self.tells: Callable[[], dict[str, int]] = dict
+        """What this program tells `macs doctor` of itself, by name: what is so now and should not be."""
         self._linked_with: set[str] = set()
         self._on_link: list[Callable[[bool], None]] = []
         self._on_router: list[Callable[[str], None]] = []
@@ -381,7 +383,8 @@ class Mesh:
         macs, wheel = installed("macs-zenoh"), installed("eclipse-zenoh")
 
         async def answer(key: str, payload: bytes) -> bytes:
-            said = ping.pong(self.settings, now_s=time.time(), macs=macs, zenoh=wheel, drops=dict(self.drops))
+            drops, now = dict(self.drops), self.tells()
+            said = ping.pong(self.settings, now_s=time.time(), macs=macs, zenoh=wheel, drops=drops, now=now)
             return ping.encode(said, payload)
 
         return self.serve(PING.of(zid=self.zid), answer)

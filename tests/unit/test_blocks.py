@@ -11,22 +11,21 @@ from macs_zenoh.blocks import (
     GATEWAY_PATIENCE_S,
     PATIENCE_S,
     Contests,
+    FreeIds,
     Verdict,
-    free_block,
+    free_blocks,
     free_id,
-    free_id_in,
     keeps,
 )
-from macs_zenoh.keyexpr import BLOCK_SIZE, block_of
+from macs_zenoh.keyexpr import block_of
 
 zids = st.text("0123456789abcdef", min_size=1, max_size=4)
 
 
-@given(st.sets(st.integers(0, BLOCKS - 1)))
+@given(st.sets(st.integers(0, BLOCKS - 1), max_size=BLOCKS - 1))
 def test_the_lowest_free_block_is_taken(taken: set[int]) -> None:
     """The block given is free and all below it are not."""
-    block = free_block(taken)
-    assert block is not None
+    (block,) = free_blocks(taken)
     assert block not in taken
     assert taken >= set(range(block))
 
@@ -34,25 +33,76 @@ def test_the_lowest_free_block_is_taken(taken: set[int]) -> None:
 def test_there_are_256_blocks() -> None:
     """When every block is leased there is none to give; one of them freed is given again."""
     everything = set(range(BLOCKS))
-    assert free_block(everything) is None
-    assert free_block(everything - {77}) == 77
-
-
-@given(st.integers(0, BLOCKS - 1), st.sets(st.integers(0, 0xFFFF)))
-def test_the_lowest_free_id_of_a_block_is_taken(block: int, taken: set[int]) -> None:
-    """The id given belongs to the block, is free, is not 0, and all below it in the block are taken."""
-    agent_id = free_id_in(block, taken)
-    assert agent_id is not None
-    assert agent_id > 0
-    assert block_of(agent_id) == block
-    assert agent_id not in taken
-    assert taken | {0} >= set(range(block * BLOCK_SIZE, agent_id))
+    assert free_blocks(everything) == []
+    assert free_blocks(everything - {77, 200, 250}, 2) == [77, 200]
 
 
 def test_a_block_has_256_ids_and_the_first_255() -> None:
     """Block 0 starts at id 1, every other block at its first id; a full block gives None."""
-    assert [free_id_in(0, range(1, n)) for n in (1, 2, 255, 256)] == [1, 2, 255, None]
-    assert [free_id_in(255, range(0xFF00, n)) for n in (0xFF00, 0xFFFF, 0x10000)] == [0xFF00, 0xFFFF, None]
+    for block, first, count in ((0, 1, 255), (1, 256, 256), (255, 0xFF00, 256)):
+        ids = FreeIds()
+        ids.add_block(block)
+        assert len(ids) == count
+        assert [ids.take(nobody) for _ in range(count)] == list(range(first, first + count))
+        assert ids.take(nobody) is None
+
+
+def nobody(agent_id: int) -> bool:
+    """Nobody else has an id."""
+    return False
+
+
+def test_an_id_is_used_again_last() -> None:
+    """Ids that nobody had come first, then the one that is free for the longest."""
+    ids = FreeIds()
+    ids.add_block(0)
+    assert [ids.take(nobody) for _ in range(3)] == [1, 2, 3]
+    ids.give_back(2)
+    ids.give_back(1)
+    assert [ids.take(nobody) for _ in range(252)] == list(range(4, 256))
+    assert [ids.take(nobody) for _ in range(3)] == [2, 1, None]
+
+
+def test_an_id_that_another_has_is_given_when_it_is_free() -> None:
+    """What somebody else has is passed over, and looked at again when there is nothing else."""
+    ids = FreeIds()
+    ids.add_block(0)
+    others = set(range(2, 256))
+    assert ids.take(others.__contains__) == 1
+    assert ids.take(others.__contains__) is None
+    others.remove(200)
+    looks = -(-len(others) // FreeIds.LOOKS)
+    assert 200 in [ids.take(others.__contains__) for _ in range(looks)]
+
+
+steps = st.lists(
+    st.tuples(st.sampled_from(["add", "remove"]), st.integers(0, 3))
+    | st.tuples(st.sampled_from(["take", "give"]), st.integers(0, 0x4FF)),
+    max_size=60,
+)
+
+
+@given(steps, st.sets(st.integers(0, 0x3FF)))
+def test_ids_are_given_once(story: list[tuple[str, int]], others: set[int]) -> None:
+    """Whatever happens, an id given belongs to a block of ours, is not 0, and neither ours nor others' already."""
+    ids = FreeIds()
+    blocks: set[int] = set()
+    given_out: set[int] = set()
+    for what, value in story:
+        if what == "add":
+            ids.add_block(value)
+            blocks.add(value)
+        elif what == "remove":
+            ids.remove_block(value)
+            blocks.discard(value)
+        elif what == "give":
+            ids.give_back(value)
+            given_out.discard(value)
+        elif (agent_id := ids.take(others.__contains__)) is not None:
+            assert agent_id > 0
+            assert block_of(agent_id) in blocks
+            assert agent_id not in given_out | others
+            given_out.add(agent_id)
 
 
 @given(st.sets(st.integers(1, 2000)), st.sets(st.integers(0, 7), max_size=8))

@@ -97,7 +97,11 @@ def test_what_is_told_adds_up(story_steps: list[tuple[str, AgentInfo | bool | fl
             of_type = [agent for agent in directory if agent.type == kind]
             assert directory.of_type(kind) == of_type
             assert directory.ids(kind) == [agent.id for agent in of_type]
-        assert directory.ids_elsewhere("nobody") == {agent.id for agent in directory}
+        claims = directory.claims()
+        for agent_id in range(1, 10):
+            for zid in ("a", "b", "nobody"):
+                others = [claim for claim in claims if claim.id == agent_id and claim.zid != zid]
+                assert directory.is_elsewhere(agent_id, zid) == bool(others)
         for agent in directory:
             assert agent.key in directory
             assert directory.get(*agent.key) == agent

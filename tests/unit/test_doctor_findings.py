@@ -321,6 +321,11 @@ def _(facts: Facts) -> None:
     _said(facts, drops={"backlog": 12})
 
 
+@makes("in_trouble", WARNING)
+def _(facts: Facts) -> None:
+    _said(facts, now={"waiting_for_id": 3})
+
+
 @makes("program_shared_memory", WARNING)
 def _(facts: Facts) -> None:
     _said(facts, shared_memory=True)

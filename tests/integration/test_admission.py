@@ -1,0 +1,137 @@
+"""A gateway never stops admitting, and says so where it cannot."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import struct
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from bridge.gateway import Gateway
+from bridge.gateway.leases import Leases
+from macs_zenoh import ping
+from macs_zenoh.keyexpr import LEASE, PING
+from macs_zenoh.mesh import Mesh
+from macs_zenoh.messages import ROS, UNITY, Configuration, Welcome, decode_data, encode_management
+from macs_zenoh.wire import MessageDecoder, encode_frame, split_message
+from tests.integration.conftest import StartGateway, until
+from tests.programs import Program, free_port
+
+
+class Plain:
+    """A TCP agent that takes its id and says who it is, no more."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._reader, self.writer = reader, writer
+        self.id = 0
+
+    async def join(self, agent_type: int) -> None:
+        """Wait for the greeting and answer it."""
+        decoder = MessageDecoder(1 << 20)
+        messages: list[bytes | bytearray | memoryview] = []
+        while not messages:
+            data = await self._reader.read(65536)
+            if not data:
+                raise ConnectionError
+            messages += decoder.feed(data)
+        self.id = decode_data(Welcome, bytes(split_message(messages[0])[1])).agent_id
+        configuration = Configuration(agent_type=agent_type, agent_id=self.id, group_id=0, request_id=1)
+        self.writer.write(encode_frame(management=encode_management(configuration)))
+
+
+@asynccontextmanager
+async def crowd(port: int, count: int, agent_type: int = UNITY) -> AsyncIterator[list[Plain]]:
+    """So many agents that connect at once, and have all joined."""
+    agents: list[Plain] = []
+
+    async def come() -> None:
+        agent = Plain(*await asyncio.open_connection("127.0.0.1", port))
+        agents.append(agent)
+        await agent.join(agent_type)
+
+    try:
+        await asyncio.wait_for(asyncio.gather(*(come() for _ in range(count))), 60)
+        yield agents
+    finally:
+        for agent in agents:
+            agent.writer.close()
+
+
+async def test_a_burst_is_admitted() -> None:
+    """With ten robots online 600 headsets that connect at once each get an id of their own, several times."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    async with (
+        Program("router", "-l", endpoint),
+        Program("gateway", "--port", "0", "-e", endpoint) as gateway,
+        crowd(gateway.port, 10, ROS) as robots,
+    ):
+        for _ in range(3):
+            async with crowd(gateway.port, 600) as headsets:
+                ids = [agent.id for agent in [*robots, *headsets]]
+                assert len(set(ids)) == 610
+
+
+async def test_an_empty_answer_is_not_believed(start_gateway: StartGateway, monkeypatch: pytest.MonkeyPatch) -> None:
+    """When routers answer that no block is leased, as they do under load, what the gateway holds stays its own, and
+    the next block is another one."""
+    gateway = await start_gateway()
+    tokens = Mesh.tokens
+    empty = 0
+
+    async def sometimes(mesh: Mesh, key: str, *, timeout_s: float = 2.0) -> list[str]:
+        nonlocal empty
+        empty += 1
+        return [] if key == LEASE.every() and empty % 3 else await tokens(mesh, key, timeout_s=timeout_s)
+
+    monkeypatch.setattr(Mesh, "tokens", sometimes)
+    async with crowd(gateway.port, 700) as agents:
+        assert len({agent.id for agent in agents}) == 700
+        assert sorted(gateway.blocks) == list(range(len(gateway.blocks)))
+
+
+async def test_who_waits_for_an_id_may_speak_and_leave(
+    start_gateway: StartGateway, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Connections that wait for an id may send what they like and leave: nothing fails; the next is served. Who waits
+    for long is named in the log and to the doctor."""
+    gateway = await start_gateway()
+    takes = asyncio.Event()
+    take_id = Leases.take_id
+    monkeypatch.setattr(Leases, "take_id", lambda *args, **named: take_id(*args, **named) if takes.is_set() else None)
+    early = encode_frame(management=encode_management(Configuration(agent_type=2, agent_id=0, group_id=0)))
+    stays = Plain(*await asyncio.open_connection("127.0.0.1", gateway.port))
+    stays.writer.write(early)
+    for linger in (struct.pack("ii", 0, 0), struct.pack("ii", 1, 0)):  # it ends politely, or not
+        _, writer = await asyncio.open_connection("127.0.0.1", gateway.port)
+        writer.write(early)
+        await asyncio.sleep(0.05)
+        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+        writer.close()
+    await until(lambda: "3 connections wait for an id" in caplog.text, 20)
+    answer, _ = ping.decode(await gateway.mesh.query(PING.of(zid=gateway.mesh.zid), b"", timeout_s=5))
+    assert answer.now == {"waiting_for_id": 3}
+    takes.set()
+    async with crowd(gateway.port, 1):
+        await asyncio.wait_for(stays.join(UNITY), 5)
+        await until(lambda: len(gateway.agents) == 2)
+    stays.writer.close()
+    assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
+
+
+async def test_when_there_are_no_ids_a_newcomer_is_closed(start_gateway: StartGateway) -> None:
+    """A gateway whose blocks are used up closes who comes, and counts it; when somebody leaves, the next is let in."""
+    gateway: Gateway = await start_gateway(blocks=[5], handshake_s=2.0)
+    async with crowd(gateway.port, 256) as agents:
+        assert {agent.id for agent in agents} == set(range(5 * 256, 6 * 256))
+        reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port)
+        assert await asyncio.wait_for(reader.read(), 10) == b""
+        writer.close()
+        assert gateway.drops["no_id"] == 1
+        agents[7].writer.close()
+        await until(lambda: len(gateway.agents) == 255)
+        async with crowd(gateway.port, 1) as late:
+            assert late[0].id == agents[7].id
