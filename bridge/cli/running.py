@@ -22,14 +22,18 @@ STOP_WITH_STDIN = "MACS_STOP_WITH_STDIN"
 LAST_WORDS_S = 1.0
 """How long tasks may take to end that were left behind: a program that is stopped is gone within 2 s."""
 
+STOPS = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU", "SIGPWR")
+"""Signals that end a program unless it takes them, and that it can take. One that ends by them must end as by Ctrl-C,
+else the last command to a robot stays. One that was ignored when the program started stays so: that is ``nohup``."""
+
 INTERRUPTED = 130
 """The exit code, as with any program that Ctrl-C ends, of one that was to find or do something: nobody must take it
 for a confirmation."""
 
 
 def until_stopped(work: Callable[[], Coroutine[Any, Any, int]], *, interrupted: int = 0) -> int:
-    """Run ``work`` to its end and return its exit code; SIGINT and SIGTERM cancel it. For who serves until it is
-    stopped that is a success; for others ``interrupted`` is the exit code then.
+    """Run ``work`` to its end and return its exit code; SIGINT and those of `STOPS` cancel it. For who serves until it
+    is stopped that is a success; for others ``interrupted`` is the exit code then.
 
     A second Ctrl-C ends the process at once, for whoever does not want to wait for a clean close.
     """
@@ -67,7 +71,10 @@ async def _stoppable(work: Callable[[], Coroutine[Any, Any, int]], interrupted: 
 
     loop.add_signal_handler(signal.SIGINT, interrupt)
     # Not twice as for Ctrl-C: under systemd a child of `macs up` gets one SIGTERM from each of the two.
-    loop.add_signal_handler(signal.SIGTERM, task.cancel)
+    for name in STOPS:
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            loop.add_signal_handler(number, task.cancel)
     if os.environ.pop(STOP_WITH_STDIN, None):
         loop.add_reader(sys.stdin.fileno(), _stop_at_end_of_stdin, loop, task)
     try:
