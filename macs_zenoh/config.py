@@ -351,6 +351,8 @@ class TopicRule(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Without a command for so long, `deadman_message` is published once."""
     deadman_message: dict[str, Any] | None = None
     """The fields that are not zero; published also when the commanding agent leaves, and at an emergency stop."""
+    allow_while_stopped: bool | None = None
+    """Commands, calls and goals pass although the emergency stop holds: for what moves nothing."""
 
     def _check(self) -> None:
         if self.deadman_s is not None and self.deadman_message is None:

@@ -108,8 +108,9 @@ class ActionNode(InterfaceNode):
                     self._cancel(goal)
 
     def emergency_stop(self, by: str) -> None:
-        for goal in self._goals.values():
-            self._cancel(goal)
+        if self.held:
+            for goal in self._goals.values():
+                self._cancel(goal)
 
     def status(self) -> dict[str, Any]:
         return {**super().status(), "goals": [_shown(goal) for goal in self._goals.values()]}
@@ -147,8 +148,8 @@ class ActionNode(InterfaceNode):
         problem = cdr_problem(body)
         if problem is not None:
             self._reject(goal, f"the goal is no {self.interface}: {problem}")
-        elif self.robot.stop.stopped:
-            self._reject(goal, f"the emergency stop by {self.robot.stop.by} holds")
+        elif self.held:
+            self._reject(goal, self._stopped())
         elif not self._room():
             self._reject(goal, f"{len(self._goals)} goals of {self.topic} are open")
         else:
@@ -234,6 +235,9 @@ class ActionNode(InterfaceNode):
         else:
             self.robot.session.submit(lambda: self._send_cancel(goal))
 
+    def _stopped(self) -> str:
+        return f"the emergency stop by {self.robot.stop.by} holds"
+
     def _reject(self, goal: Goal, reason: str) -> None:
         self._tell(goal, ActionVerb.ACCEPTED, 0, reason.encode())
 
@@ -277,6 +281,9 @@ class ActionNode(InterfaceNode):
 
     def _send_goal(self, goal: Goal, body: bytes) -> None:
         if self._client is None:
+            return
+        if self.held:  # pressed while the goal waited for the action
+            self._loop.call_soon_threadsafe(self._drop, goal, self._stopped())
             return
         message = deserialize_message(body, self._types.Goal)
         tell = self._loop.call_soon_threadsafe

@@ -140,6 +140,11 @@ class InterfaceNode(ABC):
             return str(node.resolve_service_name(name) if self.INTERFACE == "srv" else node.resolve_topic_name(name))
 
     @property
+    def held(self) -> bool:
+        """Whether the emergency stop keeps agents from acting through this node now."""
+        return self.robot.stop.stopped and not self.rule.allow_while_stopped
+
+    @property
     def in_use(self) -> bool:
         """Whether the node must stay: somebody is registered, or waits for something."""
         return bool(self.registrants)

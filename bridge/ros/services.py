@@ -139,6 +139,9 @@ class ClientNode(InterfaceNode):
             self.robot.session.node.destroy_client(client)
 
     def receive(self, message: Message) -> None:
+        if self.held:
+            self._fail(message, self._stopped())
+            return
         if len(self._calls) >= self.robot.rules.settings.max_calls:
             self._fail(message, CallFailed("refused", f"{len(self._calls)} calls of {self.topic} are open"))
             return
@@ -190,6 +193,9 @@ class ClientNode(InterfaceNode):
             pace.cancel()
             release()
 
+    def _stopped(self) -> CallFailed:
+        return CallFailed("refused", f"the emergency stop by {self.robot.stop.by} holds")
+
     def _fail(self, message: Message, error: CallFailed) -> None:
         about = f"{self.topic} from {message.sender_type}/{message.sender_id}"
         self.robot.drops.note(f"call_{error.failure.kind}", about, error.failure.reason)
@@ -205,6 +211,8 @@ class ClientNode(InterfaceNode):
     ) -> Any:
         if self._client is None:
             raise CallFailed("refused", f"{self.topic} is no longer registered")
+        if self.held:  # pressed while the call waited for the service, or for its turn
+            raise self._stopped()
         try:
             sent = self._client.call_async(deserialize_message(request, self._service.Request))
         except RuntimeError as error:

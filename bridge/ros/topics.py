@@ -348,7 +348,7 @@ class PublisherNode(InterfaceNode):
         problem = cdr_problem(message.data, self._least_bytes)
         if problem is not None:
             return "bad_cdr", f"refused {len(message.data)} bytes for {self.interface}: {problem}"
-        if self.robot.stop.stopped:
+        if self.held:
             return "stopped", "the emergency stop holds"
         if self.control is not None and not self.control.take(Registrant.of(message), time.monotonic()):
             return "not_in_control", f"{self.control.holder(time.monotonic())} has control"
