@@ -146,6 +146,8 @@ class Agent:
     def _send(
         self, to: int, ids: tuple[int, ...], groups: tuple[int, ...], data: bytes, metadata: Metadata | None
     ) -> None:
+        if isinstance(data, str):
+            raise UsageError("data is bytes, not text: send(text.encode(), ...)")
         stamped = self._stamp(metadata or Metadata())
         frame = encode_frame(to, ids, groups, message=encode_message(stamped.encode(), data), layout=self._layout)
         traffic = Traffic.COMMAND if stamped.node_type == NodeType.PUBLISHER else Traffic.CALL

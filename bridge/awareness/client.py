@@ -192,7 +192,10 @@ class GatewayClient:
         self._flush()
 
     def flush(self, timeout_s: float = 5.0) -> bool:
-        """Wait until the gateway has everything that was sent: for programs that end then. Whether it has."""
+        """Wait until the gateway has everything that was sent: for programs that end then. Whether it has.
+
+        Fast DDS, ROS's usual middleware, asks for acknowledgement every 3 s, so long it may take.
+        """
         deadline = time.monotonic() + timeout_s
         while True:
             self._flush()
@@ -216,7 +219,8 @@ class GatewayClient:
             return sorted(n for n, types in self._agents.items() if message_type is None or message_type in types)
 
     def on_undelivered(self, callback: OnUndelivered) -> None:
-        """Call ``callback(agent, message_type, why)`` for messages of this robot that were not delivered.
+        """Call ``callback(agent, message_type, why)`` for messages of this robot that were not delivered. Without any
+        such callback they are logged.
 
         ``why`` is a text as ``no such agent`` or ``not registered``.
         """
@@ -229,5 +233,7 @@ class GatewayClient:
 
     def _take_undelivered(self, message: Any) -> None:
         why = bytes(message.data).decode(errors="replace")
+        if not self._on_undelivered:
+            log.warning("%r to %r was not delivered: %s", message.type, message.agent, why)
         for callback in self._on_undelivered:
             callback(message.agent, message.type, why)

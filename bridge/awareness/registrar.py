@@ -20,6 +20,8 @@ LOOK_S = 0.2
 """How often registrations are looked after."""
 ANSWER_S = 2.0
 """A request without an answer for so long is made again: the gateway may have died over it."""
+ALONE_S = 3.0
+"""Without any gateway for so long, one is missed in the log, once."""
 GONE_S = 1.0
 """A topic without a publisher for so long: the gateway is another one, and knows nothing of us."""
 
@@ -54,6 +56,7 @@ class Registrar:
         self.group = ReentrantCallbackGroup()
         self._service_name = self.node.resolve_service_name(self.service)
         self._services = 0
+        self._alone_since: float | None = time.monotonic()
         self._client = self.node.create_client(RegisterModule, self.service, callback_group=self.group)
         self._timer = self.node.create_timer(LOOK_S, self._look, callback_group=self.group)
 
@@ -80,6 +83,7 @@ class Registrar:
         now = time.monotonic()
         ready = self._client.service_is_ready()
         self._notice_newcomer()
+        self._miss_gateway(ready, now)
         for entry in list(self.entries):
             if entry.asked is not None and now - entry.asked_at > ANSWER_S:
                 self._give_up(entry)
@@ -87,6 +91,17 @@ class Registrar:
                 continue
             if not entry.topic or entry.stale or self._is_gone(entry, now):
                 self._ask(entry)
+
+    def _miss_gateway(self, ready: bool, now: float) -> None:
+        if ready:
+            self._alone_since = None
+        elif self._alone_since is not None and now - self._alone_since > ALONE_S:
+            self._alone_since = None
+            log.warning(
+                "no gateway offers %s in ROS domain %d: does `macs awareness` run there, in this namespace?",
+                self._service_name,
+                self.node.context.get_domain_id(),
+            )
 
     def _notice_newcomer(self) -> None:
         """A gateway that was killed is seen by ROS for 20 s more; its successor beside it is seen at once."""

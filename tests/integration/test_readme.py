@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import re
 import signal
 import sys
 from pathlib import Path
+
+import pytest
 
 import macs_zenoh
 from tests.programs import ROOT, Program, free_port
@@ -43,7 +46,7 @@ async def test_the_example_runs(tmp_path: Path) -> None:
         Program("router", "-l", endpoint),
         macs_zenoh.join("unity", id=300, connect=[endpoint]) as headset,
     ):
-        process = await asyncio.create_subprocess_exec(sys.executable, str(program), stdout=asyncio.subprocess.PIPE)
+        process = await started(program)
         assert process.stdout is not None
         hello = await asyncio.wait_for(headset.receive(), 20)
         assert (hello.sender_type, hello.sender_id, hello.data) == ("ros", 7, b"robot 7 is here")
@@ -54,9 +57,46 @@ async def test_the_example_runs(tmp_path: Path) -> None:
             assert (await asyncio.wait_for(headset.receive(), 5)).data == b"got it"
             assert (await asyncio.wait_for(process.stdout.readline(), 5)).decode() == f"unity 300 b'{text}'\n"
 
-        process.send_signal(signal.SIGINT)
-        await asyncio.wait_for(process.wait(), 2)
+        assert await interrupted(process) == ""
         assert [agent.id for agent in headset.online()] == [300] or await left(headset)
+
+
+async def test_the_example_misses_its_router(tmp_path: Path) -> None:
+    """Without a router the example says so, waits, and ends on Ctrl-C without a traceback."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    program = tmp_path / "example.py"
+    program.write_text(the_example().replace(LOCAL_ROUTER, endpoint))
+    process = await started(program)
+    assert process.stderr is not None
+    said = (await asyncio.wait_for(process.stderr.readline(), 20)).decode()
+    assert said == f"no router at {endpoint} yet; waiting for it\n"
+    assert await interrupted(process) == ""
+
+
+async def test_text_is_no_data(router: str) -> None:
+    """Who sends a text is told to encode it."""
+    async with macs_zenoh.join("unity", id=300, connect=[router]) as agent:
+        with pytest.raises(macs_zenoh.MacsError, match=r"bytes, not text.*encode"):
+            agent.broadcast("hello")  # type: ignore[arg-type]
+
+
+async def started(program: Path) -> asyncio.subprocess.Process:
+    return await asyncio.create_subprocess_exec(
+        sys.executable,
+        str(program),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+
+
+async def interrupted(process: asyncio.subprocess.Process) -> str:
+    """What a program says on stderr when Ctrl-C ends it."""
+    process.send_signal(signal.SIGINT)
+    assert process.stderr is not None
+    errors = await asyncio.wait_for(process.stderr.read(), 10)
+    assert await asyncio.wait_for(process.wait(), 10) == 0
+    return errors.decode()
 
 
 async def left(headset: macs_zenoh.Agent) -> bool:

@@ -18,7 +18,7 @@ from std_msgs.msg import String
 
 from bridge.awareness.afferent import CONFIG_FILE, QUEUE, GatewayClientAfferent, Mode
 from bridge.awareness.client import GatewayClient, Module
-from bridge.awareness.node import SERVICE_QOS
+from bridge.awareness.node import SERVICE_QOS, UNDELIVERED_TOPIC
 from tests.programs import Program, free_port
 from tests.ros.ros_peer import Peer, get, until
 
@@ -128,6 +128,24 @@ async def test_messages_wait_for_a_gateway(client: GatewayClient, peer: Peer) ->
         out.get_nowait()
     client.send(String(data="x"), "t", to=["a", "b"])
     assert [(await get(out)).agent for _ in range(2)] == ["a", "b"]
+
+
+async def test_a_module_misses_its_gateway(
+    client: GatewayClient, domain: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A module without a gateway says so once, with the ROS domain in which it looks."""
+    await until(lambda: "no gateway offers" in caplog.text, 20)
+    (said,) = [record.getMessage() for record in caplog.records if "no gateway offers" in record.getMessage()]
+    assert f"/register_module in ROS domain {domain}" in said
+
+
+async def test_what_is_not_delivered_is_logged(
+    client: GatewayClient, peer: Peer, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Without a callback for it, a message that reached nobody is in the module's log."""
+    publisher = await peer.publisher(LocalGenericMessage, UNDELIVERED_TOPIC, matched=1)
+    await peer.session.run(lambda: publisher.publish(local("drone9", "chatter", b"no such agent")))
+    await until(lambda: "'chatter' to 'drone9' was not delivered: no such agent" in caplog.text)
 
 
 async def test_an_answer_that_never_comes_is_asked_for_again(
