@@ -1,0 +1,21 @@
+"""Attacks on a running site, with well-behaved neighbours beside them, and what must hold meanwhile.
+
+::
+
+    python -m tests.attack --list                         # every attack, one line each
+    python -m tests.attack empty_lists_as_management      # one of them
+    python -m tests.attack --section 3 --stops 100        # a section, with 100 stops pressed under each
+    python -m tests.attack                                # all of them, and a table
+
+It stays on loopback: attackers come from 127.0.0.2, everybody else from 127.0.0.1.
+
+* `scene`: two sites (router, gateway, robot agent with ROS), each as processes, and the good people of the first: a
+  pair of headsets that talk, a headset that drives the robot, an operator, and a ROS node that listens to the robot's
+  wheels. The same attack is first made on the second site, so that what the machine's cores are short of is measured
+  apart from what the attack costs its victims.
+* `inputs`, `floods`, `sessions`: the attacks, each a function in a table with who makes it and what it sends.
+* `attacker`: the process that makes one of them. `raw`: a TCP agent that keeps no rule.
+* `judge`: what must hold, as figures with limits. Pure.
+* `rights`: attacks that gain something instead of costing something, each with a site of its own.
+* `chaos`: everything is killed, stopped, cut and flooded for minutes, from a seed.
+"""

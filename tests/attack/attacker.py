@@ -1,0 +1,26 @@
+"""The process that makes one attack: ``python -m tests.attack.attacker NAME PORT ENDPOINT SECONDS``.
+
+It says ``begins`` on stdout when it has started and ``ended`` when it is over; whoever started it kills it if need be.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+
+from tests.attack import table
+
+
+def main(name: str, port: str, endpoint: str, seconds: str) -> int:
+    """Attack for so long."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
+    row = table.every()[name]
+    row.run(table.Target(int(port), endpoint, float(seconds), begins=lambda: print("begins", flush=True)))
+    print("ended", flush=True)
+    os._exit(0)  # threads that read for agents, sessions with queries open: nothing here is worth waiting for
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,530 @@
+"""Two sites as processes, and the well-behaved people of the first: what an attack must not cost anybody.
+
+Everybody here runs in the process of the test: 200 messages and 50 commands per second cost it little. Attackers have
+a process of their own. Times are of the monotonic clock, which all processes of a machine share.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import signal
+import struct
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # before rclpy starts: nothing leaves this machine
+os.environ.pop("ROS_STATIC_PEERS", None)
+
+from geometry_msgs.msg import Twist
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import serialize_message
+from std_msgs.msg import Bool
+
+from bridge.cli import robots
+from bridge.cli.robots import Caller, Operator, Status
+from bridge.headset.client import Headset
+from bridge.headset.nodes import Publisher
+from bridge.ros.session import RosSession
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.errors import MacsError
+from macs_zenoh.messages import OPERATOR
+from tests.attack.judge import Memory, Report, Window
+from tests.attack.table import Attack
+from tests.programs import ROOT, Program, free_port
+from tests.routers import Router
+
+MIB = 1 << 20
+ROBOT = 1
+DEADMAN_S = 0.3
+TALK_EVERY_S = 0.01
+DRIVE_EVERY_S = 0.02
+NO_EFFECT_S = 4.0
+"""A stop or a dead-man that has done nothing by then counts as none."""
+HOLDS_S = 0.1
+"""How long after each stop the driver is watched driving in vain."""
+RECOVERY_S = 15.0
+"""By when everything must be as before."""
+BEGIN_S = 30.0
+
+MEMORY_LIMITS = {"gateway": 128 * MIB, "robot": 128 * MIB, "router": 256 * MIB}
+"""What one attacker may cost a program. The router is Zenoh's, and its queues are per link."""
+KEPT_BYTES = 48 * MIB
+"""What may be left of it afterwards: allocators give back late."""
+
+SETTINGS = f"""
+[[robot.rules]]
+match = "/cmd_vel"
+exclusive = true
+deadman_s = {DEADMAN_S}
+deadman_message = {{ linear = {{ z = -1 }} }}
+"""
+
+
+# -- programs --------------------------------------------------------------------------------------------------------
+
+
+class Site:
+    """A router, a gateway and a robot agent."""
+
+    def __init__(self, settings: Path, domain: int) -> None:
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        common = ("-e", self.endpoint, "--settings", str(settings))
+        self.router = Router(listen=[self.endpoint])
+        self.gateway = Program("gateway", "--port", "0", *common)
+        self.robot = Program("agent", "--id", str(ROBOT), *common, env={"ROS_DOMAIN_ID": str(domain)})
+
+    @property
+    def programs(self) -> dict[str, Router | Program]:
+        """Each by what it is."""
+        return {"router": self.router, "gateway": self.gateway, "robot": self.robot}
+
+    async def start(self, stack: AsyncExitStack) -> None:
+        """Start all three; they are killed in the end, as an attack may have left them in any state."""
+        for program in self.programs.values():
+            await program.start()
+            stack.push_async_callback(_kill, program)
+
+
+async def _kill(program: Router | Program) -> None:
+    with suppress(AssertionError, ProcessLookupError):
+        await program.stop(signal.SIGKILL)
+
+
+def status_bytes(pid: int, field: str) -> int:
+    """A size from /proc/PID/status: VmRSS, or VmHWM for the highest since `forget_peak`."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith(f"{field}:"):
+            return int(line.split()[1]) * 1024
+    return 0
+
+
+def forget_peak(pid: int) -> None:
+    """Let VmHWM begin anew."""
+    with suppress(OSError):
+        Path(f"/proc/{pid}/clear_refs").write_text("5")
+
+
+def threads(pid: int) -> int:
+    """How many threads a process has."""
+    return len(list(Path(f"/proc/{pid}/task").iterdir()))
+
+
+def descriptors(pid: int) -> int:
+    """How many descriptors a process has open."""
+    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
+
+
+# -- people ----------------------------------------------------------------------------------------------------------
+
+
+class Pair:
+    """Two headsets that talk to each other 100 times per second."""
+
+    def __init__(self, left: Headset, right: Headset) -> None:
+        self.headsets = (left, right)
+        self.ids = (left.id, right.id)
+        self._sent: dict[tuple[int, int], float] = {}
+        """When each message was due; it is removed when it comes."""
+        self._took: list[tuple[float, float]] = []
+        self._tasks = [asyncio.create_task(job) for job in self._jobs(left, right)]
+
+    def _jobs(self, left: Headset, right: Headset) -> Any:
+        return self._say(left, right), self._say(right, left), self._hear(left, right), self._hear(right, left)
+
+    async def _say(self, me: Headset, other: Headset) -> None:
+        due, number = time.monotonic(), 0
+        with suppress(MacsError):
+            while True:
+                self._sent[me.id, number] = due
+                await me.send(
+                    struct.pack("<d", due) + number.to_bytes(8, "little"), to=2, ids=[other.id], manager="Hi"
+                )
+                number += 1
+                due += TALK_EVERY_S
+                await asyncio.sleep(due - time.monotonic())
+
+    async def _hear(self, me: Headset, other: Headset) -> None:
+        with suppress(MacsError):
+            while True:
+                message = await me.receive()
+                if message.metadata.message_manager == "Hi" and message.sender_id == other.id:
+                    (due,) = struct.unpack_from("<d", message.data)
+                    self._sent.pop((other.id, int.from_bytes(message.data[8:16], "little")), None)
+                    self._took.append((due, time.monotonic() - due))
+
+    def since(self, begin: float, end: float) -> list[float]:
+        """Latencies of what was due in this time; what has not come by now counts as never."""
+        came = [took for due, took in self._took if begin <= due < end]
+        return came + [math.inf for due in self._sent.values() if begin <= due < end]
+
+    def missing(self, begin: float, end: float) -> int:
+        """How many of what was due then have not come."""
+        return sum(begin <= due < end for due in self._sent.values())
+
+    def close(self) -> None:
+        for task in self._tasks:
+            task.cancel()
+
+
+class Heard(NamedTuple):
+    """What the robot's wheels were told."""
+
+    at: float
+    sent: float
+    stop: bool
+    """Whether it is the dead-man's message."""
+
+
+class Wheels:
+    """A ROS node on the robot: its motor, and a lamp that shows the emergency stop."""
+
+    def __init__(self, domain: int) -> None:
+        self.heard: list[Heard] = []
+        self.lamp: list[tuple[float, bool]] = []
+        self._session = RosSession("wheels", domain_id=domain)
+
+    async def start(self) -> None:
+        """Listen."""
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+        def make() -> None:
+            node = self._session.node
+            node.create_subscription(Twist, "/cmd_vel", self._drive, 100)
+            node.create_subscription(Bool, "/emergency_stop", self._show, latched)
+
+        await self._session.run(make)
+
+    def _drive(self, twist: Any) -> None:
+        self.heard.append(Heard(time.monotonic(), twist.linear.y, twist.linear.z == -1))
+
+    def _show(self, state: Any) -> None:
+        self.lamp.append((time.monotonic(), state.data))
+
+    @property
+    def stopped(self) -> bool:
+        """What the lamp shows."""
+        return bool(self.lamp) and self.lamp[-1][1]
+
+    @property
+    def moving(self) -> bool:
+        """Whether the last message was a command."""
+        return bool(self.heard) and not self.heard[-1].stop
+
+    def close(self) -> None:
+        self._session.close()
+
+
+class Driver:
+    """A headset that drives the robot 50 times per second."""
+
+    def __init__(self, headset: Headset, commands: Publisher) -> None:
+        self.headset = headset
+        self._commands = commands
+        self.sent: list[float] = []
+        self.drives = True
+        self._task = asyncio.create_task(self._drive())
+
+    async def _drive(self) -> None:
+        due = time.monotonic()
+        with suppress(MacsError):
+            while True:
+                if self.drives:
+                    twist = Twist()
+                    twist.linear.x, twist.linear.y = 0.5, due
+                    self.sent.append(due)
+                    await self._commands.publish(bytes(serialize_message(twist)))
+                due += DRIVE_EVERY_S
+                await asyncio.sleep(due - time.monotonic())
+
+    def close(self) -> None:
+        self._task.cancel()
+
+
+# -- the scene -------------------------------------------------------------------------------------------------------
+
+
+class Scene:
+    """Everything, and what is measured in it. Made by `scene`."""
+
+    def __init__(self, site: Site, other: Site, wheels: Wheels) -> None:
+        self.site = site
+        self.other = other
+        self.wheels = wheels
+        self.pair: Pair
+        self.driver: Driver
+        self.presser: Headset
+        self.operator: Operator
+        self._button: Publisher
+        self._turn = 0
+
+    @property
+    def good(self) -> list[Headset]:
+        """The headsets that behave."""
+        return [*self.pair.headsets, self.driver.headset, self.presser]
+
+    async def settle(self, stack: AsyncExitStack) -> None:
+        """Let the people come, and wait until the robot drives."""
+        headsets = [await stack.enter_async_context(await self.newcomer()) for _ in range(4)]
+        left, right, driver, self.presser = headsets
+        while ROBOT not in (await driver.online()).ros_agent_ids:
+            await asyncio.sleep(0.02)
+        mesh = MeshSettings(connect=[self.site.endpoint])
+        asking = robots.operator(mesh, Caller(OPERATOR, 7), timeout_s=10)
+        self.operator = await stack.enter_async_context(asking)
+        self.pair = Pair(left, right)
+        stack.callback(self.pair.close)
+        self._button = await self.presser.advertise("/emergency_stop", "std_msgs/Bool", agents=[ROBOT])
+        commands = await driver.advertise("/cmd_vel", "geometry_msgs/Twist", agents=[ROBOT])
+        self.driver = Driver(driver, commands)
+        stack.callback(self.driver.close)
+        await until(lambda: self.wheels.moving and bool(self.wheels.lamp), 20, "the robot to drive")
+
+    async def newcomer(self) -> Headset:
+        """A headset more."""
+        return await Headset.connect("127.0.0.1", self.site.gateway.port)
+
+    # -- one attack --
+
+    async def suffer(self, attack: Attack, *, seconds: float, stops: int | None = None) -> Report:
+        """Calm, the attack on the other site, then on this one. ``stops`` instead of as many as there is time for."""
+        calm = await self.observe(min(seconds, 1.5))
+        async with self._attacked(attack, self.other, seconds, stops):
+            benign = await self.observe(seconds, min(stops or 0, 20) or None)
+        before = await self._facts()
+        memory = {name: Memory(status_bytes(p.pid, "VmRSS")) for name, p in self.site.programs.items()}
+        for program in self.site.programs.values():
+            forget_peak(program.pid)
+        began = time.monotonic()
+        async with self._attacked(attack, self.site, seconds, stops) as finished:
+            under = await self.observe(seconds, stops, finished)
+        broken = await self._as_before(before, began)
+        for name, program in self.site.programs.items():
+            with suppress(OSError):
+                memory[name].peak = status_bytes(program.pid, "VmHWM")
+                memory[name].after = status_bytes(program.pid, "VmRSS")
+        under.latencies = self.pair.since(began, began + seconds)
+        broken += [
+            f"the {name} keeps {m.kept / MIB:.0f} MiB" for name, m in memory.items() if m.kept > KEPT_BYTES and m.after
+        ]
+        return Report(attack.name, attack.single, calm, benign, under, memory, MEMORY_LIMITS, broken)
+
+    @asynccontextmanager
+    async def _attacked(
+        self, attack: Attack, site: Site, seconds: float, stops: int | None
+    ) -> AsyncIterator[Callable[[], bool]]:
+        """While the block runs this site is attacked; ended by force a while after its time."""
+        length = seconds if stops is None else 3600.0
+        words = (attack.name, str(site.gateway.port), site.endpoint, str(length))
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "tests.attack.attacker", *words), cwd=ROOT, stdout=asyncio.subprocess.PIPE
+        )
+        try:
+            assert process.stdout is not None
+            line = await asyncio.wait_for(process.stdout.readline(), BEGIN_S)
+            assert line == b"begins\n", f"{attack.name} did not begin: {line!r}"
+            yield lambda: process.returncode is not None
+        finally:
+            if process.returncode is None:
+                process.kill()
+            await process.wait()
+
+    # -- measuring --
+
+    async def observe(
+        self, seconds: float, stops: int | None = None, finished: Callable[[], bool] = lambda: False
+    ) -> Window:
+        """Talk, drive, stop and let go for so long, or until so many stops were pressed."""
+        window = Window()
+        begin = time.monotonic()
+        while time.monotonic() - begin < seconds if stops is None else len(window.stops) < stops:
+            if not await self._stop_once(window) or not await self._let_go_once(window):
+                break
+        end = time.monotonic()
+        await until(lambda: not self.pair.missing(begin, end), NO_EFFECT_S, quietly=True)
+        window.latencies = self.pair.since(begin, end)
+        window.commands = self._commands(begin, end)
+        return window
+
+    def _commands(self, begin: float, end: float) -> list[float]:
+        came = {h.sent: h.at for h in self.wheels.heard if not h.stop and begin <= h.sent < end}
+        return [came[sent] - sent if sent in came else math.inf for sent in self.driver.sent if begin <= sent < end]
+
+    async def _stop_once(self, window: Window) -> bool:
+        """Press once, alternately a headset's button and an operator's, and measure until nothing moves any more."""
+        if not await self._moves(window):
+            return False
+        self._turn += 1
+        by_headset = bool(self._turn % 2)
+        pressed = time.monotonic()
+        asking = None if by_headset else asyncio.create_task(self._ask_stop(b"true"))
+        if by_headset:
+            with suppress(MacsError):
+                await self._button.publish(STATES[True])
+        await until(lambda: self.wheels.stopped, NO_EFFECT_S, quietly=True)
+        if asking is not None:
+            asking.cancel()
+        if not self.wheels.stopped:
+            window.stops.append(math.inf)
+            return await self._release(by_headset=by_headset)
+        shown = self.wheels.lamp[-1][0]
+        await asyncio.sleep(HOLDS_S)
+        after = [heard.at for heard in self.wheels.heard if heard.at > shown and not heard.stop]
+        settled = [at for at in after if at - pressed <= HOLDS_S / 2]
+        window.stops.append(max([shown, *settled]) - pressed)
+        window.late_commands += len(after) - len(settled)
+        return await self._release(by_headset=by_headset)
+
+    async def _ask_stop(self, data: bytes) -> None:
+        with suppress(MacsError):
+            await self.operator.ask(ROBOT, "stop", data, timeout_s=NO_EFFECT_S, urgent=True)
+
+    async def _release(self, *, by_headset: bool) -> bool:
+        """Let the robot go on, by who has stopped it, however often that has to be said."""
+        deadline = time.monotonic() + 2 * NO_EFFECT_S
+        while time.monotonic() < deadline:
+            with suppress(MacsError):
+                if by_headset:
+                    await self._button.publish(STATES[False])
+                else:
+                    await asyncio.wait_for(self._ask_stop(b"false"), 0.5)
+            if await until(lambda: not self.wheels.stopped, 0.3, quietly=True):
+                return True
+        return False
+
+    async def _moves(self, window: Window) -> bool:
+        """Whether the driver drives."""
+        self.driver.drives = True
+        moves = await until(lambda: self.wheels.moving, NO_EFFECT_S, quietly=True)
+        if not moves:
+            window.stops.append(math.inf)
+        return moves
+
+    async def _let_go_once(self, window: Window) -> bool:
+        """The driver stops commanding without a word; when the dead-man does its work."""
+        if not await self._moves(window):
+            return False
+        begin = time.monotonic()
+        await asyncio.sleep(0.15)
+        window.trips += sum(heard.stop and heard.at > begin for heard in self.wheels.heard)
+        if not await self._moves(window):
+            return False
+        self.driver.drives = False
+        last = self.driver.sent[-1]
+        stopped = await until(lambda: self._stopped_since(last), NO_EFFECT_S, quietly=True)
+        self.driver.drives = True
+        at = next((h.at for h in self.wheels.heard if h.stop and h.at > last), math.inf)
+        window.deadman.append(max(0.0, at - last - DEADMAN_S))
+        return stopped
+
+    def _stopped_since(self, moment: float) -> bool:
+        return bool(self.wheels.heard) and self.wheels.heard[-1].stop and self.wheels.heard[-1].at > moment
+
+    # -- as before --
+
+    async def _facts(self) -> dict[str, Any]:
+        """What must be the same afterwards."""
+        online = await self.presser.online(timeout_s=10)
+        _, status = robots.read(await self.operator.ask(ROBOT, "status", timeout_s=10), Status)
+        return {
+            "who is online": (online.ros_agent_ids, online.unity_agent_ids),
+            "interface nodes": sorted((node.role, node.name, tuple(node.registrants)) for node in status.nodes),
+        }
+
+    async def _as_before(self, before: dict[str, Any], began: float) -> list[str]:
+        """What is not as it was before the attack, in words."""
+        for name, program in self.site.programs.items():
+            if not Path(f"/proc/{program.pid}/task").exists() or _is_zombie(program.pid):
+                return [f"the {name} has ended"]
+        broken = [f"headset {h.id} was cut: {h.why_ended}" for h in self.good if not h.connected]
+        if broken:
+            return broken
+        now: dict[str, Any] = {}
+
+        async def same() -> bool:
+            with suppress(MacsError):
+                now.update(await self._facts())
+            return now == before
+
+        deadline = time.monotonic() + RECOVERY_S
+        while not await same() and time.monotonic() < deadline:
+            await asyncio.sleep(0.1)
+        broken += [
+            f"{what}: {str(before[what])[:200]} before, {str(now.get(what))[:200]} after"
+            for what in before
+            if now.get(what) != before[what]
+        ]
+        self.driver.drives = True
+        if not await until(
+            lambda: self.wheels.moving and self.wheels.heard[-1].at > time.monotonic() - 0.2, 5, quietly=True
+        ):
+            broken.append("the driver's commands do not arrive any more")
+        if self.wheels.stopped:
+            broken.append("the robot is stopped")
+        if missing := self.pair.missing(began, time.monotonic() - 1):
+            broken.append(f"{missing} of the neighbours' messages were lost")
+        broken += await self._newcomer_is_served()
+        for name in ("gateway", "robot"):
+            tracebacks = [line for line in self.site.programs[name].log if "Traceback" in line or " E macs" in line]
+            if tracebacks:
+                broken.append(f"the {name} has a fault in its log: {tracebacks[0][:200]}")
+                self.site.programs[name].log.clear()
+        return broken
+
+    async def _newcomer_is_served(self) -> list[str]:
+        """A headset that comes now gets an id, may register to drive, hears the robot, and reaches others."""
+        try:
+            async with await self.newcomer() as headset:
+                await headset.advertise("/cmd_vel", "geometry_msgs/Twist", agents=[ROBOT])
+                lamp = await headset.subscribe("/emergency_stop", "std_msgs/Bool", agents=[ROBOT])
+                await asyncio.wait_for(lamp.__anext__(), 5)
+                _, status = robots.read(await self.operator.ask(ROBOT, "status", timeout_s=5), Status)
+                me = f"unity/{headset.id}"
+                if not any(node.name == "/cmd_vel" and me in " ".join(node.registrants) for node in status.nodes):
+                    return [f"a newcomer may not drive: {[node.registrants for node in status.nodes]}"]
+        except (MacsError, asyncio.TimeoutError, OSError) as error:
+            return [f"a newcomer is not served: {error!r}"]
+        return []
+
+
+STATES = {True: b"\x00\x01\x00\x00\x01", False: b"\x00\x01\x00\x00\x00"}
+
+
+def _is_zombie(pid: int) -> bool:
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    return True
+
+
+async def until(
+    condition: Callable[[], object], timeout_s: float, what: str = "something", *, quietly: bool = False
+) -> bool:
+    """Wait for a condition, looking often; whether it came."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            assert quietly, f"waited {timeout_s:g} s in vain for {what}"
+            return False
+        await asyncio.sleep(0.002)
+    return True
+
+
+@asynccontextmanager
+async def scene(directory: Path, domain: int) -> AsyncIterator[Scene]:
+    """Everything started, the robot driving."""
+    settings = directory / "macs.toml"
+    settings.write_text(SETTINGS)
+    async with AsyncExitStack() as stack:
+        site, other = Site(settings, domain), Site(settings, domain % 100 + 1)
+        await asyncio.gather(site.start(stack), other.start(stack))
+        wheels = Wheels(domain)
+        stack.callback(wheels.close)
+        await wheels.start()
+        made = Scene(site, other, wheels)
+        await made.settle(stack)
+        yield made
