@@ -16,7 +16,7 @@ from msgspec import structs
 from macs_zenoh.directory import Change, Directory
 from macs_zenoh.errors import OutOfRange, Refused, Unreachable
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import ROS, AddNode, Metadata, NodeRefused, NodeType, RemoveNode, encode_data
+from macs_zenoh.messages import ROS, AddNode, Metadata, NodeRefused, NodeType, RemoveNode, encode_data, node_name
 from macs_zenoh.registrations import AgentKey, Registrations, Robots, Streams, Task
 from macs_zenoh.routing import call
 from macs_zenoh.wire import Layout
@@ -62,6 +62,9 @@ class RobotCalls:
     def register(self, node: AddNode | RemoveNode, robot_ids: list[int], groups: list[int]) -> None:
         """A headset registers on, or leaves, a node of these robots."""
         robots = self._robots()
+        if isinstance(node, AddNode) and node.node_name != node_name(node.tos_name):  # it would get another's commands
+            self._refused(Task(next(iter(robot_ids), 0), node), f"{node.node_name[:80]!r} is not its node name")
+            return
         if isinstance(node, AddNode):
             tasks = self._registrations.add(node, robot_ids, groups, robots)
         else:

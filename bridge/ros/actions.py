@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import msgspec
+from msgspec import structs
 from rclpy.serialization import deserialize_message, serialize_message
 
 from bridge.ros.graph import SEND_GOAL
@@ -21,6 +22,7 @@ from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.services import ABSENT_S, Search, first_line
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import resolve
+from macs_zenoh.errors import Refused
 from macs_zenoh.messages import ActionVerb, AddNode, NodeType
 from macs_zenoh.reading import Message
 
@@ -42,6 +44,8 @@ class Goal:
     owner: Registrant
     group: int
     request_id: int
+    node_name: str
+    """Under which its owner registered the action."""
     status: int = UNKNOWN
     """As in action_msgs/GoalStatus."""
     result: bytes = b""
@@ -75,6 +79,18 @@ class ActionNode(InterfaceNode):
     @property
     def in_use(self) -> bool:
         return bool(self.registrants) or bool(self._goals)
+
+    @classmethod
+    def resolve(cls, node: Any, name: str) -> str:
+        """ROS remaps each of an action's services by itself; goals go where this one leads."""
+        resolved = str(node.resolve_service_name(name + SEND_GOAL))
+        if not resolved.endswith(SEND_GOAL):
+            raise Refused(f"{name[:80]}: its goals are remapped to {resolved}, which is no action")
+        return resolved.removesuffix(SEND_GOAL)
+
+    def known_names(self) -> list[str]:
+        services = self.robot.session.node.get_service_names_and_types()
+        return [name.removesuffix(SEND_GOAL) for name, _ in services if name.endswith(SEND_GOAL)]
 
     def open(self) -> None:
         node = self.robot.session.node
@@ -128,7 +144,7 @@ class ActionNode(InterfaceNode):
         elif verb in (ActionVerb.RESULT, ActionVerb.CANCEL):
             goal = self._goals.get(goal_id)
             if goal is None:
-                asked = Goal(goal_id, Registrant.of(message), 0, message.metadata.request_id)
+                asked = self._asked(message, goal_id)
                 self._tell(asked, ActionVerb(verb), UNKNOWN, b"there is no such goal, or its result was not kept")
             elif verb == ActionVerb.CANCEL:
                 self._cancel(goal)
@@ -143,7 +159,8 @@ class ActionNode(InterfaceNode):
         if goal is not None:  # asked again, for want of an answer
             self._tell(goal, ActionVerb.ACCEPTED, int(goal.handle is not None))
             return
-        goal = Goal(goal_id, sender, self.robot.group_of(sender), message.metadata.request_id)
+        goal = self._asked(message, goal_id)
+        goal.group = self.robot.group_of(sender)
         body = message.data[ID_BYTES:]
         problem = cdr_problem(body)
         if problem is not None:
@@ -159,6 +176,7 @@ class ActionNode(InterfaceNode):
     def _ask_result(self, goal: Goal, message: Message) -> None:
         """Whoever asks gets the result, now or later, and the feedback from now on."""
         goal.owner, goal.request_id = Registrant.of(message), message.metadata.request_id
+        goal.node_name = message.metadata.node_name
         if goal.finished_at is not None:
             self._tell(goal, ActionVerb.RESULT, goal.status, goal.result)
 
@@ -168,8 +186,17 @@ class ActionNode(InterfaceNode):
         goals = [
             _shown(goal) for goal in self._goals.values() if goal.owner == sender or (group and goal.group == group)
         ]
-        asked = Goal(bytes(ID_BYTES), sender, 0, message.metadata.request_id)
+        asked = self._asked(message, bytes(ID_BYTES))
         self._tell(asked, ActionVerb.LIST, 0, msgspec.json.encode(goals))
+
+    def _asked(self, message: Message, goal_id: bytes) -> Goal:
+        """A goal as far as a message tells it, to answer."""
+        metadata = message.metadata
+        return Goal(goal_id, Registrant.of(message), 0, metadata.request_id, metadata.node_name)
+
+    def refused(self, message: Message, reason: str) -> None:
+        if message.metadata.message_manager == ActionVerb.GOAL and len(message.data) >= ID_BYTES:
+            self._reject(self._asked(message, message.data[:ID_BYTES]), reason)
 
     def _room(self) -> bool:
         limit = self.robot.rules.settings.max_calls
@@ -247,7 +274,7 @@ class ActionNode(InterfaceNode):
         self._check_use()
 
     def _tell(self, goal: Goal, verb: ActionVerb, code: int, rest: bytes = b"") -> None:
-        metadata = self.metadata(verb.value, goal.request_id)
+        metadata = structs.replace(self.metadata(verb.value, goal.request_id), node_name=goal.node_name)
         self.robot.send(goal.owner, metadata, goal.id + struct.pack("B", code) + rest)
 
     def _watch(self) -> None:

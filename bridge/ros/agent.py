@@ -211,6 +211,7 @@ class RobotAgent:
                 node.cut_off()
 
     def _presence(self, agent: AgentInfo, online: bool) -> None:
+        self.nodes.rights.changed()
         if not online:
             gone = Registrant(agent.type, agent.id)
             self.nodes.forget(gone)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import NamedTuple
 
 from macs_zenoh.reading import Message
@@ -47,10 +48,13 @@ class EarlyMessages:
             return True
         return False
 
-    def take(self, key: NodeKey) -> list[Message]:
-        """The messages that wait for a node, oldest first."""
-        taken = [early.message for early in self._waiting.pop(key, ())]
+    def take(self, key: NodeKey, belongs: Callable[[Message], bool] = lambda message: True) -> list[Message]:
+        """The messages that wait for a node and belong to it, oldest first; others go on waiting."""
+        waiting = self._waiting.pop(key, deque())
+        taken = [early.message for early in waiting if belongs(early.message)]
         self._bytes -= sum(len(message.data) for message in taken)
+        if len(taken) < len(waiting):
+            self._waiting[key] = deque(early for early in waiting if not any(early.message is t for t in taken))
         return taken
 
     def expire(self, now: float) -> dict[NodeKey, list[Message]]:

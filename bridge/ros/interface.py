@@ -125,6 +125,8 @@ class InterfaceNode(ABC):
         self.linger_s = 0.0
         """How long an agent stays registered that is not seen on the mesh any more."""
         self.is_open = False
+        self.alike = False
+        """Whether the robot knows another topic with the same node name."""
         self.opening: asyncio.Task[None] | None = None
         self.unused: Callable[[], None] = lambda: None
         """Called when a node that was in use without registrants is not any more."""
@@ -135,9 +137,18 @@ class InterfaceNode(ABC):
 
     def full_name(self, name: str) -> str:
         """A topic's or service's name, expanded and remapped for our node. Raises Refused when it is invalid."""
+        return full_name(self.robot, type(self), name)
+
+    @classmethod
+    def resolve(cls, node: Any, name: str) -> str:
+        """The same, as rclpy resolves it for what this node makes."""
+        return str(node.resolve_service_name(name) if cls.INTERFACE == "srv" else node.resolve_topic_name(name))
+
+    def known_names(self) -> list[str]:
+        """Names of all that ROS has of what this node works on. In the ROS thread."""
         node = self.robot.session.node
-        with ros_errors(name[:80]):
-            return str(node.resolve_service_name(name) if self.INTERFACE == "srv" else node.resolve_topic_name(name))
+        known = node.get_service_names_and_types() if self.INTERFACE == "srv" else node.get_topic_names_and_types()
+        return [name for name, _ in known]
 
     @property
     def held(self) -> bool:
@@ -153,10 +164,14 @@ class InterfaceNode(ABC):
         """Raise Refused when another topic or type is wanted under this node's name."""
         topic = self.full_name(request.tos_name)
         if topic != self.topic:
-            raise Refused(f"{topic} and {self.topic} have the same node name {self.key.node_name}; use one of them")
+            raise self.collision(topic, request.node_name)
         interface = InterfaceName.parse(request.data_exchange_type, self.INTERFACE)
         if interface != self.interface:
             raise Refused(f"{topic} is registered with type {self.interface}, not {interface}")
+
+    def collision(self, topic: str, node_name: str) -> Refused:
+        """The refusal of another topic whose messages could not be told from those of this node."""
+        return Refused(f"{topic} and {self.topic} have the same node name {node_name}; use one of them")
 
     def register(self, registrant: Registrant) -> None:
         """Add a registrant; twice changes nothing. Raises Refused when the node takes no more."""
@@ -190,6 +205,9 @@ class InterfaceNode(ABC):
     @abstractmethod
     def receive(self, message: Message) -> None:
         """Take a message that names this node. On the loop."""
+
+    def refused(self, message: Message, reason: str) -> None:  # noqa: B027 - only some senders wait for an answer
+        """A message of somebody who may not send it came; tell its sender, where that is possible. On the loop."""
 
     def receive_at_once(self, message: Message) -> bool:
         """The same in a thread of Zenoh's, for a message that is as usual; False: it is for `receive`."""
@@ -226,6 +244,12 @@ class InterfaceNode(ABC):
 
 
 _NODE_NAME = re.compile(r"[A-Za-z0-9_]{1,260}")
+
+
+def full_name(robot: Robot, kind: type[InterfaceNode], name: str) -> str:
+    """What a name from the network means on this robot: what rules, control and nodes go by. Raises Refused."""
+    with ros_errors(name[:80]):
+        return kind.resolve(robot.session.node, name)
 
 
 def key_of(request: AddNode | RemoveNode) -> NodeKey:

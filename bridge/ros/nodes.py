@@ -1,4 +1,4 @@
-"""The interface nodes of a robot: what headsets have registered, by node type and node name.
+"""The interface nodes of a robot: what headsets have registered, by node type and topic.
 
 `InterfaceNodes` belongs to the event loop; rclpy's entities are made and destroyed in the ROS thread.
 """
@@ -11,14 +11,14 @@ from collections.abc import Iterator
 
 from bridge.ros.actions import ActionNode
 from bridge.ros.early import EarlyMessages, NodeKey
-from bridge.ros.interface import InterfaceNode, Registrant, Robot, key_of
-from bridge.ros.rules import names_agent
+from bridge.ros.interface import InterfaceNode, Registrant, Robot, full_name, key_of
+from bridge.ros.places import Places
+from bridge.ros.rights import Rights
 from bridge.ros.services import ClientNode, ServiceNode, tell_failure
 from bridge.ros.stop import StopNode
 from bridge.ros.topics import PublisherNode, SubscriberNode
 from macs_zenoh.errors import Refused
-from macs_zenoh.keyexpr import type_name
-from macs_zenoh.messages import AddNode, NodeType, RemoveNode
+from macs_zenoh.messages import AddNode, NodeType, RemoveNode, node_name
 from macs_zenoh.reading import Message
 
 log = logging.getLogger("macs.ros")
@@ -29,14 +29,21 @@ KINDS: dict[int, type[InterfaceNode]] = {
 """Interface nodes by their number on the wire."""
 
 
+Work = tuple[int, str]
+"""What a node is the only one for: its type, and the full name of its topic, service or action. Topics of the robot
+(type 1) are kept by node name, which is part of the key of their stream."""
+
+
 class InterfaceNodes:
-    """All interface nodes of a robot, by node type and node name."""
+    """All interface nodes of a robot, by node type and topic."""
 
     def __init__(self, robot: Robot, max_nodes: int = 256) -> None:
         self.drops = robot.drops
         self.robot = robot
         self._max_nodes = max_nodes
-        self._nodes: dict[NodeKey, InterfaceNode] = {}
+        self.rights = Rights(robot.rules.settings, lambda agent: robot.group_of(agent))
+        self._nodes: dict[Work, InterfaceNode] = {}
+        self._places: Places[InterfaceNode] = Places()
         self._early = EarlyMessages()
         self._expiry: asyncio.TimerHandle | None = None
         self._lingering: dict[tuple[NodeKey, Registrant], asyncio.TimerHandle] = {}
@@ -51,33 +58,58 @@ class InterfaceNodes:
         return len(self._nodes) - (self.stop is not None)
 
     def get(self, node_type: int, node_name: str) -> InterfaceNode | None:
-        """An interface node, None when nobody registered it."""
-        return self._nodes.get(NodeKey(node_type, node_name))
+        """The first interface node of this name, None when nobody registered one."""
+        return self._places.first(NodeKey(node_type, node_name))
+
+    def on_topic(self, node_type: int, topic: str) -> InterfaceNode | None:
+        """The interface node that works on a topic, service or action, by its full name."""
+        return self._nodes.get((node_type, topic))
 
     async def add(self, request: AddNode) -> None:
         """Register an agent on an interface node, which the first registration creates.
 
         A repeated registration changes nothing; a further registrant takes the node as it is.
-        Raises Refused: node type not supported, invalid name, type not installed, type of the topic is another one,
-        name taken by another topic, limit reached, not allowed to this agent.
+        Raises Refused: node type not supported, invalid name, node name not that of the topic, type not installed,
+        type of the topic is another one, name taken by another topic, limit reached, not allowed to this agent.
         """
         registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
         if request.node_type != NodeType.SUBSCRIBER:
-            self._check_allowed(registrant)
-        node = self._nodes.get(key_of(request))
-        if node is None:
-            node = self._create(request)
-        else:
-            node.check_same(request)
+            self.rights.check(registrant)
+        node = self._find_or_create(request)
+        key = key_of(request)
+        meant = self._places.of(key, registrant)
+        if meant is not None and meant is not node:  # its messages say no more than the node name
+            raise meant.collision(node.topic, key.node_name)
         node.register(registrant)
+        self._places.bind(key, node, registrant)
         self._end_lingering(node, registrant)
         assert node.opening is not None
         await asyncio.shield(node.opening)
+        if node.is_open:
+            self._pass_early(node, key)
+
+    def _find_or_create(self, request: AddNode) -> InterfaceNode:
+        kind = KINDS.get(request.node_type)
+        if kind is None:
+            raise Refused(f"interface node type {request.node_type} is unknown on this robot")
+        topic = full_name(self.robot, kind, request.tos_name)
+        if request.node_name != node_name(request.tos_name):
+            problem = f"not a valid node name for {request.tos_name[:80]}, which is {node_name(request.tos_name)[:80]}"
+            raise Refused(f"{request.node_name[:80]!r} is {problem}")
+        by_name = request.node_type == NodeType.SUBSCRIBER
+        node = self._nodes.get((request.node_type, request.node_name if by_name else topic))
+        if self.stop is not None and node is not self.stop and key_of(request) == self.stop.key:
+            raise self.stop.collision(topic, request.node_name)  # whoever sends there wants to stop the robot
+        if node is None:
+            return self._create(kind, request)
+        node.check_same(request)
+        return node
 
     async def open_stop(self, topic: str) -> None:
         """Have an emergency stop on this topic. Raises Refused when the topic cannot be used for it."""
         stop = StopNode(self.robot, topic, self._stopped)
-        self._nodes[stop.key] = stop
+        self._nodes[_work(stop)] = stop
+        self._places.bind(stop.key, stop)
         await self._start(stop)
         self.stop = stop
 
@@ -87,9 +119,12 @@ class InterfaceNodes:
 
     def remove(self, request: RemoveNode) -> None:
         """Take a registrant off a node; the last one removes it. Asking for what is not there changes nothing."""
-        node = self._nodes.get(key_of(request))
+        registrant, key = Registrant(request.registrant_agent_type, request.registrant_agent_id), key_of(request)
+        node = self._places.of(key, registrant)
         if node is not None:
-            self._deregister(node, Registrant(request.registrant_agent_type, request.registrant_agent_id))
+            self._places.unbind(node, registrant, key)
+            if not any(self._places.names_of(node, registrant)):
+                self._deregister(node, registrant)
 
     def forget(self, registrant: Registrant) -> None:
         """Take an agent that left off every node. Its commands count as stopped, registered or not."""
@@ -113,7 +148,11 @@ class InterfaceNodes:
         A registration is a call of its own, which the first message can overtake: a few wait for a moment.
         """
         key = NodeKey(message.metadata.node_type, message.metadata.node_name)
-        node = self._nodes.get(key)
+        node = self._meant(key, message)
+        stops = node is not None and node is self.stop  # who may is its own matter
+        if not stops and not self.rights.may_act(message.sender_type, message.sender_id):
+            self._refuse(node, key, message)
+            return
         if node is not None and node.is_open:
             node.receive(message)
             return
@@ -125,8 +164,32 @@ class InterfaceNodes:
     def deliver_at_once(self, message: Message) -> bool:
         """The same in a thread of Zenoh's, for nodes that can; False: it is for `deliver`."""
         metadata = message.metadata
-        node = self._nodes.get((metadata.node_type, metadata.node_name))  # type: ignore[call-overload]
-        return node is not None and node.is_open and node.receive_at_once(message)
+        node = self._places.sole(NodeKey(metadata.node_type, metadata.node_name))
+        return (
+            node is not None
+            and node.is_open
+            and (node is self.stop or self.rights.may_act(message.sender_type, message.sender_id))
+            and node.receive_at_once(message)
+        )
+
+    def _meant(self, key: NodeKey, message: Message) -> InterfaceNode | None:
+        """The node that a message is for; None as well while it depends on a registration that may be under way."""
+        return self._places.sole(key) or self._places.of(key, Registrant.of(message))
+
+    def _refuse(self, node: InterfaceNode | None, key: NodeKey, message: Message) -> None:
+        """What somebody sent who may not act here, registered or not."""
+        reason = f"{Registrant.of(message)} may not command, call or serve on this robot"
+        about = node.topic if node is not None else key.node_name[:80]
+        self.drops.note("not_allowed", f"{about} from {Registrant.of(message)}", reason)
+        if node is not None:
+            node.refused(message, reason)
+        else:
+            tell_failure(self.robot, message, "refused", reason)
+
+    def _pass_early(self, node: InterfaceNode, key: NodeKey) -> None:
+        """Give a node what came before the registration that it belongs to."""
+        for message in self._early.take(key, lambda message: self._meant(key, message) is node):
+            node.receive(message)
 
     def close(self) -> None:
         """Remove all nodes."""
@@ -135,44 +198,44 @@ class InterfaceNodes:
         if self._expiry is not None:
             self._expiry.cancel()
 
-    def _check_allowed(self, agent: Registrant) -> None:
-        """What an agent may register for is in the payload, where no router's access rule can see it."""
-        allowed = self.robot.rules.settings.register_allow
-        if not names_agent(allowed, type_name(agent.agent_type), agent.agent_id, self.robot.group_of(agent)):
-            raise Refused(f"{agent} may only register for topics that this robot sends")
-
-    def _create(self, request: AddNode) -> InterfaceNode:
-        kind = KINDS.get(request.node_type)
-        if kind is None:
-            raise Refused(f"interface node type {request.node_type} is unknown on this robot")
+    def _create(self, kind: type[InterfaceNode], request: AddNode) -> InterfaceNode:
         if len(self) >= self._max_nodes:
             raise Refused(f"this robot has {self._max_nodes} interface nodes, which is its limit")
         node = kind(self.robot, request)
-        self._nodes[node.key] = node
-        node.unused = lambda: self._remove(node) if self._nodes.get(node.key) is node else None
+        self._nodes[_work(node)] = node
+        self._places.bind(node.key, node)
+        node.unused = lambda: self._remove(node) if self._nodes.get(_work(node)) is node else None
         self._start(node)
         return node
 
     def _start(self, node: InterfaceNode) -> asyncio.Task[None]:
-        opened = self.robot.session.submit(node.open)  # now, so that it comes before `close`, whenever that comes
+        # now, so that it comes before `close`, whenever that comes
+        opened = self.robot.session.submit(lambda: self._open_entity(node))
         node.opening = asyncio.get_running_loop().create_task(self._open(node, asyncio.wrap_future(opened)))
         node.opening.add_done_callback(_retrieve)
         return node.opening
+
+    def _open_entity(self, node: InterfaceNode) -> None:
+        """In the ROS thread."""
+        node.open()
+        known = [rule.match for rule in self.robot.rules.settings.rules] + node.known_names()
+        node.alike = any(node_name(other) == node.key.node_name and other != node.topic for other in known)
 
     async def _open(self, node: InterfaceNode, opened: asyncio.Future[None]) -> None:
         try:
             await opened
             await node.settle()
         except BaseException:
-            if self._nodes.get(node.key) is node:
-                del self._nodes[node.key]
+            if self._nodes.get(_work(node)) is node:
+                del self._nodes[_work(node)]
+                self._places.remove(node)
             raise
-        if self._nodes.get(node.key) is not node:  # its registrants left meanwhile
+        if self._nodes.get(_work(node)) is not node:  # its registrants left meanwhile
             return
         log.info("%s: %s %s", node.topic, node.ROLE, node.interface)
         try:
-            for message in self._early.take(node.key):
-                node.receive(message)
+            self._places.look(node)
+            self._pass_early(node, node.key)
         finally:
             node.is_open = True  # not sooner: no message may overtake these
 
@@ -190,13 +253,15 @@ class InterfaceNodes:
     def _deregister(self, node: InterfaceNode, registrant: Registrant) -> None:
         self._end_lingering(node, registrant)
         node.deregister(registrant)
+        self._places.unbind(node, registrant)
         if not node.in_use:
             self._remove(node)
 
     def _remove(self, node: InterfaceNode) -> None:
         for registrant in node.registrants:
             self._end_lingering(node, registrant)
-        del self._nodes[node.key]
+        del self._nodes[_work(node)]
+        self._places.remove(node)
         node.is_open = False
         node.retire()
         self.robot.session.submit(node.close)
@@ -210,10 +275,16 @@ class InterfaceNodes:
         self._expiry = None
         for key, messages in self._early.expire(asyncio.get_running_loop().time()).items():
             reason = f"nobody registered this node with type {key.node_type}"
+            if self._places.first(key) is not None:
+                reason = f"several topics have this node name, and the sender registered none of type {key.node_type}"
             self.drops.note("no_node", key.node_name[:80], reason, len(messages))
             for message in messages:
                 tell_failure(self.robot, message, "refused", reason)
         self._schedule_expiry()
+
+
+def _work(node: InterfaceNode) -> Work:
+    return node.key if node.NODE_TYPE == NodeType.SUBSCRIBER else (node.NODE_TYPE, node.topic)
 
 
 def _retrieve(task: asyncio.Task[None]) -> None:

@@ -13,11 +13,11 @@ from typing import Any, ClassVar, Literal
 import msgspec
 from msgspec import Struct
 
-from bridge.ros.interface import Registrant
+from bridge.ros.interface import Registrant, full_name
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.topics import PublisherNode
 from macs_zenoh.errors import Refused
-from macs_zenoh.messages import NodeType, node_name
+from macs_zenoh.messages import NodeType
 
 
 class ControlRequest(Struct, frozen=True, rename="camel"):
@@ -43,8 +43,12 @@ STATUS = "RobotStatus"
 
 
 def control(nodes: InterfaceNodes, sender: Registrant, request: ControlRequest, now: float) -> ControlReply:
-    """Do what a request for control asks. Raises Refused when the topic has no such control."""
-    node = nodes.get(NodeType.PUBLISHER, node_name(request.topic))
+    """Do what a request for control asks. Raises Refused when the topic has no such control, and when who asks, or who
+    shall have it, may not command this robot."""
+    nodes.rights.check(sender)
+    if request.action == "give":
+        nodes.rights.check(Registrant(request.to_type, request.to))
+    node = nodes.on_topic(NodeType.PUBLISHER, full_name(nodes.robot, PublisherNode, request.topic))
     if not isinstance(node, PublisherNode):
         raise Refused(f"nobody registered a publisher of {request.topic[:80]}")
     if node.control is None:

@@ -21,7 +21,7 @@ from bridge.ros import fields
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import InterfaceName, resolve
-from macs_zenoh.errors import WireError
+from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.messages import ROS, AddNode, CallFailure, Metadata, NodeType, decode_data, encode_data
 from macs_zenoh.reading import Message
 
@@ -148,6 +148,9 @@ class ClientNode(InterfaceNode):
         call = asyncio.get_running_loop().create_task(self._call(message))
         self._calls[call] = message
         call.add_done_callback(self._calls.pop)
+
+    def refused(self, message: Message, reason: str) -> None:
+        self._fail(message, CallFailed("refused", reason))
 
     def status(self) -> dict[str, Any]:
         return {**super().status(), "open_calls": len(self._calls)}
@@ -283,6 +286,11 @@ class ServiceNode(InterfaceNode):
         self._answered_at = -math.inf
         self._closing = self._ending = False
         self._loop = asyncio.get_running_loop()
+
+    def check_same(self, request: AddNode) -> None:
+        super().check_same(request)
+        if request.node_name != self.key.node_name:  # calls go out under one name
+            raise Refused(f"{self.topic} is registered as {self.request.tos_name}; use that name")
 
     def open(self) -> None:
         self._types = resolve(str(self.interface), "srv")

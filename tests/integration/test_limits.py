@@ -14,6 +14,7 @@ import pytest
 
 import macs_zenoh
 from bridge.headset.client import Headset
+from bridge.headset.frames import NodeSpec, registration
 from macs_zenoh.errors import Refused, Unreachable
 from macs_zenoh.messages import Metadata, NodeRefused, NodeType, StreamData, decode_data, encode_management
 from macs_zenoh.wire import encode_frame, encode_message
@@ -180,6 +181,26 @@ async def test_a_refusal_is_told(router: str, start_gateway: StartGateway, caplo
             refused = decode_data(NodeRefused, message.data)
             assert (refused.robot_id, refused.tos_name, refused.reason) == (1, "/secret", "no such type here")
             assert "robot 1 refused /secret: no such type here" in caplog.text
+
+
+async def test_a_node_name_of_another_topic_is_refused(router: str, start_gateway: StartGateway) -> None:
+    """What others send to a topic is not to be had by registering its node name for another; no robot is asked."""
+    gateway = await start_gateway()
+    asked = []
+
+    async def accept(call: macs_zenoh.Call) -> bytes:
+        asked.append(call)
+        return b""
+
+    async with macs_zenoh.join("ros", id=1, connect=[router]) as robot:
+        robot.serve("add_node", accept)
+        async with await Headset.connect("127.0.0.1", gateway.port) as headset:
+            evil = NodeSpec(NodeType.PUBLISHER, "/evil_cmd", "geometry_msgs/Twist")
+            object.__setattr__(evil, "name", "nd__cmd_vel")
+            await headset.send_frame(registration(headset.id, evil, [1], []))
+            refused = decode_data(NodeRefused, (await headset.receive(5)).data)
+            assert (refused.tos_name, refused.reason) == ("/evil_cmd", "'nd__cmd_vel' is not its node name")
+            assert not asked
 
 
 async def test_a_name_with_another_type_is_kept_away(

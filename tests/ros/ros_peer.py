@@ -87,5 +87,5 @@ def command(topic: str, data: Any, data_type: str = "std_msgs/String") -> Messag
 def drive(x: float, sender: int = 5, topic: str = "/cmd_vel") -> Message:
     """A headset's command to drive at this speed."""
     twist = Twist()
-    twist.linear.x = x
+    twist.linear.x = float(x)
     return command(topic, twist, "geometry_msgs/Twist")._replace(sender_id=sender)

@@ -1,0 +1,245 @@
+"""Rights are asked when they are used, and a topic's rules hold under whatever name it is reached."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import pytest
+from geometry_msgs.msg import Twist
+from rclpy.serialization import serialize_message
+from ros_peer import Peer, adding, drive, get, removing, until
+from std_msgs.msg import Bool
+from std_srvs.srv import SetBool
+
+from bridge.ros.interface import Registrant, Robot
+from bridge.ros.nodes import InterfaceNodes
+from bridge.ros.requests import ControlRequest, control
+from bridge.ros.rules import Rules
+from bridge.ros.session import RosSession
+from macs_zenoh.config import RobotSettings, TopicRule
+from macs_zenoh.errors import Refused
+from macs_zenoh.messages import ActionVerb, CallFailure, Metadata, NodeType
+from macs_zenoh.reading import Message
+
+OPERATOR, STRANGER = 5, 6
+TWIST = "geometry_msgs/Twist"
+RULES = [
+    TopicRule(match="/cmd_vel", exclusive=True, deadman_message={}),
+    TopicRule(match="/locked", read_only=True),
+]
+
+
+class Sent:
+    """What the robot sends to agents."""
+
+    def __init__(self) -> None:
+        self.messages: list[tuple[Registrant, Metadata, bytes]] = []
+
+    def send(self, to: Registrant, metadata: Metadata, data: bytes) -> None:
+        self.messages.append((to, metadata, data))
+
+
+@asynccontextmanager
+async def robot_nodes(session: RosSession, sent: Sent | None = None, **settings: Any) -> AsyncIterator[InterfaceNodes]:
+    """Nodes of a robot with these settings."""
+    rules = Rules(RobotSettings(rules=RULES, **settings))
+    send = (sent or Sent()).send
+    nodes = InterfaceNodes(Robot(session, 7, lambda node, frame: None, rules=rules, send=send))
+    await nodes.open_stop("/emergency_stop")
+    try:
+        yield nodes
+    finally:
+        nodes.close()
+
+
+@pytest.fixture
+async def nodes(session: RosSession) -> AsyncIterator[InterfaceNodes]:
+    async with robot_nodes(session) as nodes:
+        yield nodes
+
+
+def publishing(topic: str, registrant: int = OPERATOR, **options: Any) -> Any:
+    return adding(topic, TWIST, node_type=NodeType.PUBLISHER, registrant=registrant, **options)
+
+
+async def heard(nodes: InterfaceNodes, peer: Peer, topic: str) -> asyncio.Queue[Any]:
+    """What ROS hears on a topic, from the first message on."""
+    received = await peer.subscription(Twist, topic, 100)
+    await until(lambda: nodes.robot.session.node.count_subscribers(topic) == 1)
+    return received
+
+
+# -- a node name and its topic belong together -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("node_type", list(NodeType))
+async def test_a_node_name_of_another_topic_is_refused(nodes: InterfaceNodes, node_type: NodeType) -> None:
+    """Nobody gets what others send to one topic by registering its node name for another one, of any node type."""
+    with pytest.raises(Refused, match="'nd__cmd_vel' is not a valid node name for /evil_cmd, which is nd__evil_cmd"):
+        await nodes.add(adding("/evil_cmd", TWIST, node_type=node_type, name="nd__cmd_vel"))
+    assert len(nodes) == 0
+
+
+async def test_commands_go_to_the_topic_that_their_sender_registered(nodes: InterfaceNodes, peer: Peer) -> None:
+    """/cmd/vel and /cmd_vel have one node name: whoever registers the former first gets no command of who registered
+    the latter, which is driven under its own rules."""
+    good, evil = await heard(nodes, peer, "/cmd_vel"), await heard(nodes, peer, "/cmd/vel")
+    await nodes.add(publishing("/cmd/vel", STRANGER, buffer_size=100))
+    for number in range(20):  # the first of them before their registration
+        if number == 3:
+            await nodes.add(publishing("/cmd_vel", buffer_size=100))
+        nodes.deliver(drive(number / 10))
+        assert not nodes.deliver_at_once(drive(9, STRANGER))
+        nodes.deliver(drive(9, STRANGER))
+    assert [(await get(good)).linear.x for _ in range(20)] == [number / 10 for number in range(20)]
+    assert [(await get(evil)).linear.x for _ in range(20)] == [9] * 20
+    assert good.empty()
+    assert evil.empty()
+    assert nodes.drops == {}
+    node = nodes.on_topic(NodeType.PUBLISHER, "/cmd_vel")
+    assert node is not None
+    assert node.status()["control"]["holder"] == "unity/5"
+
+
+async def test_a_name_that_may_mean_two_topics_is_for_those_who_registered(
+    nodes: InterfaceNodes, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sender that never registered is heard while its node name means one topic, of those that the robot knows."""
+    monkeypatch.setattr("bridge.ros.early.EarlyMessages.HOLD_S", 0.02)
+    received = await heard(nodes, peer, "/cmd/vel")
+    await nodes.add(publishing("/cmd/vel", STRANGER))  # a rule knows /cmd_vel
+    nodes.deliver(drive(1))
+    await until(lambda: nodes.drops["no_node"] == 1)
+    nodes.deliver(drive(2, STRANGER))
+    assert (await get(received)).linear.x == 2
+    plain = await heard(nodes, peer, "/plain/name")
+    await nodes.add(publishing("/plain/name", STRANGER))
+    nodes.deliver(drive(3, topic="/plain/name"))
+    assert (await get(plain)).linear.x == 3
+
+
+async def test_one_sender_cannot_mean_two_topics_by_one_name(nodes: InterfaceNodes) -> None:
+    """Its messages say no more than the node name."""
+    await nodes.add(publishing("/cmd/vel"))
+    with pytest.raises(Refused, match="/cmd_vel and /cmd/vel have the same node name nd__cmd_vel; use one of them"):
+        await nodes.add(publishing("/cmd_vel"))
+
+
+async def test_nobody_takes_the_name_of_the_emergency_stop(nodes: InterfaceNodes) -> None:
+    """A stop is heard from anybody, so its node name has one meaning."""
+    stop = await asyncio.gather(
+        nodes.add(adding("/emergency/stop", "std_msgs/Bool", node_type=NodeType.PUBLISHER)), return_exceptions=True
+    )
+    assert "same node name nd__emergency_stop" in str(stop[0])
+    await nodes.add(adding("emergency_stop", "std_msgs/Bool", node_type=NodeType.PUBLISHER))
+    assert nodes.on_topic(NodeType.PUBLISHER, "/emergency_stop") is nodes.stop
+
+
+@pytest.mark.parametrize("alias", ["cmd_vel", "/drive"])
+async def test_rules_hold_under_every_name_of_a_topic(domain: int, peer: Peer, alias: str) -> None:
+    """A relative or remapped name is the same node: exclusive control, dead-man and rules are one."""
+    with RosSession("rosagent", domain_id=domain, ros_args=["--ros-args", "-r", "/drive:=/cmd_vel"]) as session:
+        async with robot_nodes(session) as nodes:
+            received = await heard(nodes, peer, "/cmd_vel")
+            await nodes.add(publishing("/cmd_vel"))
+            await nodes.add(publishing(alias, STRANGER))
+            assert session.node.count_publishers("/cmd_vel") == 1
+            nodes.deliver(drive(1))
+            nodes.deliver(drive(2, STRANGER, topic=alias))
+            assert nodes.drops == {"not_in_control": 1}
+            nodes.remove(removing(alias, node_type=NodeType.PUBLISHER, registrant=STRANGER))
+            nodes.deliver(drive(3))
+            assert [(await get(received)).linear.x for _ in range(2)] == [1, 3]
+
+
+async def test_names_cannot_get_around_a_rule(domain: int) -> None:
+    """What a name resolves to is what rules and settings are asked about."""
+    arguments = ["--ros-args", "-r", "/open:=/locked", "-r", "__ns:=/r7"]
+    with RosSession("rosagent", domain_id=domain, ros_args=arguments) as session:
+        async with robot_nodes(session, hide=["/r7/secret", "/r7/rosagent/**"]) as nodes:
+            for topic, reason in (
+                ("/open", "only read /locked"),
+                ("secret", "/r7/secret is not open"),
+                ("~/own", "/r7/rosagent/own is not open"),
+                ("/r7//secret", "cannot be used"),
+                ("/r7/secret/", "cannot be used"),
+            ):
+                with pytest.raises(Refused, match=reason):
+                    await nodes.add(publishing(topic))
+            assert len(nodes) == 0
+
+
+async def test_control_is_asked_for_by_topic(nodes: InterfaceNodes) -> None:
+    """A request for control means the topic that it names, whoever has a node of the same name."""
+    await nodes.add(publishing("/cmd/vel", STRANGER))
+    await nodes.add(publishing("/cmd_vel"))
+    assert control(nodes, Registrant(2, OPERATOR), ControlRequest("take", "cmd_vel"), 0).done
+
+
+# -- who may act -----------------------------------------------------------------------------------------------------
+
+
+async def test_who_may_not_act_is_heard_nowhere(session: RosSession, peer: Peer) -> None:
+    """Commands, calls, goals and requests for control of an agent that `register_allow` does not name do nothing, also
+    where others registered the node, and the way through Zenoh's threads is no other. It may stop."""
+    sent = Sent()
+    async with robot_nodes(session, sent, register_allow=["unity/5"]) as nodes:
+        received = await heard(nodes, peer, "/cmd_vel")
+        called = asyncio.Queue[bool]()
+        loop = asyncio.get_running_loop()
+
+        def serve(request: Any, response: Any) -> Any:
+            loop.call_soon_threadsafe(called.put_nowait, True)
+            return response
+
+        await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/lights", serve))
+        await until(lambda: session.node.count_services("/lights") == 1)
+        await nodes.add(publishing("/cmd_vel"))
+        await nodes.add(adding("/lights", "std_srvs/SetBool", node_type=NodeType.CLIENT))
+
+        request = bytes(serialize_message(SetBool.Request(data=True)))
+        call = Metadata(2, STRANGER, 3, CallFailure.manager, NodeType.CLIENT, "nd__lights", "std_srvs/SetBool")
+        goal = Metadata(2, STRANGER, 4, ActionVerb.GOAL.value, NodeType.ACTION, "nd__count", "a/Count")
+        for _ in range(3):
+            assert not nodes.deliver_at_once(drive(1, STRANGER))
+            nodes.deliver(drive(1, STRANGER))
+            nodes.deliver(Message("unity", STRANGER, call, request))
+            nodes.deliver(Message("unity", STRANGER, goal, bytes(20)))
+        for action in ("take", "give"):
+            with pytest.raises(Refused, match="unity/6"):
+                control(nodes, Registrant(2, STRANGER), ControlRequest(action, "/cmd_vel", to=STRANGER), 0)  # type: ignore[arg-type]
+        with pytest.raises(Refused, match="unity/6"):  # nor be given it
+            control(nodes, Registrant(2, OPERATOR), ControlRequest("give", "/cmd_vel", to=STRANGER), 0)
+
+        assert nodes.drops == {"not_allowed": 9, "call_refused": 3}
+        told = [(to, metadata.request_id, data) for to, metadata, data in sent.messages]
+        assert [(to, number) for to, number, _ in told] == [(Registrant(2, STRANGER), 3)] * 3
+        assert all(b'"refused"' in data for _, _, data in told)
+        nodes.deliver(drive(2))
+        assert (await get(received)).linear.x == 2
+        assert received.empty()
+        assert called.empty()
+        stop = Metadata(2, STRANGER, 0, "", NodeType.PUBLISHER, "nd__emergency_stop", "std_msgs/Bool")
+        nodes.deliver(Message("unity", STRANGER, stop, bytes(serialize_message(Bool(data=True)))))
+        assert nodes.robot.stop.stopped
+
+
+async def test_a_right_ends_when_it_is_taken_away(session: RosSession) -> None:
+    """What was found out about an agent is asked again when somebody came, left or changed its group."""
+    groups = {Registrant(2, OPERATOR): 9}
+    rules = Rules(RobotSettings(register_allow=["group/9"]))
+    robot = Robot(session, 7, lambda node, frame: None, rules=rules, group_of=lambda agent: groups.get(agent, 0))
+    nodes = InterfaceNodes(robot)
+    try:
+        await nodes.add(publishing("/cmd_vel"))
+        nodes.deliver(drive(1))
+        assert nodes.drops == {}
+        groups.clear()
+        nodes.rights.changed()
+        nodes.deliver(drive(1))
+        assert nodes.drops == {"not_allowed": 1}
+    finally:
+        nodes.close()
