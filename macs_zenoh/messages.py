@@ -253,6 +253,22 @@ class NodeRefused(Management, frozen=True):
     reason: str
 
 
+class DataRefused(Struct, frozen=True, rename="camel"):
+    """Robot → agent: what it sent for an interface node was not taken, and why. For agents that know our extensions.
+
+    ``kind`` is the name under which the robot counts it, as ``stopped``, ``not_in_control``, ``not_allowed``,
+    ``bad_cdr`` or ``no_node``; ``reason`` is for a person. Told at once, and again while more of it comes.
+    """
+
+    manager: ClassVar[str] = "InterfaceDataRefused"
+    robot_id: AgentId
+    node_type: Annotated[int, Meta(ge=0, le=255)]
+    node_name: str
+    tos_name: str
+    kind: str
+    reason: str
+
+
 class CallFailure(Struct, frozen=True, rename="camel"):
     """In place of a service's response, in the data part: why there is none. Metadata names it as the manager.
 
@@ -274,6 +290,9 @@ class FunctionalityRequest(Management, frozen=True):
 
 MANAGERS: dict[str, type[Management]] = {kind.manager: kind for kind in Management.__subclasses__()}
 """Every manager by its name on the wire. Nothing is ever imported or created because a message names it."""
+
+FOR_NEWER = frozenset({DataRefused.manager})
+"""Managers of messages between agents that existing programs do not have: not for who does not know our extensions."""
 
 NO_CUSTOM: Mapping[str, type[Struct]] = {}
 

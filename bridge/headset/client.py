@@ -27,11 +27,14 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from types import TracebackType
 
+import msgspec
+
 from macs_zenoh.errors import CallTimeout, Unreachable, UsageError, WireError
 from macs_zenoh.messages import (
     BROADCAST,
     EXTENSIONS,
     ROS,
+    DataRefused,
     Metadata,
     NodeRefused,
     NodeType,
@@ -550,12 +553,25 @@ class Headset:
         elif not metadata.message_manager and self._take_answer(message):
             return
         else:
-            if metadata.message_manager == NodeRefused.manager:
-                refused = decode_data(NodeRefused, message.data)
-                log.warning("robot %d refused %s: %s", refused.robot_id, refused.tos_name, refused.reason)
+            self._take_refusal(message)
             mailbox = self._inbox
         if mailbox is not None:
             await mailbox.offer(message)
+
+    def _take_refusal(self, message: Incoming) -> None:
+        """Tell the node that a robot, or its gateway, refused it or what was sent for it."""
+        refused: NodeRefused | DataRefused
+        if message.metadata.message_manager == NodeRefused.manager:
+            refused = decode_data(NodeRefused, message.data)
+        elif message.metadata.message_manager == DataRefused.manager and message.sender_type == ROS:
+            refused = msgspec.structs.replace(decode_data(DataRefused, message.data), robot_id=message.sender_id or 0)
+        else:
+            return
+        node = self._nodes.get((refused.node_type, refused.node_name))
+        if node is not None:
+            node.refused(refused.robot_id, refused.reason, final=isinstance(refused, NodeRefused))
+        else:
+            log.warning("robot %d refused %s: %s", refused.robot_id, refused.tos_name, refused.reason)
 
     def _take_node_message(self, message: Incoming) -> Mailbox[Incoming] | None:
         node = self._nodes.get((message.metadata.node_type, message.metadata.node_name))

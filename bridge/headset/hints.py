@@ -19,10 +19,11 @@ ALIKE = 0.7
 """How alike names are that may be meant by each other, from 0 to 1."""
 
 
-async def hints(headset: Headset, robots: Collection[int], topic: str, role: Role) -> list[str]:
+async def hints(headset: Headset, robots: Collection[int], topic: str, role: Role) -> dict[int, str]:
     """A line for each robot where something seems to be wrong; none for robots that do not tell what they have."""
-    asked = (_hint(headset, robot, topic, role) for robot in sorted(robots))
-    return [line for line in await asyncio.gather(*asked) if line]
+    asked = sorted(robots)
+    lines = await asyncio.gather(*(_hint(headset, robot, topic, role) for robot in asked))
+    return {robot: line for robot, line in zip(asked, lines, strict=True) if line}
 
 
 async def _hint(headset: Headset, robot: int, topic: str, role: Role) -> str:

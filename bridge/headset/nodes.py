@@ -6,9 +6,10 @@ import asyncio
 import contextlib
 import inspect
 import logging
+import time
 from collections.abc import Awaitable, Callable, Collection
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError
 from macs_zenoh.messages import CallFailure, Metadata, decode_data, encode_data
@@ -21,6 +22,8 @@ log = logging.getLogger("macs.headset")
 
 MAX_OPEN_REQUESTS = 64
 """How many requests a served service answers at a time; more are dropped and counted."""
+REFUSING_S = 2.5
+"""A robot that refuses what is sent says so again every second."""
 REQUEST_IDS = 1 << 31
 """Request ids start again after so many: the C# program counts in an int."""
 
@@ -74,6 +77,18 @@ class Owner(Protocol):
         """The node is closed."""
 
 
+class Refusal(NamedTuple):
+    """Why a robot does not take part in a node. ``at_s`` is when it said so, by the monotonic clock.
+
+    ``final``: it refused the node itself, and stays with that until it is asked again; otherwise something that was
+    sent, which it says again while more of it comes.
+    """
+
+    reason: str
+    final: bool
+    at_s: float
+
+
 class Node:
     """An interface node that this headset asked robots for. `agents` and `groups` are where it is registered."""
 
@@ -81,13 +96,18 @@ class Node:
         self.spec = spec
         self.agents: set[int] = set()
         self.groups: set[int] = set()
+        self.refusals: dict[int, Refusal] = {}
+        """What robots said last that refused the node, or what was sent for it."""
         self._owner = owner
+        self._refused = asyncio.Event()
 
     async def register(self, *, agents: Collection[int] = (), groups: Collection[int] = ()) -> None:
         """Register at these robots, and at the robots of these groups, where it is not registered yet."""
         new_agents = [agent for agent in agents if agent not in self.agents]
         new_groups = [group for group in groups if group not in self.groups]
         self.agents.update(new_agents)
+        for agent in new_agents:
+            self.refusals.pop(agent, None)
         self.groups.update(new_groups)
         if new_agents or new_groups:
             await self._owner.tell(lambda own_id: frames.registration(own_id, self.spec, new_agents, new_groups))
@@ -97,6 +117,36 @@ class Node:
         self.agents.difference_update(agents)
         self.groups.difference_update(groups)
         await self._owner.tell(lambda own_id: frames.deregistration(own_id, self.spec, agents, groups))
+
+    def refused(self, robot: int, reason: str, *, final: bool) -> None:
+        """A robot refused the node, or with ``final`` false something that was sent for it."""
+        before = self.refusals.get(robot)
+        self.refusals[robot] = Refusal(reason, final, time.monotonic())
+        if before is None or before.reason != reason:
+            what = "refused" if final else "does not take what is sent for"
+            log.warning("robot %d %s %s: %s", robot, what, self.spec.tos_name, reason)
+        self._refused.set()
+
+    def refusing(self) -> dict[int, str]:
+        """The robots that refuse now, and why."""
+        now = time.monotonic()
+        return {
+            robot: refusal.reason
+            for robot, refusal in sorted(self.refusals.items())
+            if refusal.final or now - refusal.at_s < REFUSING_S
+        }
+
+    async def wait_refused(self) -> None:
+        """Wait until every robot that was asked for this node has refused it."""
+        while not self.refused_everywhere:
+            self._refused.clear()
+            await self._refused.wait()
+
+    @property
+    def refused_everywhere(self) -> bool:
+        """Whether every robot that was asked for this node has refused it."""
+        final = {robot for robot, refusal in self.refusals.items() if refusal.final}
+        return bool(self.agents) and not self.groups and self.agents <= final
 
     async def close(self) -> None:
         """Leave all robots and groups; the node is gone. Two messages, agents then groups, as the C# program."""
@@ -194,6 +244,10 @@ class ServiceClient(Node):
         finally:
             del self._open[agent, request_id]
 
+    def refused(self, robot: int, reason: str, *, final: bool) -> None:
+        super().refused(robot, reason, final=final)
+        fail_all([answer for (agent, _), answer in self._open.items() if agent == robot], Refused(reason))
+
     def fail(self, error: Unreachable) -> None:
         """The connection that the answers would come over is gone."""
         fail_all(self._open.values(), error)
@@ -265,7 +319,7 @@ class Service(Node):
             task.cancel()
 
 
-def fail_all(answers: Collection[asyncio.Future[bytes]], error: Unreachable) -> None:
+def fail_all(answers: Collection[asyncio.Future[bytes]], error: MacsError) -> None:
     """Let everybody who waits for an answer fail with this error."""
     for answer in answers:
         if not answer.done():

@@ -17,16 +17,16 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coroutine, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coroutine, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from macs_zenoh.errors import CallTimeout, MacsError, Unreachable, UsageError, WireError
+from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError, WireError
 from macs_zenoh.keyexpr import type_name
 
 from .client import Headset
 from .hints import Role, hints
-from .nodes import Incoming, Service, ServiceRequest, Subscription
+from .nodes import Incoming, Node, Service, ServiceRequest, Subscription
 from .typed import Types, request_of, response_of
 from .verbs import MAX_BYTES, agent_type, json_object, script_parser
 
@@ -39,6 +39,10 @@ _LAST_MESSAGES_S = 0.2
 carried the message."""
 _SILENCE_S = 2.0
 """How long `sub` waits for a first message before it says where nobody publishes the topic."""
+STATUS = "RobotStatus"
+"""The request that robots answer from what they know, without looking around (docs/robot.md)."""
+_CONFIRM_S = 1.0
+"""How long a robot may take, after the last message of `pub`, until it is clear that it refused none of them."""
 _RETRY_S = 0.1
 """How often `pub` looks whether a lost connection is back."""
 
@@ -66,7 +70,7 @@ async def perform(args: argparse.Namespace, emit: Emit) -> int:
             lines = stdin_lines() if args.file == "-" else file_lines(args.file)
             return await Script(session, emit, keep_going=args.keep_going).run(lines)
     except asyncio.CancelledError:
-        return 0 if session.endless else 130
+        return session.stopped_code
 
 
 class Job(NamedTuple):
@@ -80,14 +84,23 @@ class Session:
     """One headset and the verbs that it performs. ``emit`` takes each result, an object for one JSON line."""
 
     def __init__(self, emit: Emit, definitions: Sequence[str] = ()) -> None:
-        self.endless = False
-        """Whether the verb that was started last goes on until somebody stops it."""
+        self._endless = False
+        self._node: Node | None = None
+        self._silent: set[int] = set()
         self._emit = emit
         self._definitions = definitions
         self._types: Types | None = None
         self._headset: Headset | None = None
         self._received: Counter[str] = Counter()
         self._progress = asyncio.Event()
+
+    @property
+    def stopped_code(self) -> int:
+        """The exit code when somebody stops the verb that was started last: success for one without an end of its own,
+        unless robots refuse what it does."""
+        if not self._endless:
+            return 130
+        return 1 if self._node is not None and self._node.refusing() else 0
 
     @property
     def headset(self) -> Headset:
@@ -126,8 +139,9 @@ class Session:
             "send": self._send,
             "listen": self._listen,
         }
+        self._node = None
         job = await starts[args.headset_verb](args)
-        self.endless = job.endless
+        self._endless = job.endless
         return job
 
     @property
@@ -162,11 +176,14 @@ class Session:
             buffer_size=args.buffer,
             drop_new=args.drop_new,
         )
+        self._node = subscription
         log.info("subscribed to %s of robots %s", args.topic, _where(subscription))
 
         async def work() -> int:
-            async with self._hint(args.topic, subscription.agents, "publishers", after_s=_SILENCE_S):
-                return await self._take(subscription, args.topic, args, lambda item: self._shown_topic(args, item))
+            async with self._hint(args.topic, await self._there(subscription), "publishers", after_s=_SILENCE_S):
+                return await self._take(
+                    subscription, args.topic, args, lambda item: self._shown_topic(args, item), subscription
+                )
 
         return Job(work(), endless=not (args.count or args.timeout))
 
@@ -176,19 +193,24 @@ class Session:
         publisher = await self.headset.advertise(
             args.topic, args.type, agents=agents, groups=args.groups, latched=args.latched
         )
+        self._node = publisher
         count = args.count or (0 if args.rate else 1)
         new = args.topic not in known
         settle_s = args.settle if new else 0.0
 
         async def work() -> int:
-            async with self._hint(args.topic, publisher.agents if new else (), "subscribers"):
-                return await publish()
+            there = await self._there(publisher, agents)
+            async with self._hint(args.topic, there if new else (), "subscribers") as hinted:
+                await asyncio.sleep(settle_s)
+                sent = await publish()
+                if not await self._reaches(there, hinted):
+                    await asyncio.sleep(_LAST_MESSAGES_S)
+            return self._published(args, sent, self._refusals(publisher, agents, there, hinted.said))
 
         async def publish() -> int:
-            await asyncio.sleep(settle_s)
             sent = 0
             began = time.monotonic()
-            while not count or sent < count:
+            while (not count or sent < count) and not publisher.refused_everywhere:
                 try:
                     await publisher.publish(self._message(args, sent), agents=agents, groups=args.groups)
                 except Unreachable:
@@ -200,17 +222,59 @@ class Session:
                 sent += 1
                 if args.rate and sent != count:
                     await asyncio.sleep(began + sent / args.rate - time.monotonic())
-            await asyncio.sleep(_LAST_MESSAGES_S)
-            self._emit({"topic": args.topic, "published": sent})
-            return 0
+            return sent
 
         return Job(work(), endless=not count)
+
+    def _published(self, args: argparse.Namespace, sent: int, refusals: dict[int, str]) -> int:
+        """Say what came of `pub`. What some robots refused was sent; whether all of it was lost there is not known."""
+        if not refusals:
+            self._emit({"topic": args.topic, "published": sent})
+            return 0
+        refused = [{"robot": robot, "reason": reason} for robot, reason in sorted(refusals.items())]
+        self._emit({"topic": args.topic, "sent": sent, "refused": refused})
+        return 1
+
+    def _refusals(
+        self, node: Node, agents: Collection[int], there: Collection[int], hinted: Mapping[int, str]
+    ) -> dict[int, str]:
+        """Why robots do not take what was published: by what they say, or because they cannot."""
+        absent = {robot: "it is not online" for robot in agents if robot not in there}
+        said = {robot: reason for robot, reason in node.refusing().items() if not agents or robot in agents}
+        return {**absent, **hinted, **said}
+
+    async def _there(self, node: Node, agents: Collection[int] = ()) -> set[int]:
+        """Which of the robots that a verb names are online. Tells of the others."""
+        named = set(agents or node.agents)
+        if not named:
+            return named
+        there = named & set((await self.headset.online()).ros_agent_ids)
+        for robot in sorted(named - there):
+            log.warning("robot %d is not online: it is asked for %s when it comes", robot, node.spec.tos_name)
+        return there
+
+    async def _reaches(self, robots: Collection[int], hinted: Hinted) -> bool:
+        """Whether all robots have answered something that was sent now, and so all that was sent before: a refusal of
+        that has come before the answer. Robots that do not answer are not asked again."""
+        await hinted.wait()
+
+        async def answers(robot: int) -> None:
+            try:
+                await self.headset.ask(robot, STATUS, timeout_s=_CONFIRM_S)
+            except Unreachable:  # an existing program, say
+                self._silent.add(robot)
+
+        asked = [robot for robot in robots if robot not in self._silent]
+        await asyncio.gather(*map(answers, asked))
+        return bool(robots) and not self._silent & set(robots)
 
     async def _call(self, args: argparse.Namespace) -> Job:
         request = self.types.serialize(request_of(args.type), json_object(args.json))
         agent = args.agent or await self._only_robot()
 
         async def work() -> int:
+            if agent not in (await self.headset.online()).ros_agent_ids:
+                raise Unreachable(f"robot {agent}", "it is not online")
             began = time.monotonic()
             cdr = await self.headset.call(args.topic, args.type, agent, request, timeout_s=args.timeout, failures=True)
             took_ms = round((time.monotonic() - began) * 1000, 2)
@@ -231,10 +295,17 @@ class Session:
         service = await self.headset.serve(
             args.topic, args.type, answer, agents=await self._robots(args), groups=args.groups
         )
+        self._node = service
         log.info("serving %s for robots %s", args.topic, _where(service))
         taken = _until_ended(self.headset, requests)
-        work = self._take(taken, args.topic, args, lambda request: self._shown_request(args, request))
-        return Job(work, endless=not (args.count or args.timeout))
+
+        async def work() -> int:
+            await self._there(service)
+            return await self._take(
+                taken, args.topic, args, lambda request: self._shown_request(args, request), service
+            )
+
+        return Job(work(), endless=not (args.count or args.timeout))
 
     async def _send(self, args: argparse.Namespace) -> Job:
         async def work() -> int:
@@ -242,8 +313,12 @@ class Session:
             await self.headset.send(
                 data, to=agent_type(args.to), ids=args.ids, groups=args.groups, manager=args.manager
             )
-            self._emit({"to": args.to, "ids": args.ids, "groups": args.groups, "bytes": len(data)})
-            return 0
+            sent = {"to": args.to, "ids": args.ids, "groups": args.groups, "bytes": len(data)}
+            online = await self.headset.online()
+            there = {"ros": online.ros_agent_ids, "unity": online.unity_agent_ids}.get(args.to, [])
+            absent = [number for number in args.ids if number not in there]
+            self._emit({**sent, "absent": absent} if absent else sent)
+            return 1 if absent else 0
 
         return Job(work())
 
@@ -257,25 +332,34 @@ class Session:
     @contextlib.asynccontextmanager
     async def _hint(
         self, topic: str, robots: Collection[int], role: Role, *, after_s: float = 0
-    ) -> AsyncIterator[None]:
+    ) -> AsyncIterator[Hinted]:
         """Meanwhile, if nothing has been received by then, say what may be wrong."""
 
         async def hint() -> None:
             await asyncio.sleep(after_s)
             if not self._received[topic]:
-                for line in await hints(self.headset, robots, topic, role):
+                hinted.said.update(await hints(self.headset, robots, topic, role))
+                for line in hinted.said.values():
                     log.warning("%s", line)
 
-        hinting = asyncio.get_running_loop().create_task(hint())
+        hinted = Hinted(hinting := asyncio.get_running_loop().create_task(hint()), {})
         try:
-            yield
+            yield hinted
         finally:
             hinting.cancel()
 
     async def _take(
-        self, source: AsyncIterator[Any], what: str, args: argparse.Namespace, show: Callable[[Any], dict[str, Any]]
+        self,
+        source: AsyncIterator[Any],
+        what: str,
+        args: argparse.Namespace,
+        show: Callable[[Any], dict[str, Any]],
+        node: Node | None = None,
     ) -> int:
-        """Emit what ``source`` gives until there were ``--count`` or ``--timeout`` has passed."""
+        """Emit what ``source`` gives until there were ``--count`` or ``--timeout`` has passed.
+
+        Raises Refused when every robot has refused ``node``: nothing will ever come.
+        """
         taken = 0
 
         async def take() -> None:
@@ -291,7 +375,7 @@ class Session:
                 raise Unreachable(self.headset.target, self.headset.why_ended)
 
         try:
-            await asyncio.wait_for(take(), args.timeout)
+            await asyncio.wait_for(_unless_refused(take(), node), args.timeout)
         except asyncio.TimeoutError:
             log.info("%s: %d within %g s", what, taken, args.timeout)
             return 0 if taken and not args.count else 1
@@ -334,6 +418,37 @@ class Session:
             return {**line, "request": self.types.deserialize(request_of(args.type), request.data)}
         except WireError as error:
             return {**line, "bytes": len(request.data), "error": str(error)}
+
+
+class Hinted(NamedTuple):
+    """A hint while it is found out: ``said`` by robot, once `wait` is over."""
+
+    finding: asyncio.Task[None]
+    said: dict[int, str]
+
+    async def wait(self) -> None:
+        """Until it is known, or known that nobody says."""
+        await asyncio.wait([self.finding])
+
+
+async def _unless_refused(work: Coroutine[Any, Any, None], node: Node | None) -> None:
+    """Do ``work`` until every robot has refused ``node``. Raises Refused then."""
+    if node is None:
+        await work
+        return
+    loop = asyncio.get_running_loop()
+    working, refused = loop.create_task(work), loop.create_task(node.wait_refused())
+    try:
+        await asyncio.wait((working, refused), return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            working.result()
+        else:
+            reasons = "; ".join(f"robot {robot}: {why}" for robot, why in node.refusing().items())
+            raise Refused(f"{node.spec.tos_name} was refused by {reasons}")
+    finally:
+        for task in (working, refused):
+            task.cancel()
+        await asyncio.gather(working, refused, return_exceptions=True)
 
 
 class Script:

@@ -126,7 +126,10 @@ def _add_pub(verbs: Any) -> None:
         "pub",
         "publish to a robot's topic",
         "Fields that are left out get their defaults; $i in JSON becomes the number of the message, from 0.\n"
-        "Without --count: one message, or with --rate until stopped.\n\n"
+        "Without --count: one message, or with --rate until stopped.\n"
+        'Prints {"topic": "/talk", "published": 3}. When a robot does not take it, or has no such topic but one\n'
+        "that is spelled alike, exit code 1 and\n"
+        '{"topic": "/talk", "sent": 3, "refused": [{"robot": 1, "reason": "the emergency stop holds"}]}.\n\n'
         "examples:\n"
         '  macs headset 127.0.0.1:7000 pub /cmd_vel geometry_msgs/Twist \'{"linear": {"x": 0.5}}\' --rate 10\n'
         '  macs headset 127.0.0.1:7000 pub /talk std_msgs/String \'{"data": "$i"}\' --agents 1 --count 3',

@@ -15,6 +15,7 @@ from rclpy.exceptions import NameValidationException
 from rclpy.type_support import NoTypeSupportImportedException
 
 from bridge.ros.early import NodeKey
+from bridge.ros.refusals import Refusals
 from bridge.ros.rules import Rules
 from bridge.ros.safety import EmergencyStop
 from bridge.ros.session import RosSession
@@ -22,7 +23,7 @@ from bridge.ros.types import InterfaceName
 from macs_zenoh.config import Priority
 from macs_zenoh.errors import Refused
 from macs_zenoh.keyexpr import type_name, type_number
-from macs_zenoh.messages import ROS, AddNode, Metadata, NodeType, RemoveNode
+from macs_zenoh.messages import ROS, AddNode, Metadata, NodeType, RemoveNode, encode_data
 from macs_zenoh.reading import Message
 from macs_zenoh.wire import MACS, Layout
 
@@ -90,6 +91,7 @@ class Robot:
         rules: what the settings say by name.
         group_of: an agent's group now, 0 for none.
         stop: the emergency stop.
+        refusals: who was told lately why what he sent was not taken.
     """
 
     session: RosSession
@@ -103,6 +105,14 @@ class Robot:
     stop: EmergencyStop = field(default_factory=EmergencyStop)
     prioritise_stream: Callable[[str, Priority | None], None] = lambda node, priority: None
     keep_stream: Callable[[str, int | None], bool] = lambda node, frames: False
+    refusals: Refusals = field(default_factory=Refusals)
+
+    def tell_refused(self, message: Message, topic: str, kind: str, reason: str) -> None:
+        """Tell a message's sender why it was not taken; ``kind`` is the name under which that is counted."""
+        told = self.refusals.due(message, self.agent_id, topic, kind, reason)
+        if told is not None:
+            metadata = Metadata(ROS, self.agent_id, message_manager=told.manager)
+            self.send(Registrant.of(message), metadata, encode_data(told))
 
 
 class InterfaceNode(ABC):

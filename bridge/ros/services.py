@@ -72,6 +72,8 @@ def tell_failure(robot: Robot, message: Message, kind: str, reason: str) -> None
     if message.metadata.message_manager == CallFailure.manager:
         metadata = answer_metadata(robot.agent_id, message.metadata, failed=True)
         robot.send(Registrant.of(message), metadata, encode_data(CallFailure(kind, reason)))
+    elif message.metadata.node_type == NodeType.PUBLISHER:
+        robot.tell_refused(message, "", kind, reason)
 
 
 class Search:

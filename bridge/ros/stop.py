@@ -65,11 +65,13 @@ class StopNode(InterfaceNode):
         problem = cdr_problem(message.data, 5)
         if problem is not None:
             self.robot.drops.note("bad_cdr", f"{self.topic} from {sender}", problem)
+            self.robot.tell_refused(message, self.topic, "bad_cdr", problem)
             return
         try:
             self.set(sender, message.data[4] != 0)
         except Refused as refusal:
             self.robot.drops.note("not_allowed", f"{self.topic} from {sender}", refusal.reason)
+            self.robot.tell_refused(message, self.topic, "not_allowed", refusal.reason)
 
     def set(self, sender: Registrant, stop: bool) -> None:
         """Stop or release. Raises Refused when the settings do not allow it to this agent."""

@@ -330,10 +330,14 @@ class PublisherNode(InterfaceNode):
             if refusal is not None:
                 name, why = refusal
                 self.robot.drops.note(name, f"{self.topic} from {Registrant.of(message)}", why)
+                self.robot.tell_refused(message, self.topic, name, why)
                 return
             self._command(message)
             if self._watch is None:
                 self._watch_silence()
+
+    def refused(self, message: Message, reason: str) -> None:
+        self.robot.tell_refused(message, self.topic, "not_allowed", reason)
 
     def receive_at_once(self, message: Message) -> bool:
         with self.lock:
