@@ -359,6 +359,9 @@ class TopicRule(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True)
             raise self._wrong("deadman_s", "needs a deadman_message; {} is a message with every field zero")
 
 
+WHO_STOPPED = "who_stopped"
+"""In `RobotSettings.release_allow`: whoever pressed the emergency stop may take that back."""
+
 ROBOT_HIDES = (
     "/rosout",
     "/parameter_events",
@@ -400,8 +403,8 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     stop_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
     """Who may stop: ``*``, ``unity``, ``unity/5``, ``block/1`` (headsets of this block of ids), ``group/3`` or
     ``operator/5`` (`macs stop --as`)."""
-    release_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
-    """Who may release a stop."""
+    release_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["operator", WHO_STOPPED])
+    """Who may release a stop, whoever pressed it; ``who_stopped`` takes back its own, as long as it is online."""
     register_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
     """Who may register to publish, to call, to serve and to give goals. Others may register for topics only."""
     rules: list[TopicRule] = []
@@ -409,7 +412,7 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     def _check(self) -> None:
         for field in ("stop_allow", "release_allow", "register_allow"):
             for number, pattern in enumerate(getattr(self, field)):
-                if not _names_agents(pattern):
+                if not _names_agents(pattern) and (field, pattern) != ("release_allow", WHO_STOPPED):
                     problem = f"{pattern!r} names no agents, as *, unity, unity/5, operator/5, block/1 and group/3 do"
                     raise self._wrong(f"{field}[{number}]", problem)
 

@@ -1,7 +1,8 @@
 """Stop robots: every one that is online, or those named. --release lets them go on.
 
 The emergency stop of a robot is latched: commands and goals are refused until it is released, and what each topic is
-given at a stop is in the robot's settings (docs/robot.md). The call is repeated until the robot says that it holds.
+given at a stop is in the robot's settings (docs/robot.md). The call is repeated until the robot says that it holds;
+then the robot is asked once more, a moment later, whether it still does.
 Robots and routers may allow it only to some: the settings ([operator]) or --as say who you are.
 
 Exit code 0 when every robot has confirmed; 1 when one has not, or none is online; 130 after Ctrl-C. A program
@@ -34,6 +35,8 @@ SUMMARY = "stop robots, and release them"
 FIRST_S = 0.5
 """How long the first attempt waits for its answer; each further one waits twice as long."""
 RETRY_S = 0.05
+LOOK_AGAIN_S = 0.3
+"""After so long a stop is looked at once more: somebody may have released it."""
 
 
 @dataclass(frozen=True)
@@ -132,10 +135,25 @@ async def _settle(operator: Operator, robot: int, args: argparse.Namespace) -> O
             outcome = Outcome(robot, False, problem=error.why)
         else:
             if status.stopped is wanted:
-                return Outcome(robot, True, status.stopped, status.stop.by)
+                outcome = Outcome(robot, True, status.stopped, status.stop.by)
+                return await _look_again(operator, outcome, status.stop.times, args.timeout) if wanted else outcome
             outcome = Outcome(robot, False, status.stopped, status.stop.by, "it has not done what it was told")
         await asyncio.sleep(RETRY_S)
     return replace(outcome, problem=await _why_unserved(operator, robot) or outcome.problem) if unserved else outcome
+
+
+async def _look_again(operator: Operator, stopped: Outcome, times: int, timeout_s: float) -> Outcome:
+    """Whether a stop that was confirmed still holds a moment later, and has held all the time."""
+    await asyncio.sleep(LOOK_AGAIN_S)
+    try:
+        _, status = robots.read(await operator.ask(stopped.id, "status", timeout_s=timeout_s, urgent=True), Status)
+    except MacsError as error:
+        return replace(stopped, done=False, problem=f"it stopped, and does not say whether it still does: {error}")
+    if not status.stopped:
+        return replace(stopped, done=False, stopped=False, problem=f"it stopped, and {status.stop.by} released it")
+    if status.stop.times != times:
+        return replace(stopped, done=False, problem="it stopped, somebody released it, and it was stopped again")
+    return stopped
 
 
 async def _why_unserved(operator: Operator, robot: int) -> str:

@@ -57,7 +57,8 @@ class Drops(Counter[str]):
     ``bad_cdr`` data that cannot be a ROS message; ``lost_in_ros`` messages that ROS lost before we could take them;
     ``failed`` messages that ROS or the mesh did not take; ``late_answer`` answers after their deadline, or to nothing;
     ``refused_by_manager`` management messages that an own manager did not take; ``not_in_control`` and ``stopped``
-    commands that safety did not let pass; ``bad_request`` what asks for nothing that there is.
+    commands that safety did not let pass; ``bad_request`` what asks for nothing that there is; ``bad_stop_state`` what
+    another agent of the ROS graph says of the emergency stop, and cannot be read.
     """
 
     LOGGED = 1000

@@ -76,6 +76,7 @@ def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int])
         "stopped": stop.stopped,
         "stop": {
             "by": stop.by,
+            "pressed": stop.pressed,
             "seconds": round(time.time() - stop.since, 1) if stop.stopped else 0,
             "times": stop.times,
             "history": stop.history,

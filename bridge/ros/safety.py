@@ -111,34 +111,74 @@ class DeadMan:
 
 @dataclass
 class EmergencyStop:
-    """Latched: once stopped, stopped until released."""
+    """Latched: once stopped, stopped until released. Whoever stopped can take that back; the robot goes on when nobody
+    is left who stopped it.
+
+    Several programs may keep one stop among them (`adopt`): each change has a number, and the highest wins.
+    """
 
     stopped: bool = False
+    pressed: list[str] = field(default_factory=list)
+    """Everybody who stopped it and has not taken that back, the first first."""
     by: str = ""
+    """Who stopped it; who released it, when it is not stopped."""
     since: float = 0.0
     """Seconds since the epoch."""
     times: int = 0
+    changes: int = 0
+    """The number of the last change, here or elsewhere."""
     history: list[str] = field(default_factory=list)
 
     HISTORY = 20
+    PRESSED = 64
+    """More are not remembered: the robot is stopped, and their releases do not count."""
 
     def press(self, by: str, now: float) -> bool:
         """Stop. Whether this is new."""
-        if self.stopped:
+        was = self.stopped
+        if by not in self.pressed and len(self.pressed) < self.PRESSED:
+            self.changes += 1
+            self._become([*self.pressed, by], by, now)
+        return not was
+
+    def take_back(self, by: str, now: float) -> bool:
+        """One of those who stopped it stops it no more. Whether the robot goes on by that."""
+        if by not in self.pressed:
             return False
-        self.stopped, self.by, self.since = True, by, now
-        self.times += 1
-        self._note(f"stopped by {by}")
-        return True
+        self.changes += 1
+        self._become([agent for agent in self.pressed if agent != by], by, now)
+        return not self.stopped
 
     def release(self, by: str, now: float) -> bool:
-        """Go on. Whether this is new."""
+        """Go on, whoever stopped it. Whether this is new."""
         if not self.stopped:
             return False
-        self.stopped, self.by, self.since = False, by, now
-        self._note(f"released by {by}")
+        self.changes += 1
+        self._become([], by, now)
         return True
 
-    def _note(self, what: str) -> None:
-        self.history.append(what)
+    def left(self, agent: str) -> None:
+        """An agent is gone; who comes under its name is another, and cannot take back what this one did."""
+        self.pressed = [f"{agent} (left)" if pressed == agent else pressed for pressed in self.pressed]
+
+    def adopt(self, changes: int, pressed: list[str], by: str, now: float) -> bool:
+        """What another program says of the same stop. Whether that changed anything here. Of two that changed it at
+        once, who stopped wins."""
+        if changes < self.changes:
+            return False
+        if changes == self.changes:
+            pressed = [*self.pressed, *(agent for agent in pressed if agent not in self.pressed)]
+        self.changes = changes
+        if pressed == self.pressed:
+            return False
+        self._become(pressed[: self.PRESSED], by, now)
+        return True
+
+    def _become(self, pressed: list[str], by: str, now: float) -> None:
+        was, self.pressed, self.stopped = self.stopped, pressed, bool(pressed)
+        if was == self.stopped:
+            return
+        self.by, self.since = by, now
+        self.times += self.stopped
+        self.history.append(f"{'stopped' if self.stopped else 'released'} by {by}")
         del self.history[: -self.HISTORY]

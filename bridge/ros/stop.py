@@ -2,12 +2,14 @@
 
 True stops, false releases. So any existing headset program can stop the robot: it publishes to a topic, which crosses
 the mesh at the highest priority and needs no registration. The state is on the same topic for ROS nodes and for
-subscribed headsets, latched.
+subscribed headsets, latched, and other agents on the same ROS graph share it (`shared_stop`).
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -16,9 +18,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.rules import names_agent
+from bridge.ros.shared_stop import A_NODE, SharedStop, StopState
 from bridge.ros.stream import cdr_problem
 from bridge.ros.topics import check_topic_type
 from bridge.ros.types import resolve
+from macs_zenoh.config import WHO_STOPPED
 from macs_zenoh.errors import Refused
 from macs_zenoh.keyexpr import type_name
 from macs_zenoh.messages import ROS, AddNode, NodeType, node_name
@@ -28,10 +32,13 @@ log = logging.getLogger("macs.ros")
 
 STATES = {True: b"\x00\x01\x00\x00\x01", False: b"\x00\x01\x00\x00\x00"}
 """std_msgs/Bool in CDR."""
+HEAR_S = 0.5
+"""How long the stop waits, at the start, to hear whether it holds for the graph already."""
+LOOK_S = 0.01
 
 
 class StopNode(InterfaceNode):
-    """Stops and releases. ``on_stop`` is called with who did it, once per stop."""
+    """Stops and releases, from any thread. ``on_stop`` is called with who did it, once per stop."""
 
     NODE_TYPE = NodeType.PUBLISHER
     ROLE = "emergency stop"
@@ -42,6 +49,9 @@ class StopNode(InterfaceNode):
         )
         self._on_stop = on_stop
         self._publisher: Any = None
+        self._shared: SharedStop | None = None
+        self._lock = threading.RLock()
+        """Held while the stop changes and that is told: what is told last is what holds."""
 
     @property
     def in_use(self) -> bool:
@@ -50,13 +60,29 @@ class StopNode(InterfaceNode):
     def open(self) -> None:
         node, topic = self.robot.session.node, self.request.tos_name
         check_topic_type(node, topic, self.interface)
+        kind = resolve(str(self.interface))
         with ros_errors(topic):
             latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            self._publisher = node.create_publisher(resolve(str(self.interface)), topic, latched)
-        self._publisher.publish(STATES[self.robot.stop.stopped])
+            self._publisher = node.create_publisher(kind, topic, latched)
+        self._shared = SharedStop(self.robot, self.topic, kind, self._adopt, lambda: self.press(A_NODE))
+        self._shared.open()
+
+    async def settle(self) -> None:
+        """Hear from the other agents of this graph before anything is said, or passes."""
+        assert self._shared is not None
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + HEAR_S
+        while loop.time() < deadline:
+            if not self._shared.unheard:
+                break
+            await asyncio.sleep(LOOK_S)
+        with self._lock:
+            self._tell()
 
     def close(self) -> None:
         publisher, self._publisher = self._publisher, None
+        if self._shared is not None:
+            self._shared.close()
         if publisher is not None:
             self.robot.session.node.destroy_publisher(publisher)
 
@@ -75,28 +101,83 @@ class StopNode(InterfaceNode):
 
     def set(self, sender: Registrant, stop: bool) -> None:
         """Stop or release. Raises Refused when the settings do not allow it to this agent."""
-        settings = self.robot.rules.settings
-        allowed = settings.stop_allow if stop else settings.release_allow
-        if not names_agent(allowed, type_name(sender.agent_type), sender.agent_id, self.robot.group_of(sender)):
-            raise Refused(f"{sender} may not {'stop' if stop else 'release'} this robot")
         if stop:
+            if not self._names(self.robot.rules.settings.stop_allow, sender):
+                raise Refused(f"{sender} may not stop this robot")
             self.press(str(sender))
-        else:
+        elif self._names(self.robot.rules.settings.release_allow, sender):
             self.release(str(sender))
+        elif WHO_STOPPED in self.robot.rules.settings.release_allow:
+            self._take_back(str(sender))
+        else:
+            raise Refused(f"{sender} may not release this robot")
+
+    def _names(self, patterns: list[str], sender: Registrant) -> bool:
+        return names_agent(patterns, type_name(sender.agent_type), sender.agent_id, self.robot.group_of(sender))
 
     def press(self, by: str) -> None:
         """Stop, latched. Again changes nothing."""
-        if self.robot.stop.press(by, time.time()):
-            self._on_stop(by)
-            self._publish()
-            log.warning("emergency stop by %s; commands are refused until it is released", by)
+        with self._lock:
+            before = self.robot.stop.changes
+            if self.robot.stop.press(by, time.time()):
+                self._has_stopped()
+            elif self.robot.stop.changes != before:
+                self._tell()
 
     def release(self, by: str) -> None:
-        """Let commands pass again; the robot does nothing until one comes."""
-        if self.robot.stop.release(by, time.time()):
-            self._publish()
-            log.warning("emergency stop released by %s", by)
+        """Let commands pass again, whoever stopped; the robot does nothing until one comes."""
+        with self._lock:
+            if self.robot.stop.release(by, time.time()):
+                self._has_been_released()
 
-    def _publish(self) -> None:
+    def left(self, agent: Registrant) -> None:
+        with self._lock:
+            if str(agent) in self.robot.stop.pressed:
+                self.robot.stop.left(str(agent))
+                self._tell()
+
+    def status(self) -> dict[str, Any]:
+        others = self._shared.others if self._shared is not None else []
+        return {**super().status(), **({"shared_with": others} if others else {})}
+
+    def _take_back(self, by: str) -> None:
+        with self._lock:
+            stop = self.robot.stop
+            if not stop.stopped:
+                return
+            if by not in stop.pressed:
+                raise Refused(f"{by} may not release what {' and '.join(stop.pressed)} stopped")
+            if stop.take_back(by, time.time()):
+                self._has_been_released()
+                return
+            self._tell()
+            raise Refused(f"{' and '.join(stop.pressed)} stopped it as well")
+
+    def _adopt(self, state: StopState) -> None:
+        with self._lock:
+            stop = self.robot.stop
+            was = stop.stopped
+            if not stop.adopt(state.changes, state.pressed, state.by, time.time()):
+                return
+            if stop.stopped and not was:
+                self._has_stopped()
+            elif was and not stop.stopped:
+                self._has_been_released()
+            else:
+                self._tell()
+
+    def _has_stopped(self) -> None:
+        by = self.robot.stop.by
+        self._on_stop(by)
+        self._tell()
+        log.warning("emergency stop by %s; commands are refused until it is released", by)
+
+    def _has_been_released(self) -> None:
+        self._tell()
+        log.warning("emergency stop released by %s", self.robot.stop.by)
+
+    def _tell(self) -> None:
         if self._publisher is not None:
             self._publisher.publish(STATES[self.robot.stop.stopped])
+        if self._shared is not None:
+            self._shared.tell()

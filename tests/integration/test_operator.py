@@ -96,7 +96,7 @@ async def test_stop_takes_ids_and_groups(router: str, start_robot: StartRobot) -
     robots = {number: await start_robot(number, group) for number, group in ((1, 3), (2, 3), (3, 0), (4, 5))}
     stopped = await macs("stop", "3", "--group", "3", "--as", "operator/9", "--json", "-e", router)
     assert [outcome["id"] for outcome in stopped] == [1, 2, 3]
-    assert robots[3].calls == ["stop by operator/9"]
+    assert robots[3].calls == ["stop by operator/9", "status by operator/9"]
     assert robots[4].calls == []
 
 
@@ -106,7 +106,7 @@ async def test_stop_is_repeated_until_it_is_confirmed(router: str, start_robot: 
     robot.silent_for = 2
     code, out, errors = await ended("stop", "7", "-e", router, "--timeout", "15")
     assert (code, out) == (0, "robot 7 is stopped, by operator/0\n"), errors
-    assert robot.calls == ["stop by operator/0"] * 3
+    assert robot.calls == ["stop by operator/0"] * 3 + ["status by operator/0"]
 
 
 async def test_stop_fails_unless_all_confirm(router: str, start_robot: StartRobot) -> None:

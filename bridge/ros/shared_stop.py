@@ -1,0 +1,152 @@
+"""One emergency stop for all robot agents of a ROS graph, and for ROS nodes that stop.
+
+Several agents on one graph drive the same robot, so a stop that one of them heard must hold for all. Each tells its
+state on a hidden topic beside the stop's own, latched, so that one that comes later knows it as well. The state has a
+number that grows with each change; the highest is adopted, so nothing goes round in circles, and of two changes at
+once the stop wins (`safety.EmergencyStop.adopt`).
+
+On the stop's own topic any ROS node can stop the robot, as a button does: true. Its false releases nothing, that is a
+right of agents on the mesh. What agents themselves publish there is not taken for a button: only where the topic has
+more publishers than there are agents on the graph.
+"""
+
+from __future__ import annotations
+
+import logging
+import uuid
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
+
+from bridge.ros.interface import Robot, ros_errors
+from bridge.ros.types import resolve
+
+log = logging.getLogger("macs.ros")
+
+AGENTS = "/_agents"
+"""After the topic of the stop: where agents tell each other. ROS hides it, and so do our rules."""
+STATE_BYTES = 16 << 10
+KNOWN = 64
+"""Agents of one graph that are remembered."""
+A_NODE = "a ROS node"
+
+
+class StopState(Struct, frozen=True):
+    """What one agent says of the stop."""
+
+    session: str
+    """A new one with each start."""
+    robot: int
+    changes: int
+    pressed: list[str]
+    by: str
+
+
+class SharedStop:
+    """The part of the emergency stop that other ROS nodes see and set.
+
+    ``on_state`` is called with what another agent says, ``on_press`` when a ROS node stops; in the thread of the
+    intake.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        topic: str,
+        kind: type[Any],
+        on_state: Callable[[StopState], None],
+        on_press: Callable[[], None],
+    ) -> None:
+        self._robot = robot
+        self._topic = topic
+        self._kind = kind
+        self._on_state = on_state
+        self._on_press = on_press
+        self._session = uuid.uuid4().hex
+        self._agents: dict[str, int] = {}
+        self._text: Any = None
+        self._publisher: Any = None
+        self._subscriptions: list[Any] = []
+
+    def open(self) -> None:
+        """Tell, and listen. In the ROS thread. Raises Refused."""
+        session, latched = self._robot.session, _latched(1)
+        self._text = resolve("std_msgs/msg/String")
+        with ros_errors(self._topic):
+            self._publisher = session.node.create_publisher(self._text, self._topic + AGENTS, latched)
+            self._subscriptions = [
+                session.intake.subscribe(self._text, self._topic + AGENTS, self._told, _latched(KNOWN)),
+                session.intake.subscribe(self._kind, self._topic, self._pressed, _latched(KNOWN)),
+            ]
+
+    def close(self) -> None:
+        """In the ROS thread."""
+        publisher, self._publisher = self._publisher, None
+        subscriptions, self._subscriptions = self._subscriptions, []
+        for subscription in subscriptions:
+            self._robot.session.intake.unsubscribe(subscription)
+        if publisher is not None:
+            self._robot.session.node.destroy_publisher(publisher)
+
+    def tell(self) -> None:
+        """Tell the state as it is now. From any thread."""
+        publisher, stop = self._publisher, self._robot.stop
+        if publisher is not None:
+            state = StopState(self._session, self._robot.agent_id, stop.changes, stop.pressed, stop.by)
+            publisher.publish(self._text(data=msgspec.json.encode(state).decode()))
+
+    @property
+    def unheard(self) -> int:
+        """Of how many agents on this graph nothing has been heard yet. From any thread."""
+        return max(0, int(self._robot.session.node.count_publishers(self._topic + AGENTS)) - 1 - len(self._agents))
+
+    @property
+    def others(self) -> list[int]:
+        """Ids of other robots whose agents work on this graph."""
+        if self._publisher is None or self._robot.session.node.count_publishers(self._topic + AGENTS) < 2:
+            return []
+        return sorted(set(self._agents.values()) - {self._robot.agent_id})
+
+    # -- in the thread of the intake -----------------------------------------------------------------------------
+
+    def _told(self, cdr: bytes, _info: Mapping[str, Any]) -> None:
+        try:
+            if len(cdr) > STATE_BYTES:
+                raise msgspec.DecodeError(f"{len(cdr)} bytes")
+            state = msgspec.json.decode(deserialize_message(cdr, self._text).data, type=StopState)
+        except (msgspec.DecodeError, RuntimeError) as error:
+            self._robot.drops.note("bad_stop_state", self._topic + AGENTS, f"this is no state of an agent: {error}")
+            return
+        if state.session == self._session:
+            return
+        self._meet(state)
+        self._on_state(state)
+
+    def _meet(self, state: StopState) -> None:
+        if state.session in self._agents:
+            return
+        if len(self._agents) >= KNOWN:
+            del self._agents[next(iter(self._agents))]
+        self._agents[state.session] = state.robot
+        if state.robot != self._robot.agent_id:
+            log.warning(
+                "the agent of robot %d works on this ROS graph too: each drives what the other drives, and a stop of"
+                " one holds for both; give each robot a ROS_DOMAIN_ID of its own",
+                state.robot,
+            )
+
+    def _pressed(self, cdr: bytes, _info: Mapping[str, Any]) -> None:
+        if bytes(cdr[4:5]) == b"\x01" and not self._robot.stop.stopped and self._has_buttons():
+            self._on_press()
+
+    def _has_buttons(self) -> bool:
+        count = self._robot.session.node.count_publishers
+        return bool(count(self._topic) > count(self._topic + AGENTS))
+
+
+def _latched(depth: int) -> QoSProfile:
+    return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)

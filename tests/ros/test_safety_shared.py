@@ -1,0 +1,148 @@
+"""One emergency stop for all agents on one ROS graph, and for ROS nodes that press it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import pytest
+from driven import STOPPED, driving, hear, may_command, site
+from hypothesis import given
+from hypothesis import strategies as st
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_peer import Peer, until
+from std_msgs.msg import Bool
+
+from bridge.ros.safety import EmergencyStop
+from macs_zenoh.agent import Agent
+from macs_zenoh.errors import Refused
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+# -- pure ------------------------------------------------------------------------------------------------------------
+
+AGENTS = 3
+STEPS = st.lists(
+    st.tuples(
+        st.sampled_from(["press", "release", "take back", "hear"]), st.integers(0, AGENTS - 1), st.integers(0, 4)
+    ),
+    max_size=40,
+)
+
+
+@given(STEPS)
+def test_agents_that_share_a_stop_agree_and_fall_silent(steps: list[tuple[str, int, int]]) -> None:
+    """Whatever happens to whom in which order, as soon as all have heard all they agree, and nobody says more."""
+    stops = [EmergencyStop() for _ in range(AGENTS)]
+    waiting: list[list[deque[tuple[int, list[str], str]]]] = [[deque() for _ in stops] for _ in stops]
+    said = 0
+
+    def tell(number: int) -> None:
+        nonlocal said
+        said += 1
+        for other in range(AGENTS):
+            if other != number:
+                waiting[other][number].append((stops[number].changes, list(stops[number].pressed), stops[number].by))
+
+    def hear_one(number: int, sender: int) -> None:
+        if waiting[number][sender] and stops[number].adopt(*waiting[number][sender].popleft(), 0.0):
+            tell(number)
+
+    for step, number, who in steps:
+        stop, before = stops[number], stops[number].changes
+        if step == "hear":
+            hear_one(number, who % AGENTS)
+            continue
+        act = {"press": stop.press, "release": stop.release, "take back": stop.take_back}[step]
+        act(f"unity/{who}", 0.0)
+        if stop.changes != before:
+            tell(number)
+    limit = said + 100 * (len(steps) + 1)
+    while any(queue for queues in waiting for queue in queues):
+        for number in range(AGENTS):
+            for sender in range(AGENTS):
+                hear_one(number, sender)
+        assert said < limit, "they tell each other without end"
+    assert len({(stop.changes, tuple(sorted(stop.pressed))) for stop in stops}) == 1
+
+
+def test_of_two_at_once_the_stop_wins() -> None:
+    """One agent is released in the moment in which the other is stopped: both end stopped."""
+    one, other = EmergencyStop(), EmergencyStop()
+    one.press("a", 0)
+    other.adopt(one.changes, one.pressed, one.by, 0)
+    one.release("operator/5", 1)
+    other.press("b", 1)
+    one_says, other_says = (one.changes, one.pressed, one.by), (other.changes, other.pressed, other.by)
+    one.adopt(*other_says, 2)
+    other.adopt(*one_says, 2)
+    assert one.stopped
+    assert other.stopped
+
+
+# -- with processes --------------------------------------------------------------------------------------------------
+
+
+async def told(agent: Agent, robot: int) -> Any:
+    return json.loads(await agent.call("ros", robot, "status", timeout_s=20))
+
+
+async def stopped(agent: Agent, robot: int, wanted: bool = True) -> None:
+    """Wait until a robot says that it is, or is not."""
+    deadline = time.monotonic() + 10
+    while (await told(agent, robot))["stopped"] is not wanted:
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.02)
+
+
+async def test_a_stop_of_one_agent_holds_for_the_graph(domain: int, peer: Peer, tmp_path: Path) -> None:
+    """Two agents drive one graph: what stops one stops the other, now and when it comes later; a release of either
+    ends it for both."""
+    heard = await hear(peer)
+    async with site(domain, tmp_path) as place, place.headset() as driver, place.robot(1) as first:
+        async with place.robot(2) as second:
+            await may_command(driver, 2)
+            async with driving(driver, 2):
+                await until(lambda: heard.last == 0.5)
+                await driver.call("ros", 1, "stop", b"true")
+                await until(lambda: heard.last == STOPPED)
+                await stopped(driver, 2)
+                count = len(heard.values)
+                await asyncio.sleep(0.5)
+                assert len(heard.values) == count, "a command passed the other agent"
+            others = (await told(driver, 2))["nodes"][0]["shared_with"]
+            assert others == [1]
+            assert any("agent of robot 1 works on this ROS graph too" in line for line in second.log)
+            assert any("agent of robot 2 works on this ROS graph too" in line for line in first.log)
+        async with place.robot(3):
+            await stopped(driver, 3)
+            await driver.call("ros", 3, "stop", b"false")  # by whoever stopped, at another agent
+            await stopped(driver, 1, False)
+            await stopped(driver, 3, False)
+            assert (await told(driver, 1))["stop"]["times"] == 1
+
+
+async def test_a_ros_node_stops_the_robot(domain: int, peer: Peer, tmp_path: Path) -> None:
+    """A button on the robot: its true stops, now or before the agent came; its false releases nothing."""
+    heard = await hear(peer)
+    button = await peer.publisher(Bool, "/emergency_stop", LATCHED)
+    async with site(domain, tmp_path) as place, place.headset() as driver:
+        async with place.robot():
+            await may_command(driver, 1)
+            async with driving(driver, 1):
+                await until(lambda: heard.last == 0.5)
+                await peer.session.run(lambda: button.publish(Bool(data=True)))
+                await until(lambda: heard.last == STOPPED)
+                await peer.session.run(lambda: button.publish(Bool(data=False)))
+                await asyncio.sleep(0.3)
+                assert heard.last == STOPPED
+            with pytest.raises(Refused, match="may not release what a ROS node stopped"):
+                await driver.call("ros", 1, "stop", b"false")
+            await peer.session.run(lambda: button.publish(Bool(data=True)))
+        async with place.robot():
+            await until(lambda: (1, 1) in driver.directory)
+            await stopped(driver, 1)
