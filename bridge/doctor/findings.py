@@ -410,8 +410,12 @@ def _one_program(facts: Facts, program: Program, where: str) -> Iterator[Finding
         yield found("program_peer", where, mode=pong.mode)
     if pong.drops:
         yield found("losses", where, drops=_counts(pong.drops))
-    if pong.now:
-        yield found("in_trouble", where, now=_counts(pong.now))
+    now = dict(pong.now)
+    for kind in ("wrong_settings", "shared_graph"):
+        if count := now.pop(kind, 0):
+            yield found(kind, where, count=count)
+    if now:
+        yield found("in_trouble", where, now=_counts(now))
 
 
 def _counts(counts: dict[str, int]) -> str:

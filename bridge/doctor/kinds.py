@@ -282,6 +282,18 @@ KINDS: dict[str, Kind] = {
         "set id_slots and group_slots in [mesh] to the same everywhere",
     ),
     "losses": Kind("programs", NOTE, "it has lost messages since it started: {drops}", "its log says more"),
+    "wrong_settings": Kind(
+        "programs",
+        ERROR,
+        "messages of its [[robot.rules]] do not fit the types of its graph: {count}",
+        "its log names the topic and the field; until then headsets cannot command there",
+    ),
+    "shared_graph": Kind(
+        "programs",
+        WARNING,
+        "agents of {count} other robots work on its ROS graph: each drives what the other drives",
+        "give each robot a ROS_DOMAIN_ID of its own",
+    ),
     "in_trouble": Kind("programs", WARNING, "at this moment: {now}", "its log says more"),
     "program_shared_memory": Kind(
         "programs", WARNING, "implicit shared memory is on", "set shared_memory = false in its [mesh]"

@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import macs_zenoh
 from bridge.ros import parameters
+from bridge.ros.checked import CheckedSettings
 from bridge.ros.graph import Offers
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
@@ -66,7 +67,8 @@ class RobotAgent:
             keep_stream=agent.keep_stream,
         )
         self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
-        self.offers = Offers(robot, agent.publish_stream)
+        self.checked = CheckedSettings(robot.rules, robot.drops)
+        self.offers = Offers(robot, agent.publish_stream, self.checked.look)
         self._answering: set[asyncio.Task[None]] = set()
 
     async def start(self) -> None:
@@ -80,6 +82,7 @@ class RobotAgent:
         self.agent.on_presence(self._presence)
         self.agent.on_id(self._id_changed)
         self.agent.mesh.on_link(self._link)
+        self.agent.mesh.tells = self._troubles
         for verb, handler in (
             ("add_node", self._add_node),
             ("remove_node", self._remove_node),
@@ -140,6 +143,13 @@ class RobotAgent:
         if answer is not None:
             self._send(sender, Metadata(request_id=message.metadata.request_id), encode_data(answer))
 
+    def _troubles(self) -> dict[str, int]:
+        """What `macs doctor` shall find."""
+        troubles = {"wrong_settings": len(self.checked.wrong)}
+        if self.nodes.stop is not None:
+            troubles["shared_graph"] = len(self.nodes.stop.shared_with)
+        return {name: count for name, count in troubles.items() if count}
+
     def _state(self) -> bytes:
         return status(self.nodes, self.session.full_name, self.agent.drops + self.agent.mesh.drops)
 
@@ -194,7 +204,7 @@ class RobotAgent:
         self.nodes.forget_all()
         self.offers.close()
         self.nodes.robot.agent_id = new
-        self.offers = Offers(self.nodes.robot, self.agent.publish_stream)
+        self.offers = Offers(self.nodes.robot, self.agent.publish_stream, self.checked.look)
 
     def _link(self, up: bool) -> None:
         """Without a router nobody is seen to leave, and no command comes: after a lease all commanders count as gone.

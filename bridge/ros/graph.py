@@ -10,6 +10,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -128,11 +129,18 @@ def _qos_of(node: Any, topic: str) -> TopicQos:
 class Offers:
     """What the robot offers, for those who ask and for those who follow its changes. Belongs to the loop."""
 
-    def __init__(self, robot: Robot, publish_stream: PublishStream) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        publish_stream: PublishStream,
+        on_graph: Callable[[NamesAndTypes, NamesAndTypes], None] = lambda topics, services: None,
+    ) -> None:
+        """``on_graph`` is called in the ROS thread with topics and services, when they have changed."""
         self._robot = robot
         self._publish_stream = publish_stream
+        self._on_graph = on_graph
         self._followers: dict[Registrant, int] = {}
-        self._graph: object = None
+        self._graph: tuple[NamesAndTypes, NamesAndTypes] | None = None
         self._last = Offered()
         self._frame = StreamFraming(
             Metadata(ROS, robot.agent_id, node_name=OFFERS_STREAM, message_manager=FunctionalityRequest.manager),
@@ -170,6 +178,7 @@ class Offers:
                 )
                 if graph != self._graph:
                     self._graph, looks = graph, SETTLE_LOOKS
+                    await self._robot.session.run(partial(self._on_graph, *graph))
                 if looks:
                     looks -= 1
                     await self._tell(await self.now())

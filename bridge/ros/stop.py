@@ -136,8 +136,13 @@ class StopNode(InterfaceNode):
                 self.robot.stop.left(str(agent))
                 self._tell()
 
+    @property
+    def shared_with(self) -> list[int]:
+        """Ids of other robots whose agents work on this ROS graph."""
+        return self._shared.others if self._shared is not None else []
+
     def status(self) -> dict[str, Any]:
-        others = self._shared.others if self._shared is not None else []
+        others = self.shared_with
         return {**super().status(), **({"shared_with": others} if others else {})}
 
     def _take_back(self, by: str) -> None:

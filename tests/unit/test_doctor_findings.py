@@ -321,6 +321,16 @@ def _(facts: Facts) -> None:
     _said(facts, drops={"backlog": 12})
 
 
+@makes("wrong_settings", ERROR)
+def _(facts: Facts) -> None:
+    _said(facts, now={"wrong_settings": 1})
+
+
+@makes("shared_graph", WARNING)
+def _(facts: Facts) -> None:
+    _said(facts, now={"shared_graph": 1})
+
+
 @makes("in_trouble", WARNING)
 def _(facts: Facts) -> None:
     _said(facts, now={"waiting_for_id": 3})

@@ -1,0 +1,63 @@
+"""What is wrong in a robot's safety settings is found when it starts, not when a headset needs it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from driven import site
+from geometry_msgs.msg import Twist
+from ros_peer import Peer, until
+
+from bridge.ros.checked import CheckedSettings
+from bridge.ros.interface import Drops
+from bridge.ros.rules import Rules
+from macs_zenoh.config import RobotSettings, TopicRule
+from tests.programs import ended
+
+WRONG = """
+[[robot.rules]]
+match = "/cmd_vel"
+deadman_s = 0.5
+deadman_message = { linaer = { x = 0.0 } }
+"""
+
+
+async def test_a_dead_man_that_does_not_fit_its_type_is_told_at_the_start(
+    domain: int, peer: Peer, tmp_path: Path
+) -> None:
+    """The graph has the topic: the log names the field, and `macs doctor` is not content."""
+    await peer.subscription(Twist, "/cmd_vel")
+    async with site(domain, tmp_path, WRONG) as place, place.robot() as robot:
+        await until(lambda: any("Twist has no field linaer" in line for line in robot.log), 20)
+        code, out, errors = await ended("doctor", "--json", "--quick", "-e", place.router.endpoint)
+        assert code == 3, errors
+        found = [finding for finding in json.loads(out)["findings"] if finding["id"] == "wrong_settings"]
+        assert [finding["severity"] for finding in found] == ["error"]
+
+
+async def test_two_agents_on_one_graph_are_found(domain: int, tmp_path: Path) -> None:
+    """`macs doctor` names the graph that two robots share."""
+    async with site(domain, tmp_path) as place, place.robot(1) as first, place.robot(2):
+        await until(lambda: any("works on this ROS graph too" in line for line in first.log), 20)
+        _, out, errors = await ended("doctor", "--json", "--quick", "-e", place.router.endpoint)
+        found = [finding for finding in json.loads(out)["findings"] if finding["id"] == "shared_graph"]
+        assert len(found) == 2, errors
+
+
+def test_each_message_is_compared_once_with_the_types_that_there_are() -> None:
+    """Topics and services, also such with several types; what is not installed is left to whoever registers it."""
+    drops = Drops()
+    rules = [
+        TopicRule(match="/cmd_vel", deadman_message={"linear": {"x": "fast"}}),
+        TopicRule(match="/good", deadman_message={"linear": {"x": 1}}),
+        TopicRule(match="/set", error_response={"sucess": False}),
+    ]
+    checked = CheckedSettings(Rules(RobotSettings(rules=rules)), drops)
+    twist = ["geometry_msgs/msg/Twist"]
+    for _ in range(2):
+        checked.look(
+            [("/cmd_vel", twist), ("/good", [*twist, "no_such_msgs/msg/Thing"])], [("/set", ["std_srvs/srv/SetBool"])]
+        )
+    assert sorted(checked.wrong) == ["/cmd_vel", "/set"]
+    assert drops["wrong_settings"] == 2
