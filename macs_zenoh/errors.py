@@ -6,6 +6,7 @@
     ├── WireError                 the peer: what it sent cannot be used
     │   ├── FrameTooLarge         (final for its connection: framing is lost)
     │   ├── BadSizes
+    │   ├── TooLong
     │   ├── BadJson
     │   ├── BadField
     │   ├── UnknownManager
@@ -50,6 +51,16 @@ class BadSizes(WireError):
         self.what = what
         self.declared = declared
         self.available = available
+
+
+class TooLong(WireError):
+    """A part that is parsed, or a name, is longer than allowed (`limits`)."""
+
+    def __init__(self, what: str, size: int, limit: int) -> None:
+        super().__init__(f"{what} of {size} bytes, the limit is {limit}")
+        self.what = what
+        self.size = size
+        self.limit = limit
 
 
 class BadJson(WireError):

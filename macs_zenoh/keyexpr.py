@@ -12,6 +12,7 @@ from functools import lru_cache
 from urllib.parse import quote, unquote
 
 from .errors import UsageError
+from .limits import CHUNK_BYTES, KEY_BYTES
 from .messages import OPERATOR, ROS, UNITY
 
 BLOCK_SIZE = 256
@@ -96,7 +97,7 @@ class Key:
 
     def parse(self, key: str) -> dict[str, FieldValue] | None:
         """The fields of a concrete key (types and ids as numbers), or None when the key is not of this space."""
-        match = self._pattern.fullmatch(key)
+        match = self._pattern.fullmatch(key) if len(key) <= KEY_BYTES else None
         if match is None:
             return None
         try:
@@ -108,7 +109,10 @@ class Key:
         unknown = values.keys() - set(self.fields)
         if unknown:
             raise UsageError(f"key {self.template} has no field {', '.join(sorted(unknown))}")
-        return (template or self.template).format(**{name: _write(name, value) for name, value in values.items()})
+        key = (template or self.template).format(**{name: _write(name, value) for name, value in values.items()})
+        if len(key) > KEY_BYTES:
+            raise UsageError(f"a key {self.template} of {len(key)} bytes, at most {KEY_BYTES} are allowed")
+        return key
 
 
 def expression_problem(text: str) -> str | None:
@@ -187,10 +191,14 @@ def _write(name: str, value: FieldValue) -> str:
     text = str(value)
     if not text:
         raise UsageError(f"{name} is empty")
+    if len(text) > CHUNK_BYTES:
+        raise UsageError(f"{name} has {len(text)} characters, a key takes at most {CHUNK_BYTES} bytes of it")
     try:
         chunk = quote(text, safe=_SAFE)
     except UnicodeEncodeError as error:
         raise UsageError(f"{name} {text!r} is no Unicode text") from error
+    if len(chunk) > CHUNK_BYTES:
+        raise UsageError(f"{name} takes {len(chunk)} bytes in a key, at most {CHUNK_BYTES} are allowed")
     return "%40" + chunk[1:] if chunk.startswith("@") else chunk  # Zenoh's wildcards do not match what starts with @
 
 

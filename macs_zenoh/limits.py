@@ -15,20 +15,24 @@ CONFIGURATION_BYTES = 256 << 10
 """The same while an agent is not configured: a robot's first message lists its topics and services, 2 000 and more of
 them. It costs a few milliseconds, once per connection."""
 
-MANAGEMENT_KEYS = 4096
-"""Keys in management data, at all depths, as far as colons tell."""
+JSON_PARTS = 4096
+"""Keys, and objects and lists, in JSON of more than ``METADATA_BYTES``, at all depths, as far as colons and brackets
+tell: what a part costs in time and memory is many times what it takes in bytes."""
 
-MANAGEMENT_FIELDS = 64
+JSON_FIELDS = 64
 """Keys at the top of a JSON object; ours have at most ten."""
 
 METADATA_BYTES = 4 << 10
 """The JSON in front of a message's data; with three of the longest names it has 1 KiB."""
 
 NAME_BYTES = 255
-"""UTF-8 of one name: interface node, topic, service, type, manager. ROS 2 allows 247 to 255."""
+"""Characters of one name: interface node, topic, service, type, manager. ROS 2, where each is a byte, allows 247."""
 
 REQUEST_BYTES = 64 << 10
 """JSON in the data part of a message to a gateway, a manager or a robot that reads it there."""
+
+ANSWER_BYTES = 1 << 20
+"""JSON in an answer that one asked for oneself: 65 535 ids, or all that a robot offers."""
 
 REASON_CHARACTERS = 500
 """Of a reason that is passed on to a person."""
@@ -36,17 +40,17 @@ REASON_CHARACTERS = 500
 NODE_AGENTS = 1024
 """Robots that one registration may name by id; groups are for more."""
 
-CHUNK_BYTES = 2400
-"""One part of a key between two slashes, escaped: 200 characters of any script."""
+CHUNK_BYTES = 12 * NAME_BYTES
+"""One part of a key between two slashes: a name of any script, escaped."""
 
-KEY_BYTES = 8 << 10
+KEY_BYTES = 16 << 10
 """A whole key. Zenoh writes its length in 16 bits, and panics above them."""
 
 NESTING = 32
-"""How deep objects and lists may lie in each other in settings, and in YAML that a person writes."""
+"""How deep objects and lists may lie in each other, in JSON from others, settings and YAML."""
 
-PARTIAL_BYTES_PER_S = 1024
-"""Slower than this, a frame that has begun is not going to end: its connection is closed."""
+PARTIAL_BYTES_PER_S = 16 << 10
+"""A frame that has begun and comes more slowly than this is not going to end: its connection is closed."""
 
-PARTIAL_PATIENCE_S = 10.0
-"""What every frame has at least, however slow its network is."""
+PARTIAL_WINDOW_S = 60.0
+"""Over how long that is judged: a headset that is taken off in the middle of a frame has so long to come back."""

@@ -19,7 +19,18 @@ from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar
 import msgspec
 from msgspec import Meta, Struct
 
-from .errors import BadField, BadJson, UnknownManager
+from .errors import BadField, BadJson, TooLong, UnknownManager
+from .limits import (
+    ANSWER_BYTES,
+    JSON_FIELDS,
+    JSON_PARTS,
+    MANAGEMENT_BYTES,
+    METADATA_BYTES,
+    NAME_BYTES,
+    NESTING,
+    NODE_AGENTS,
+    REQUEST_BYTES,
+)
 
 BROADCAST = 0
 """Agent type of a header that goes to everybody."""
@@ -40,6 +51,14 @@ AgentType = Annotated[int, Meta(ge=0, le=255)]
 AgentId = Annotated[int, Meta(ge=0, le=0xFFFF)]
 GroupId = Annotated[int, Meta(ge=0, le=255)]
 RequestId = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
+
+PLAIN = r"^[^\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]*\Z"
+"""Text without control characters and without those that turn the direction of writing."""
+
+Name = Annotated[str, Meta(max_length=NAME_BYTES, pattern=PLAIN)]
+"""Of a topic, service, type or manager; it may be empty where there is none."""
+NodeName = Annotated[str, Meta(min_length=1, max_length=NAME_BYTES, pattern=PLAIN)]
+"""Of an interface node: a part of keys."""
 
 
 class NodeType(IntEnum):
@@ -78,14 +97,16 @@ class Metadata(Struct, frozen=True, rename="camel", forbid_unknown_fields=True):
     sender_agent_type: AgentType | None = None
     sender_agent_id: AgentId | None = None
     request_id: RequestId = 0
-    message_manager: str = ""
+    message_manager: Name = ""
     node_type: Annotated[int, Meta(ge=0, le=255)] = 0
-    node_name: str = ""
-    data_exchange_type: str = ""
+    node_name: Name = ""
+    data_exchange_type: Name = ""
 
     @staticmethod
     def decode(data: bytes | bytearray | memoryview) -> Metadata:
-        """Read metadata JSON. Raises BadJson or BadField."""
+        """Read metadata JSON. Raises TooLong, BadJson or BadField."""
+        if len(data) > METADATA_BYTES:
+            raise TooLong("metadata", len(data), METADATA_BYTES)
         try:
             return _metadata_decoder.decode(data)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -173,11 +194,11 @@ class Registration(Management, frozen=True):
     manager: ClassVar[str] = "RosAgentNodeRegistrationForwarder"
     registrant_agent_id: AgentId
     node_type: Annotated[int, Meta(ge=0, le=255)]
-    node_name: str
-    registrar_agent_ids: list[AgentId] = []
-    registrar_group_ids: list[GroupId] = []
-    tos_name: str = ""
-    data_exchange_type: str = ""
+    node_name: Name
+    registrar_agent_ids: Annotated[list[AgentId], Meta(max_length=NODE_AGENTS)] = []
+    registrar_group_ids: Annotated[list[GroupId], Meta(max_length=NODE_AGENTS)] = []
+    tos_name: Name = ""
+    data_exchange_type: Name = ""
 
 
 class AddNode(Management, frozen=True):
@@ -187,9 +208,9 @@ class AddNode(Management, frozen=True):
     registrant_agent_type: AgentType
     registrant_agent_id: AgentId
     node_type: Annotated[int, Meta(ge=0, le=255)]
-    node_name: str
-    tos_name: str
-    data_exchange_type: str
+    node_name: NodeName
+    tos_name: Name
+    data_exchange_type: Name
     buffer_size: Annotated[int, Meta(ge=0)] = 10
     drop_new: bool = False
     is_latched: bool = False
@@ -202,7 +223,7 @@ class RemoveNode(Management, frozen=True):
     registrant_agent_type: AgentType
     registrant_agent_id: AgentId
     node_type: Annotated[int, Meta(ge=0, le=255)]
-    node_name: str
+    node_name: NodeName
 
 
 _TYPES = {str(number): number for number in range(1, 256)}
@@ -306,12 +327,14 @@ class Custom(NamedTuple):
     data: Struct
 
 
-def decode_management(data: bytes, custom: Mapping[str, type[Struct]] = NO_CUSTOM) -> Management | Custom:
+def decode_management(
+    data: bytes, custom: Mapping[str, type[Struct]] = NO_CUSTOM, max_bytes: int = MANAGEMENT_BYTES
+) -> Management | Custom:
     """Read management data; ``custom`` has the managers that somebody added.
 
-    Raises BadJson, BadField or UnknownManager.
+    Raises TooLong, BadJson, BadField or UnknownManager.
     """
-    fields = _json_object("management data", data)
+    fields = _json_object("management data", _judged("management data", data, max_bytes))
     name = fields.pop("message_manager", None)
     if not isinstance(name, str):
         raise BadField("management data", "the key 'messageManager' is missing or not a string")
@@ -330,10 +353,11 @@ def encode_management(value: Management) -> bytes:
     return msgspec.json.encode(fields)
 
 
-def decode_data(kind: type[StructT], data: bytes | bytearray | memoryview) -> StructT:
-    """Read the JSON in a message's data part as ``kind``. Raises BadJson or BadField."""
+def decode_data(kind: type[StructT], data: bytes | bytearray | memoryview, max_bytes: int = REQUEST_BYTES) -> StructT:
+    """Read the JSON in a message's data part as ``kind``. Raises TooLong, BadJson or BadField."""
     name = getattr(kind, "manager", "") or kind.__name__
-    return _convert(name, _json_object(name, bytes(data)), kind)
+    data = _judged(name, data, max_bytes)
+    return _convert(name, _json_object(name, data), kind)
 
 
 def encode_data(value: Struct) -> bytes:
@@ -346,11 +370,11 @@ _SENDER = frozenset(("senderagenttype", "senderagentid"))
 
 def correct_sender(metadata: bytes, agent_type: int, agent_id: int) -> bytes:
     """The same metadata JSON with its true sender and our keys in camelCase, itself when it is so already; unknown
-    keys are kept. Raises BadJson.
+    keys are kept. Raises TooLong or BadJson.
 
     Keys that are the sender's to a reader who takes small and capital letters for the same are not kept.
     """
-    fields = _json("metadata", metadata)
+    fields = _json("metadata", _judged("metadata", metadata, METADATA_BYTES))
     names = _wire_names(Metadata)
     true = {}
     for key, value in fields.items():
@@ -367,6 +391,18 @@ def node_name(tos_name: str) -> str:
     return "nd_" + tos_name.replace("/", "_").replace("~", "_")
 
 
+def _judged(what: str, data: bytes | bytearray | memoryview, max_bytes: int) -> bytes:
+    """The same bytes, if they may be parsed: not too many, and not made of too many parts."""
+    if len(data) > max_bytes:
+        raise TooLong(what, len(data), max_bytes)
+    data = bytes(data)
+    if len(data) > METADATA_BYTES and max_bytes < ANSWER_BYTES:
+        for parts in (data.count(b":"), data.count(b"[") + data.count(b"{")):
+            if parts > JSON_PARTS:
+                raise BadJson(what, f"it has {parts} parts, at most {JSON_PARTS} are allowed")
+    return data
+
+
 def _json_object(what: str, data: bytes) -> dict[str, Any]:
     """The object in ``data`` with its top-level keys in snake_case. Raises BadJson."""
     return {_snake(key): field for key, field in _json(what, data).items()}
@@ -379,13 +415,29 @@ def _json(what: str, data: bytes) -> dict[str, Any]:
         raise BadJson(what, str(error)) from error
     if not isinstance(value, dict):
         raise BadJson(what, f"an object was expected, not {type(value).__name__}")
+    if len(value) > JSON_FIELDS:
+        raise BadJson(what, f"{len(value)} keys, at most {JSON_FIELDS} are allowed")
+    if data.count(b"[") + data.count(b"{") > NESTING and is_deep(value):
+        raise BadJson(what, f"more than {NESTING} objects and lists in each other")
     return value
+
+
+def is_deep(value: object) -> bool:
+    """Whether more than ``NESTING`` objects and lists lie in each other: readers elsewhere follow less than we do."""
+    level: list[object] = [value]
+    for _ in range(NESTING + 1):
+        inner: list[object] = []
+        for one in level:
+            if isinstance(one, dict | list):
+                inner += one.values() if isinstance(one, dict) else one
+        level = inner
+    return bool(level)
 
 
 def _convert(what: str, fields: dict[str, Any], kind: type[StructT]) -> StructT:
     names = _wire_names(kind)
     known = {names[key]: value for key, value in fields.items() if key in names}
-    if (nested := known.get("functionality")) and isinstance(nested, dict):
+    if (nested := known.get("functionality")) and isinstance(nested, dict) and len(nested) <= JSON_FIELDS:
         known["functionality"] = {_snake(key): value for key, value in nested.items()}
     try:
         return msgspec.convert(known, kind)

@@ -14,12 +14,15 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Mapping
+from contextlib import suppress
 from enum import Enum
 from typing import NamedTuple
 
 from msgspec import Struct, structs
 
-from .errors import BadField, NotAllowed, TooFast, WireError
+from .credit import Credit
+from .errors import BadField, BadJson, NotAllowed, TooFast, UnknownManager, WireError
+from .limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, PARTIAL_BYTES_PER_S, PARTIAL_WINDOW_S, REASON_CHARACTERS
 from .messages import (
     NO_CUSTOM,
     OPERATOR,
@@ -32,6 +35,7 @@ from .messages import (
     Heartbeat,
     Management,
     Metadata,
+    NodeRefused,
     OnlineRequest,
     Registration,
     RemoveNode,
@@ -65,7 +69,10 @@ class Limits(NamedTuple):
     held_frames: int = 256
     held_bytes: int = 1 << 20
     frames_per_s: float = 0.0
-    """Frames for others beyond this rate (a second's worth at once) are dropped; 0 is no limit."""
+    """Frames of any kind beyond this rate (a second's worth at once) are dropped; 0 is no limit."""
+    partial_bytes_per_s: float = PARTIAL_BYTES_PER_S
+    """What comes of a frame that has begun must not be less, over ``partial_window_s``."""
+    partial_window_s: float = PARTIAL_WINDOW_S
 
 
 DEFAULT_LIMITS = Limits()
@@ -119,6 +126,12 @@ class Asked(NamedTuple):
     request_id: int
 
 
+class RegistrationRefused(NamedTuple):
+    """A registration was not accepted, for the agent to be told; a `Rejected` is beside it."""
+
+    refused: NodeRefused
+
+
 class Rejected(NamedTuple):
     """A frame was not accepted. The connection goes on unless a `Left` follows."""
 
@@ -131,7 +144,7 @@ class Left(NamedTuple):
     reason: str
 
 
-Event = Joined | Sent | Streamed | Registering | AskedOnline | Asked | Rejected | Left
+Event = Joined | Sent | Streamed | Registering | AskedOnline | Asked | RegistrationRefused | Rejected | Left
 
 
 class Peer:
@@ -154,7 +167,9 @@ class Peer:
         custom: Mapping[str, type[Struct]] = NO_CUSTOM,
         layout: Layout = MACS,
         scratch: bytearray | None = None,
+        credit: Credit | None = None,
     ) -> None:
+        """``credit`` is what an earlier connection left, if there was one."""
         self.agent_id = agent_id
         self.former_ids: set[int] = set()
         self.connection_number = connection_number
@@ -169,13 +184,15 @@ class Peer:
         self.corrected = 0
         self._limits = limits
         self._custom = custom
-        self._credit = max(1.0, limits.frames_per_s)
+        self.credit = credit or Credit(limits.frames_per_s, now)
         self._layout = layout
         self._decoder = FrameDecoder(limits.max_frame_bytes, layout, scratch)
         self._held: deque[Frame] = deque()
         self._held_bytes = 0
         self._connected_at = now
         self._heard_at = now
+        self._partial_since: float | None = None
+        self._partial_begun = 0
         # headsets repeat the same metadata for every message of a topic: decode and correct each one once
         self._metadata: dict[bytes, tuple[Metadata, bytes | None]] = {}
         self._usual: Sent | None = None
@@ -192,6 +209,11 @@ class Peer:
         later one as its new id, and answers again."""
         metadata = Metadata(request_id=self.connection_number, message_manager=Welcome.manager)
         return encode_message(metadata.encode(), encode_data(Welcome(agent_id=self.agent_id)))
+
+    @property
+    def partial_bytes(self) -> int:
+        """How much memory a frame has that has begun and is not whole."""
+        return self._decoder.partial_bytes
 
     def renumber(self, agent_id: int) -> None:
         """From now on the agent has another id. `welcome` tells it; until it has read that it uses the former one."""
@@ -213,23 +235,28 @@ class Peer:
         if size == self._usual_bytes and (again := self._again(size)) is not None:
             self._heard_at = now
             return [again]
-        if self._limits.frames_per_s:
-            earned = (now - self._heard_at) * self._limits.frames_per_s
-            self._credit = min(max(1.0, self._limits.frames_per_s), self._credit + earned)
         self._heard_at = now
         events: list[Event] = []
+        limited = self._limits.frames_per_s
         for frame in self._decoder.advance(size):
             try:
                 frame.check()
-                if self.state is ONLINE and not frame.has_management:
+                if limited and not self._covered(frame, now):
+                    self._too_fast(frame, events)
+                elif self.state is ONLINE and not frame.has_management:
                     events.append(self._sent(frame))
                     continue
-                self._frame(frame, events)
+                else:
+                    self._frame(frame, events)
             except WireError as error:
-                self.drops[type(error).__name__] += frame.count
-                events.append(Rejected(error))
+                self._reject(error, frame.count, events)
             if self._gone():
                 return events
+        if self._decoder.refused:
+            for refused in self._decoder.refused:
+                self._reject(refused, 1, events)
+            self._decoder.refused.clear()
+        self._look_at_partial(now)
         if self._decoder.error is not None:
             self.drops["FrameTooLarge"] += 1
             events += [Rejected(self._decoder.error), self._leave("its next frame cannot be found")]
@@ -267,7 +294,10 @@ class Peer:
         """When `tick` is due at the latest."""
         if self.state is GREETED:
             return self._connected_at + self._limits.handshake_s
-        return self._heard_at + self._limits.silence_s
+        due = self._heard_at + self._limits.silence_s
+        if self._partial_since is not None:
+            return min(due, self._partial_since + self._limits.partial_window_s)
+        return due
 
     def tick(self, now: float) -> list[Event]:
         """Judge the time that has passed."""
@@ -275,7 +305,25 @@ class Peer:
             return []
         if self.state is GREETED:
             return [self._leave(f"no configuration within {self._limits.handshake_s:g} s")]
-        return [self._leave(f"silent for {self._limits.silence_s:g} s")]
+        if now >= self._heard_at + self._limits.silence_s:
+            return [self._leave(f"silent for {self._limits.silence_s:g} s")]
+        return self._judge_partial(now)
+
+    def _look_at_partial(self, now: float) -> None:
+        begun = self._decoder.begun
+        if not begun:
+            self._partial_since = None
+        elif self._partial_since is None or begun < self._partial_begun:  # a new one
+            self._partial_since, self._partial_begun = now, begun
+
+    def _judge_partial(self, now: float) -> list[Event]:
+        """A frame had its time to come on."""
+        begun, window_s = self._decoder.begun, self._limits.partial_window_s
+        if begun - self._partial_begun < window_s * self._limits.partial_bytes_per_s:
+            self.drops["unfinished_frame"] += 1
+            return [self._leave(f"of a frame {begun} bytes have come, and next to nothing for {window_s:g} s")]
+        self._partial_since, self._partial_begun = now, begun
+        return []
 
     def lost(self) -> None:
         """The connection has ended."""
@@ -283,9 +331,37 @@ class Peer:
 
     # -- frames --------------------------------------------------------------------------------------------------
 
+    def _reject(self, error: WireError, count: int, events: list[Event]) -> None:
+        self.drops[type(error).__name__] += count
+        events.append(Rejected(error))
+
+    def _covered(self, frame: Frame, now: float) -> bool:
+        """Whether the rate limit lets a frame pass: every one counts but the one that configures the agent."""
+        if self.state is GREETED and frame.has_management and isinstance(self._management(frame), Configuration):
+            return True
+        return self.credit.take(frame.count, now)
+
+    def _too_fast(self, frame: Frame, events: list[Event]) -> None:
+        """A frame beyond the rate limit is dropped, but who leaves may say so. A registration is answered, which a
+        topic's data cannot be."""
+        error = TooFast(self._limits.frames_per_s)
+        if frame.has_management:
+            with suppress(BadJson, BadField, UnknownManager):
+                management = self._management(frame)
+                if isinstance(management, GoOffline):
+                    self._frame(frame, events)
+                    return
+                if isinstance(management, Registration):
+                    events.append(_refusal(management, error))
+        raise error
+
+    def _management(self, frame: Frame) -> Management | Custom:
+        most = CONFIGURATION_BYTES if self.state is GREETED else MANAGEMENT_BYTES
+        return decode_management(frame.management, self._custom, most)
+
     def _frame(self, frame: Frame, events: list[Event]) -> None:
         if frame.has_management:
-            management = decode_management(frame.management, self._custom)
+            management = self._management(frame)
             if isinstance(management, Configuration):
                 self._configure(management, events)
                 return
@@ -295,7 +371,12 @@ class Peer:
                 self._go_offline(management, events)
                 return
             if self.state is ONLINE:
-                events.append(self._manage(management, frame))
+                try:
+                    events.append(self._manage(management, frame))
+                except WireError as error:
+                    if isinstance(management, Registration):
+                        events.append(_refusal(management, error))
+                    raise
                 return
         elif self.state is ONLINE:
             events.append(self._sent(frame))
@@ -332,8 +413,7 @@ class Peer:
             try:
                 self._frame(frame, events)
             except WireError as error:
-                self.drops[type(error).__name__] += 1
-                events.append(Rejected(error))
+                self._reject(error, 1, events)
 
     def _go_offline(self, message: GoOffline, events: list[Event]) -> None:
         if message.agent_id not in {0, self.agent_id, *self.former_ids}:
@@ -372,10 +452,6 @@ class Peer:
         return Streamed(sent.frame, sent.metadata, stream.targets())
 
     def _sent(self, frame: Frame) -> Sent:
-        if self._limits.frames_per_s:
-            if self._credit < 1.0:
-                raise TooFast(self._limits.frames_per_s)
-            self._credit -= 1.0
         raw = frame.metadata
         known = self._metadata.get(raw)
         if known is None:
@@ -410,3 +486,16 @@ class Peer:
 
     def _gone(self) -> bool:
         return self.state is GONE
+
+
+def _refusal(registration: Registration, error: WireError) -> RegistrationRefused:
+    """What the agent is told; no robot has heard of it."""
+    return RegistrationRefused(
+        NodeRefused(
+            robot_id=0,
+            node_type=registration.node_type,
+            node_name=registration.node_name,
+            tos_name=registration.tos_name,
+            reason=str(error)[:REASON_CHARACTERS],
+        )
+    )

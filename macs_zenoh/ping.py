@@ -6,6 +6,7 @@ import msgspec
 
 from .config import MeshSettings
 from .errors import BadJson
+from .limits import REQUEST_BYTES
 from .wire import Buffer, encode_message, split_message
 
 
@@ -54,8 +55,8 @@ def encode(said: Pong, echo: Buffer = b"") -> bytes:
 
 
 def decode(answer: bytes) -> tuple[Pong, bytes]:
-    """Take an answer apart. Raises BadSizes, BadJson."""
-    metadata, echo = split_message(answer)
+    """Take an answer apart. Raises BadSizes, TooLong, BadJson."""
+    metadata, echo = split_message(answer, REQUEST_BYTES)
     try:
         return msgspec.json.decode(metadata, type=Pong), bytes(echo)
     except msgspec.MsgspecError as error:

@@ -22,7 +22,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from .errors import BadSizes, FrameTooLarge, OutOfRange, TooManyDestinations
+from .errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations
+from .limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES
 
 MAX_FRAME_BYTES = 32 << 20
 """Default limit of a whole frame; camera frames of 20 MiB pass."""
@@ -215,7 +216,8 @@ class Frame:
         return memoryview(self.data)[self._body_at : self._size]
 
     def check(self) -> None:
-        """Raise BadSizes unless the sizes inside the message add up. A frame that fails must never be forwarded."""
+        """Raise BadSizes unless the sizes inside the message add up, TooLong when its metadata is more than any needs.
+        A frame that fails must never be forwarded."""
         self._body_at = _body_at(self.data, self._message_at, self._size)
 
     def each(self) -> Iterator[Frame]:
@@ -255,13 +257,15 @@ def is_probe(data: Buffer, layout: Layout = MACS) -> bool:
 
 
 def parse_frame(data: bytes | bytearray, layout: Layout = MACS) -> Frame:
-    """Take ``data`` as exactly one frame, check all of its sizes and return it. Raises BadSizes."""
+    """Take ``data`` as exactly one frame, check all of its sizes and return it. Raises BadSizes, TooLong."""
     if len(data) < layout.header_bytes:
         raise BadSizes("header", layout.header_bytes, len(data))
     management_bytes, message_bytes = _SIZES.unpack_from(data, layout.destination_bytes)
     declared = layout.header_bytes + management_bytes + message_bytes
     if declared != len(data):
         raise BadSizes("frame", declared, len(data))
+    if management_bytes > MANAGEMENT_BYTES:
+        raise TooLong("management data", management_bytes, MANAGEMENT_BYTES)
     frame = Frame(data, layout, layout.header_bytes + management_bytes, declared)
     frame.check()
     return frame
@@ -272,7 +276,7 @@ def parse_frames(data: bytes | bytearray, layout: Layout = MACS, *, runs: bool =
     those that begin alike as one.
 
     That is what a sample on the mesh carries: frames that one sender sent the same way at once. A probe (`PROBE`)
-    carries none. Raises BadSizes.
+    carries none. Raises BadSizes, TooLong.
     """
     frames: list[Frame] = []
     start, end = 0, len(data)
@@ -288,6 +292,8 @@ def parse_frames(data: bytes | bytearray, layout: Layout = MACS, *, runs: bool =
         stop = start + size
         if stop > end:
             raise BadSizes("frame", size, end - start)
+        if management_bytes > MANAGEMENT_BYTES:
+            raise TooLong("management data", management_bytes, MANAGEMENT_BYTES)
         if runs and stop != end and not management_bytes:
             stop = _run_end(data, start, message_at, size, end)
         frame = Frame(data[start:stop] if start or stop != end else data, layout, message_at, size)
@@ -303,9 +309,10 @@ def _run_end(data: bytes | bytearray, start: int, message_at: int, size: int, en
     head_bytes = message_at + MESSAGE_OVERHEAD
     if size < head_bytes:
         return start + size
-    head_bytes += _U32.unpack_from(data, start + message_at)[0]
-    if head_bytes > size:
-        return start + size  # its sizes do not add up
+    metadata_bytes = _U32.unpack_from(data, start + message_at)[0]
+    head_bytes += metadata_bytes
+    if head_bytes > size or metadata_bytes > METADATA_BYTES:
+        return start + size  # it will be refused
     head = data[start : start + head_bytes]
     at = start + size
     while at + size <= end and data.startswith(head, at):
@@ -332,20 +339,22 @@ def encode_message(metadata: bytes, data: Buffer = b"") -> bytes:
     return b"".join((_U32.pack(len(metadata)), metadata, _U32.pack(len(data)), data))
 
 
-def split_message(message: Buffer) -> tuple[bytes, memoryview]:
-    """Take a message apart into metadata JSON and data (a view into ``message``). Raises BadSizes."""
-    at = _body_at(message, 0, len(message))
+def split_message(message: Buffer, max_metadata_bytes: int = METADATA_BYTES) -> tuple[bytes, memoryview]:
+    """Take a message apart into metadata JSON and data (a view into ``message``). Raises BadSizes, TooLong."""
+    at = _body_at(message, 0, len(message), max_metadata_bytes)
     view = memoryview(message)
     return bytes(view[4 : at - 4]), view[at:]
 
 
-def _body_at(buffer: Buffer, at: int, size: int) -> int:
-    """Where the data starts of the message from ``at`` to ``size``. Raises BadSizes."""
+def _body_at(buffer: Buffer, at: int, size: int, max_metadata_bytes: int = METADATA_BYTES) -> int:
+    """Where the data starts of the message from ``at`` to ``size``. Raises BadSizes, TooLong."""
     try:
         metadata_bytes = _U32.unpack_from(buffer, at)[0]
         body_at: int = at + MESSAGE_OVERHEAD + metadata_bytes
         if body_at + _U32.unpack_from(buffer, body_at - 4)[0] == size:
-            return body_at
+            if metadata_bytes <= max_metadata_bytes:
+                return body_at
+            raise TooLong("metadata", metadata_bytes, max_metadata_bytes)
     except struct.error:
         pass
     available = size - at - MESSAGE_OVERHEAD
@@ -366,6 +375,9 @@ class FrameDecoder:
 
     A frame above the limit finishes the decoder, because the next one cannot be found: the frames before it are
     still returned, `error` is set, and whatever follows is ignored.
+
+    A frame whose management data or metadata alone is more than any needs is left out and not stored: its bytes are
+    skipped as they come. `refused` has why; who reads it empties it.
     """
 
     SMALL_BYTES = 64 << 10
@@ -384,12 +396,25 @@ class FrameDecoder:
         self.max_frame_bytes = max_frame_bytes
         self.layout = layout
         self.error: FrameTooLarge | None = None
+        self.refused: list[TooLong] = []
         self.runs = runs
         self._scratch = memoryview(scratch if scratch is not None else bytearray(self.SMALL_BYTES))
         self._partial = bytearray()  # a frame that has begun; its length is what is reserved, not what has come
         self._filled = 0
         self._message_at = 0
         self._wanted = 0  # size of the whole partial frame; 0 while its header is incomplete
+        self._judged = True  # whether the size of its metadata was looked at
+        self._skip = 0  # bytes of a refused frame that are still to come
+
+    @property
+    def begun(self) -> int:
+        """How much has come of a frame that has begun and is not whole; 0 when there is none."""
+        return self._filled or len(self._partial)
+
+    @property
+    def partial_bytes(self) -> int:
+        """How much memory a frame that has begun has."""
+        return len(self._partial)
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[Frame]:
         """Take the next bytes of the stream and return the frames that are now whole."""
@@ -410,7 +435,7 @@ class FrameDecoder:
         Never large either: an event loop may fill it many times before anything else gets its turn.
         """
         if not self._wanted:
-            return self._scratch
+            return self._scratch[: self._skip] if self._skip else self._scratch
         if self._filled == len(self._partial):
             self._partial.extend(bytes(min(self._wanted, 2 * self._filled) - self._filled))
         return memoryview(self._partial)[self._filled : self._filled + self.SMALL_BYTES]
@@ -421,7 +446,15 @@ class FrameDecoder:
             return []
         if self._wanted:
             self._filled += size
-            return [self._finish()] if self._filled == self._wanted else []
+            if self._filled == self._wanted:
+                return [self._finish()]
+            if not self._judged:
+                self._judge(memoryview(self._partial)[: self._filled])
+            return []
+        if self._skip:
+            self._skip -= size
+            self._filled = self._filled + size if self._skip else 0
+            return []
         received = self._scratch[:size]
         if self._partial:
             begun = bytes(self._partial) + received
@@ -430,7 +463,9 @@ class FrameDecoder:
         if size >= self.layout.header_bytes:
             management_bytes, message_bytes = _SIZES.unpack_from(received, self.layout.destination_bytes)
             wanted = self.layout.header_bytes + management_bytes + message_bytes
-            if size < wanted <= self.max_frame_bytes:  # the beginning of one large frame: copied once
+            if (
+                size < wanted <= self.max_frame_bytes and management_bytes <= CONFIGURATION_BYTES
+            ):  # the beginning of one large frame: copied once
                 self._begin(received, wanted, self.layout.header_bytes + management_bytes)
                 return []
         return self._cut(bytes(received))
@@ -438,7 +473,7 @@ class FrameDecoder:
     def again(self, size: int, beginning: bytes) -> bytes | None:
         """`advance` for bytes that are a whole frame of this size with this `Frame.beginning`. None when they are
         not, or when they may not be a frame at all: then nothing has happened."""
-        if self._wanted or self._partial or self.error or self._scratch[: len(beginning)] != beginning:
+        if self._wanted or self._partial or self._skip or self.error or self._scratch[: len(beginning)] != beginning:
             return None
         return bytes(self._scratch[:size])
 
@@ -457,6 +492,10 @@ class FrameDecoder:
                 self.error = FrameTooLarge(size, self.max_frame_bytes)
                 return frames
             message_at = header_bytes + management_bytes
+            if management_bytes > CONFIGURATION_BYTES:
+                self._refuse(TooLong("management data", management_bytes, CONFIGURATION_BYTES), size, end - start)
+                start = min(start + size, end)
+                continue
             if size > end - start:
                 self._begin(memoryview(data)[start:], size, message_at)
                 return frames
@@ -474,6 +513,26 @@ class FrameDecoder:
         self._filled = len(data)
         self._message_at = message_at
         self._wanted = wanted
+        self._judged = False
+        self._judge(data)
+
+    def _judge(self, data: memoryview) -> None:
+        """Look at the size of the metadata of the partial frame as soon as it has come."""
+        at = self._message_at
+        if len(data) < at + 4:
+            return
+        self._judged = True
+        metadata_bytes = _U32.unpack_from(data, at)[0]
+        if METADATA_BYTES < metadata_bytes <= self._wanted - at - MESSAGE_OVERHEAD:  # else its sizes do not add up
+            self._refuse(TooLong("metadata", metadata_bytes, METADATA_BYTES), self._wanted, len(data))
+
+    def _refuse(self, error: TooLong, size: int, available: int) -> None:
+        """Let go of a frame of which so much is there."""
+        self.refused.append(error)
+        self._skip = max(0, size - available)
+        self._filled = available if self._skip else 0
+        self._wanted = 0
+        self._partial = bytearray()
 
     def _finish(self) -> Frame:
         frame = Frame(self._partial, self.layout, self._message_at, self._wanted)

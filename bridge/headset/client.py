@@ -30,6 +30,7 @@ from types import TracebackType
 import msgspec
 
 from macs_zenoh.errors import CallTimeout, Unreachable, UsageError, WireError
+from macs_zenoh.limits import ANSWER_BYTES
 from macs_zenoh.messages import (
     BROADCAST,
     EXTENSIONS,
@@ -212,7 +213,7 @@ class Headset:
         self._open[request_id] = answer
         try:
             await self.send_frame(frames.online_request(self.id, request_id))
-            return decode_data(OnlineReply, await asyncio.wait_for(answer, timeout_s))
+            return decode_data(OnlineReply, await asyncio.wait_for(answer, timeout_s), ANSWER_BYTES)
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"router {self.target}", timeout_s) from error
         finally:

@@ -8,6 +8,7 @@ from collections.abc import Collection
 from typing import Literal
 
 from macs_zenoh.errors import MacsError
+from macs_zenoh.limits import ANSWER_BYTES
 from macs_zenoh.messages import Functionality, FunctionalityRequest, decode_data
 
 from .client import Headset
@@ -29,7 +30,7 @@ async def hints(headset: Headset, robots: Collection[int], topic: str, role: Rol
 async def _hint(headset: Headset, robot: int, topic: str, role: Role) -> str:
     try:
         answer = await headset.ask(robot, FunctionalityRequest.manager, timeout_s=PATIENCE_S)
-        return judge(robot, topic, role, decode_data(Functionality, answer))
+        return judge(robot, topic, role, decode_data(Functionality, answer, ANSWER_BYTES))
     except MacsError:  # not every program answers, and the user has not asked this
         return ""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 
 import pytest
 import zenoh
@@ -25,6 +26,7 @@ from macs_zenoh.keyexpr import (
     type_name,
     type_number,
 )
+from macs_zenoh.limits import KEY_BYTES
 
 FORBIDDEN = "/*$?#%"
 """Characters that Zenoh gives a meaning to, and the one that escapes them."""
@@ -48,6 +50,40 @@ NUMBERS: dict[str, st.SearchStrategy[int | str]] = {
 def fields_of(space: Key) -> st.SearchStrategy[dict[str, int | str]]:
     """Any fields of a key space."""
     return st.fixed_dictionaries({name: NUMBERS.get(name, texts) for name in space.fields})
+
+
+# -- what Zenoh would not survive ------------------------------------------------------------------------------------
+
+
+@by_plane
+def test_a_key_is_never_longer_than_zenoh_can_write(plane: str) -> None:
+    """Texts of any length make a key of less than 64 KiB, or are refused; so does what is subscribed to."""
+    space = KEYS[plane]
+    for text in (
+        "x" * 200,
+        "\U0001f916" * 200,
+        "\U0001f916" * 255,
+        "x" * 3061,
+        "x" * 70_000,
+        "\n" * 100_000,
+        "é" * 40_000,
+    ):
+        fields: dict[str, int | str] = {name: 1 if name in NUMBERS else text for name in space.fields}
+        for make in (space.of, space.every):
+            try:
+                key = make(**fields)
+            except UsageError:
+                assert len(text) > 255
+            else:
+                assert len(key.encode()) <= KEY_BYTES < 0xFFFF
+                zenoh.KeyExpr(key)
+
+
+@by_plane
+def test_longer_keys_are_nobodys(plane: str) -> None:
+    """What others put on a key of 60 000 characters is not looked at."""
+    space = KEYS[plane]
+    assert space.parse(re.sub("{.*?}", "7" * 20_000, space.template)) is None
 
 
 # -- there and back --------------------------------------------------------------------------------------------------

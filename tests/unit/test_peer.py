@@ -14,7 +14,16 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from recordings import BY_NAME, RECORDINGS, Recording, one_by_one, reading
 
-from macs_zenoh.errors import BadField, BadJson, BadSizes, FrameTooLarge, NotAllowed, UnknownManager, WireError
+from macs_zenoh.errors import (
+    BadField,
+    BadJson,
+    BadSizes,
+    FrameTooLarge,
+    NotAllowed,
+    TooFast,
+    UnknownManager,
+    WireError,
+)
 from macs_zenoh.messages import (
     MANAGERS,
     OPERATOR,
@@ -26,6 +35,7 @@ from macs_zenoh.messages import (
     Functionality,
     FunctionalityRequest,
     GoOffline,
+    Heartbeat,
     Management,
     Metadata,
     NodeRefused,
@@ -46,6 +56,7 @@ from macs_zenoh.peer import (
     Limits,
     Peer,
     Registering,
+    RegistrationRefused,
     Rejected,
     Sent,
     State,
@@ -593,7 +604,7 @@ def test_a_false_sender_cannot_hide_behind_the_true_one(key: str) -> None:
             BadJson,
         ),
         pytest.param(
-            b'{"new":' + b"[" * 200_000 + b"]" * 200_000 + b"}",
+            b'{"new":' + b"[" * 2000 + b"]" * 2000 + b"}",
             BadJson,
         ),
     ],
@@ -610,8 +621,8 @@ def test_long_metadata_is_forgotten() -> None:
     """Metadata that an agent makes up costs memory only while its frame is read."""
     peer = online()
     raws = [
-        encode_frame(UNITY, [5], message=encode_message(b'{"new":"%d%s"}' % (number, b"x" * 100_000)))
-        for number in range(20)
+        encode_frame(UNITY, [5], message=encode_message(b'{"new":"%d%s"}' % (number, b"x" * 4000)))
+        for number in range(600)
     ]
     tracemalloc.start()
     try:
@@ -732,7 +743,8 @@ def test_frames_beyond_the_rate_are_dropped() -> None:
     assert count_sent(peer, 15, 0.0) == 10
     assert count_sent(peer, 5, 0.25) == 2
     assert peer.drops == {"TooFast": 8}
-    assert peer.receive(configuration(group=3), 0.25) == [Joined(UNITY, 3, None)]
+    assert errors(peer.receive(configuration(group=3), 0.25)) == [TooFast]
+    assert peer.receive(configuration(group=3), 0.35) == [Joined(UNITY, 3, None)]
     assert count_sent(peer, 15, 4.0) == 10
 
 
@@ -740,6 +752,149 @@ def test_a_slow_rate_lets_something_through() -> None:
     """With less than one frame per second allowed, one passes in each such time."""
     peer = online(limits=LIMITS._replace(frames_per_s=0.5))
     assert [count_sent(peer, 1, now) for now in (0.0, 1.0, 2.0, 3.0, 4.0)] == [1, 0, 1, 0, 1]
+
+
+def registration(name: str = "nd_x", body: bytes | None = None, robots: Iterable[int] = (1,)) -> bytes:
+    """A headset's registration on a node."""
+    management = encode_management(Registration(7, 1, name, list(robots), tos_name="/x"))
+    metadata = Metadata(UNITY, 7, message_manager=AddNode.manager).encode()
+    node = encode_data(AddNode(UNITY, 7, 1, name, "/x", "std_msgs/String"))
+    return encode_frame(management=management, message=encode_message(metadata, node if body is None else body))
+
+
+EVERY_KIND = {
+    "message": message(),
+    "registration": registration(),
+    "question": encode_frame(management=encode_management(OnlineRequest(UNITY, 7)), message=encode_message(b"")),
+    "heartbeat": encode_frame(management=encode_management(Heartbeat())),
+    "configuration": configuration(group=3),
+    "no JSON": encode_frame(management=b"{"),
+}
+
+
+@pytest.mark.parametrize("raw", EVERY_KIND.values(), ids=EVERY_KIND)
+def test_every_kind_of_frame_counts(raw: bytes) -> None:
+    """Whatever an agent sends takes its credit, so that none is left for messages."""
+    peer = online(limits=LIMITS._replace(frames_per_s=10.0))
+    for _ in range(500):
+        peer.receive(raw, 0.0)
+    assert count_sent(peer, 5, 0.0) == 0
+    assert peer.drops["TooFast"] >= 490
+    assert count_sent(peer, 5, 1.0) == 5
+
+
+def test_a_registration_beyond_the_rate_is_answered() -> None:
+    """Who registers too fast hears of it, and nothing else comes of it."""
+    peer = online(limits=LIMITS._replace(frames_per_s=1.0))
+    assert [type(event) for event in peer.receive(registration(), 0.0)] == [Registering]
+    told, rejected = peer.receive(registration("nd_y"), 0.0)
+    assert isinstance(told, RegistrationRefused)
+    assert (told.refused.node_name, told.refused.tos_name, told.refused.robot_id) == ("nd_y", "/x", 0)
+    assert told.refused.reason == "more than 1 frames/s"
+    assert errors([rejected]) == [TooFast]
+    assert peer.state is State.ONLINE
+
+
+def test_who_is_too_fast_may_still_leave() -> None:
+    """Going offline is heard at any rate."""
+    peer = online(limits=LIMITS._replace(frames_per_s=1.0))
+    events = peer.receive(message() * 5 + encode_frame(management=encode_management(GoOffline(7))), 0.0)
+    assert isinstance(events[-1], Left)
+
+
+def test_credit_is_that_of_the_connection_before() -> None:
+    """A new connection that is given spent credit has none."""
+    limits = LIMITS._replace(frames_per_s=10.0)
+    first = online(limits=limits)
+    assert count_sent(first, 20, 0.0) == 10
+    second = Peer(8, 43, 0.5, limits=limits, credit=first.credit)
+    second.receive(configuration(), 0.5)
+    assert count_sent(second, 20, 0.5) == 5
+
+
+@pytest.mark.parametrize("name", ["", "x" * 70_000, "a\x1b[2J", "a\nb"])
+def test_a_registration_with_a_name_that_is_none_is_answered(name: str) -> None:
+    """A name that cannot be a node's costs that frame; who sent it is told as far as it can be said."""
+    peer = online()
+    events = peer.receive(registration(name), 1.0)
+    assert not any(isinstance(event, Registering) for event in events)
+    assert len(errors(events)) == 1
+    assert peer.state is State.ONLINE
+    plain = registration(body=encode_data(AddNode(UNITY, 7, 1, name, "/x", "std_msgs/String")))
+    told, rejected = peer.receive(plain, 1.0)
+    assert isinstance(told, RegistrationRefused)
+    assert told.refused.reason == str(getattr(rejected, "error", ""))[:500]
+
+
+def test_a_registration_names_a_thousand_robots_at_most() -> None:
+    """65 535 robots in one registration are refused; 1 024 are not."""
+    peer = online(limits=LIMITS._replace(max_frame_bytes=32 << 20))
+    assert [type(event) for event in peer.receive(registration(robots=range(1, 1025)), 1.0)] == [Registering]
+    assert len(errors(peer.receive(registration(robots=range(1, 1026)), 1.0))) == 1
+    assert len(errors(peer.receive(registration(robots=range(1, 65_536)), 1.0))) == 1
+    assert peer.drops.total() == 2
+
+
+# -- frames that do not end ------------------------------------------------------------------------------------------
+
+
+SLOW = LIMITS._replace(max_frame_bytes=32 << 20, partial_bytes_per_s=1000.0, partial_window_s=10.0)
+
+
+def drip(peer: Peer, size: int, each_s: float, until_s: float, start_s: float = 0.0) -> list[Event]:
+    """So many bytes of zeros in each such time, with what `tick` says in between."""
+    events: list[Event] = []
+    now = start_s
+    while now < until_s and not events:
+        now += each_s
+        events += peer.receive(bytes(size), now)
+        events += peer.tick(max(now, min(peer.next_deadline(), now + each_s / 2)))
+    return events
+
+
+@pytest.mark.parametrize("begun", [MACS.pack(2, [1], [], 0, 31 << 20) + bytes(15 << 20), MACS.pack(2, [1])[:20]])
+def test_a_frame_that_does_not_go_on_ends_its_connection(begun: bytes) -> None:
+    """A byte every few seconds keeps no half frame alive, nor half a header."""
+    peer = online(limits=SLOW)
+    assert peer.receive(begun, 0.0) == []
+    events = drip(peer, 1, 4.0, 26.0)
+    assert [type(event) for event in events] == [Left]
+    assert peer.drops == {"unfinished_frame": 1}
+
+
+def test_a_frame_that_is_slow_is_waited_for() -> None:
+    """As long as enough comes of it in each window, a large frame may take its time."""
+    peer = online(limits=SLOW)
+    size = 200_000
+    whole = encode_frame(UNITY, [5], message=encode_message(Metadata(UNITY, 7).encode(), bytes(size)))
+    now = 0.0
+    events: list[Event] = []
+    for at in range(0, len(whole), 4000):
+        now += 3.0
+        events += peer.receive(whole[at : at + 4000], now) + peer.tick(now)
+    assert [type(event) for event in events] == [Sent]
+    assert peer.partial_bytes == 0
+
+
+def test_frames_one_after_the_other_are_none_that_does_not_end() -> None:
+    """An agent whose reads always end within a frame is judged frame by frame."""
+    peer = online(limits=SLOW)
+    stream = message() * 200
+    now = 0.0
+    for at in range(0, len(stream), 50):
+        now += 0.5
+        assert not [
+            event for event in peer.receive(stream[at : at + 50], now) + peer.tick(now) if isinstance(event, Left)
+        ]
+
+
+def test_what_a_half_frame_costs_is_known() -> None:
+    """The memory of a frame that has begun can be asked for, and is given back with its end."""
+    peer = online(limits=SLOW)
+    peer.receive(MACS.pack(2, [1], [], 0, 10 << 20) + bytes(5 << 20), 0.0)
+    assert 5 << 20 <= peer.partial_bytes <= 10 << 20
+    peer.receive(bytes(5 << 20), 1.0)
+    assert peer.partial_bytes == 0
 
 
 # -- hostile bytes ---------------------------------------------------------------------------------------------------

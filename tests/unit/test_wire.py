@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import tracemalloc
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from typing import NamedTuple
 
 import pytest
@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import cut_around, one_by_one
 
-from macs_zenoh.errors import BadSizes, FrameTooLarge, OutOfRange, TooManyDestinations
+from macs_zenoh.errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations
+from macs_zenoh.limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES
 from macs_zenoh.wire import (
     COPY_BYTES,
     EMPTY_MESSAGE,
@@ -366,6 +367,59 @@ def test_messages_have_a_limit_too() -> None:
         with pytest.raises(FrameTooLarge) as raised:
             MessageDecoder(100).feed(encode_message(metadata, body))
         assert (raised.value.size, raised.value.limit) == (101, 100)
+
+
+# -- what is parsed is small ------------------------------------------------------------------------------------------
+
+
+BIG = 20 << 20
+
+GOOD = encode_frame(2, [3], message=encode_message(b"{}", b"data"))
+
+OVERSIZED = [
+    (encode_frame(management=b"x" * BIG), "management data"),
+    (encode_frame(management=b"x" * (CONFIGURATION_BYTES + 1)), "management data"),
+    (encode_frame(2, [3], message=encode_message(b"x" * BIG)), "metadata"),
+    (encode_frame(2, [3], message=encode_message(b"x" * (METADATA_BYTES + 1), bytes(1 << 20))), "metadata"),
+    (encode_frame(management=b"{}", message=encode_message(b"x" * 100_000)), "metadata"),
+]
+
+
+@pytest.mark.parametrize(("frame", "what"), OVERSIZED, ids=[f"{what} of {len(f)}" for f, what in OVERSIZED])
+@pytest.mark.parametrize("piece", [1 << 30, 65_536, 10_000, 43, 39])
+def test_what_is_too_long_to_parse_is_skipped_and_not_stored(frame: bytes, what: str, piece: int) -> None:
+    """A frame whose management data or metadata alone is too large costs itself, told once, and hardly any memory,
+    whatever the pieces in which it comes; the frames around it are whole."""
+    if len(frame) > 10_000 * piece:
+        piece = 3000
+    decoder = FrameDecoder()
+    whole = GOOD + frame + GOOD
+    most = 0
+    found = []
+    for start in range(0, len(whole), piece):
+        found += decoder.feed(memoryview(whole)[start : start + piece])
+        most = max(most, decoder.partial_bytes)
+    assert [bytes(one.data) for one in found if one.message_at < 200_000] == [GOOD, GOOD]
+    assert [error.what for error in decoder.refused] == [what]
+    assert decoder.error is None
+    assert (decoder.begun, decoder.partial_bytes) == (0, 0)
+    assert most <= 2 * decoder.SMALL_BYTES
+
+
+def test_whole_frames_are_judged_like_those_in_pieces() -> None:
+    """Metadata of exactly the limit passes, a byte more is refused; in a sample management data as well."""
+    for size, passes in ((METADATA_BYTES, True), (METADATA_BYTES + 1, False)):
+        frame = encode_frame(2, [3], message=encode_message(b"x" * size, b"data"))
+        for read in (parse_frame, lambda data: parse_frames(data, runs=True)):
+            with nullcontext() if passes else pytest.raises(TooLong):
+                read(frame)
+        with nullcontext() if passes else pytest.raises(TooLong):
+            split_message(frame[39:])
+    for size, passes in ((MANAGEMENT_BYTES, True), (MANAGEMENT_BYTES + 1, False)):
+        frame = encode_frame(management=b"x" * size, message=encode_message(b"{}", b"data"))
+        for read in (parse_frame, lambda data: parse_frames(data, runs=True)):
+            with nullcontext() if passes else pytest.raises(TooLong):
+                read(frame)
 
 
 # -- receiving straight into the decoder -----------------------------------------------------------------------------
