@@ -283,7 +283,7 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     max_frame_bytes: Bytes = 32 * 1024 * 1024
     """A larger declared frame closes its connection before a byte of it is stored."""
     max_frames_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0
-    """What one connection may send to others; the rest is dropped and counted. 0: no limit."""
+    """Frames of every kind from one connection; the rest is dropped and counted. 0: no limit."""
     handshake_s: Seconds = 10.0
     """A connection that has not configured itself by then is closed."""
     silence_s: Seconds = 10.0

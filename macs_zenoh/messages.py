@@ -28,7 +28,6 @@ from .limits import (
     METADATA_BYTES,
     NAME_BYTES,
     NESTING,
-    NODE_AGENTS,
     REQUEST_BYTES,
 )
 
@@ -189,16 +188,17 @@ class OnlineReply(Struct, frozen=True, rename="camel"):
 
 
 class Registration(Management, frozen=True):
-    """Headset → router → robots: add or remove an interface node. The message inside says which."""
+    """Headset → router → robots: add or remove an interface node. The message inside says which, and is judged: the
+    names here are only for telling who sent it."""
 
     manager: ClassVar[str] = "RosAgentNodeRegistrationForwarder"
     registrant_agent_id: AgentId
     node_type: Annotated[int, Meta(ge=0, le=255)]
-    node_name: Name
-    registrar_agent_ids: Annotated[list[AgentId], Meta(max_length=NODE_AGENTS)] = []
-    registrar_group_ids: Annotated[list[GroupId], Meta(max_length=NODE_AGENTS)] = []
-    tos_name: Name = ""
-    data_exchange_type: Name = ""
+    node_name: str
+    registrar_agent_ids: list[AgentId] = []
+    registrar_group_ids: list[GroupId] = []
+    tos_name: str = ""
+    data_exchange_type: str = ""
 
 
 class AddNode(Management, frozen=True):

@@ -22,7 +22,15 @@ from msgspec import Struct, structs
 
 from .credit import Credit
 from .errors import BadField, BadJson, NotAllowed, TooFast, UnknownManager, WireError
-from .limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, PARTIAL_BYTES_PER_S, PARTIAL_WINDOW_S, REASON_CHARACTERS
+from .limits import (
+    CONFIGURATION_BYTES,
+    MANAGEMENT_BYTES,
+    NAME_BYTES,
+    NODE_AGENTS,
+    PARTIAL_BYTES_PER_S,
+    PARTIAL_WINDOW_S,
+    REASON_CHARACTERS,
+)
 from .messages import (
     NO_CUSTOM,
     OPERATOR,
@@ -359,9 +367,18 @@ class Peer:
         most = CONFIGURATION_BYTES if self.state is GREETED else MANAGEMENT_BYTES
         return decode_management(frame.management, self._custom, most)
 
+    def _read_management(self, frame: Frame, events: list[Event]) -> Management | Custom:
+        """The same; who meant to register hears why it cannot be read."""
+        try:
+            return self._management(frame)
+        except WireError as error:
+            if Registration.manager.encode() in frame.management:
+                events.append(_refusal(None, error))
+            raise
+
     def _frame(self, frame: Frame, events: list[Event]) -> None:
         if frame.has_management:
-            management = self._management(frame)
+            management = self._read_management(frame, events)
             if isinstance(management, Configuration):
                 self._configure(management, events)
                 return
@@ -432,6 +449,9 @@ class Peer:
         raise NotAllowed(f"{management.manager} is not for an agent to send")
 
     def _registration(self, registration: Registration, frame: Frame) -> Registering:
+        named = max(len(registration.registrar_agent_ids), len(registration.registrar_group_ids))
+        if named > NODE_AGENTS:
+            raise BadField("registration", f"it names {named} robots or groups, at most {NODE_AGENTS} are allowed")
         manager = self._decode(frame).message_manager
         node: AddNode | RemoveNode
         if manager == AddNode.manager:
@@ -488,14 +508,14 @@ class Peer:
         return self.state is GONE
 
 
-def _refusal(registration: Registration, error: WireError) -> RegistrationRefused:
-    """What the agent is told; no robot has heard of it."""
-    return RegistrationRefused(
-        NodeRefused(
-            robot_id=0,
+def _refusal(registration: Registration | None, error: WireError) -> RegistrationRefused:
+    """What the agent is told, with its own words as far as they can be read; no robot has heard of it."""
+    refused = NodeRefused(0, 0, "", "", str(error)[:REASON_CHARACTERS])
+    if registration is not None:
+        refused = structs.replace(
+            refused,
             node_type=registration.node_type,
-            node_name=registration.node_name,
-            tos_name=registration.tos_name,
-            reason=str(error)[:REASON_CHARACTERS],
+            node_name=registration.node_name[:NAME_BYTES],
+            tos_name=registration.tos_name[:NAME_BYTES],
         )
-    )
+    return RegistrationRefused(refused)

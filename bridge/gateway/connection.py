@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import logging
 import socket
+import sys
+import termios
 import threading
 import time
 from collections import Counter
@@ -23,6 +26,10 @@ log = logging.getLogger("macs.gateway")
 
 WRITE_BUFFER_BYTES = 256 << 10
 """What the transport may hold before messages wait in the outbox, where a call can still overtake topic data."""
+
+
+READ_S = 0.02
+"""How long what waits in a socket has before the agent's time is looked at again."""
 
 
 class Owner(Protocol):
@@ -77,6 +84,9 @@ class Connection(asyncio.BufferedProtocol):
         self._told: dict[tuple[int, int, int, str], AddNode] = {}
         self._refused = False
         self._pauses = 0
+        self._unread = 0
+        """Of what waited in the socket when the agent's time had run out: how much is still to be read."""
+        self._looked = False
         self.congested = False
         """Whether so much waits for this agent that its senders should slow down."""
         self.brake = Brake()
@@ -130,6 +140,7 @@ class Connection(asyncio.BufferedProtocol):
         return self.peer.space()
 
     def buffer_updated(self, nbytes: int) -> None:
+        self._unread -= nbytes
         self._events(self.peer.advance(nbytes, time.monotonic()))
 
     def pause_writing(self) -> None:
@@ -163,17 +174,31 @@ class Connection(asyncio.BufferedProtocol):
 
     def _events(self, events: list[Event]) -> None:
         for event in events:
-            if type(event) is Sent:
-                self.owner.forward(self, event)
-            elif isinstance(event, Rejected):
-                self._warn_once(type(event.error).__name__, str(event.error))  # the peer has counted it
-            elif isinstance(event, Left):
-                self.close(event.reason)
-            else:
-                self.owner.handle(self, event)
-                if isinstance(event, Joined):
-                    self._schedule()  # from now on silence counts, which may be less than what the handshake has
-        self.owner.received(self)
+            try:
+                if type(event) is Sent:
+                    self.owner.forward(self, event)
+                elif isinstance(event, Rejected):
+                    self._warn_once(type(event.error).__name__, str(event.error))  # the peer has counted it
+                elif isinstance(event, Left):
+                    self.close(event.reason)
+                else:
+                    self.owner.handle(self, event)
+                    if isinstance(event, Joined):
+                        self._schedule()  # from now on silence counts, which may be less than what the handshake has
+            except Exception:  # ours to mend; this agent goes on, and so do all others
+                if self._fails():
+                    log.exception("%s: %s failed (logged once, counted as failed)", self, type(event).__name__)
+        try:
+            self.owner.received(self)
+        except Exception:
+            if self._fails():
+                log.exception("%s: what it sent failed (logged once, counted as failed)", self)
+
+    def _fails(self) -> bool:
+        """What this agent said could not be carried out, for a reason that nobody thought of; whether that is the
+        first time."""
+        self.drops["failed"] += 1
+        return self.drops["failed"] == 1
 
     # -- out -----------------------------------------------------------------------------------------------------
 
@@ -348,15 +373,37 @@ class Connection(asyncio.BufferedProtocol):
         if self._paused_at is not None:
             due = min(due, self._paused_at + self._stall_s)
         delay_s = max(0.0, due - time.monotonic()) + 0.001
+        if self._unread > 0:
+            delay_s = max(delay_s, READ_S)
         self._timer = asyncio.get_running_loop().call_later(delay_s, self._tick)
 
     def _tick(self) -> None:
         now = time.monotonic()
-        self._events(self.peer.tick(now))
+        if now < self.peer.next_deadline() or not self._must_be_read():
+            self._events(self.peer.tick(now))
         if self._paused_at is not None and now >= self._paused_at + self._stall_s:
             self.close(f"it has not read for {self._stall_s:g} s")
         if self.peer.state is not State.GONE:
             self._schedule()
+
+    def _must_be_read(self) -> bool:
+        """Whether the agent's time has run out, but not all of what it had sent by then was looked at: the loop may
+        have been held up, or reading paused. What comes later does not count, so that nobody can put that off."""
+        if not self._looked:
+            self._looked = True
+            self._unread = _waiting_bytes(self._transport.get_extra_info("socket"))
+        if self._unread > 0:
+            return True
+        self._looked = False
+        return False
+
+
+def _waiting_bytes(sock: socket.socket) -> int:
+    """How much has come that nobody has read."""
+    try:
+        return int.from_bytes(fcntl.ioctl(sock.fileno(), termios.FIONREAD, bytes(4)), sys.byteorder)
+    except OSError:  # it is closed
+        return 0
 
 
 def _tune(sock: socket.socket) -> None:

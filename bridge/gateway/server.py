@@ -33,7 +33,18 @@ from macs_zenoh.messages import (
     OnlineReply,
     encode_data,
 )
-from macs_zenoh.peer import Asked, AskedOnline, Event, Joined, Limits, Peer, Registering, Sent, Streamed
+from macs_zenoh.peer import (
+    Asked,
+    AskedOnline,
+    Event,
+    Joined,
+    Limits,
+    Peer,
+    Registering,
+    RegistrationRefused,
+    Sent,
+    Streamed,
+)
 from macs_zenoh.presence import Presence
 from macs_zenoh.registrations import AgentKey, Streams
 from macs_zenoh.routing import keys_of
@@ -363,6 +374,8 @@ class Gateway:
             if isinstance(event.node, AddNode):
                 connection.registered(event.node.node_name, event.node.node_type)
             self._robots.register(event.node, event.robot_ids, event.groups)
+        elif isinstance(event, RegistrationRefused):
+            self._tell_refusal(connection.key, event.refused)
         elif isinstance(event, AskedOnline):
             self._answer_online(connection, event.request_id)
         elif isinstance(event, Asked):

@@ -1,0 +1,219 @@
+"""What one agent says costs nobody else anything, whatever its size and whatever it names."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from contextlib import ExitStack, suppress
+
+import pytest
+
+import macs_zenoh
+from bridge.headset.client import Headset
+from macs_zenoh.messages import (
+    AddNode,
+    Configuration,
+    Metadata,
+    NodeRefused,
+    Registration,
+    decode_data,
+    encode_data,
+    encode_management,
+)
+from macs_zenoh.wire import MACS, MessageDecoder, encode_frame, encode_message, split_message
+from tests.integration.conftest import Connect, StartGateway, until
+from tests.integration.test_limits import answers, memory_bytes, site
+
+MANY_KEYS = b"{%s}" % ",".join(f'"key{n}":0' for n in range(2_200_000)).encode()
+LISTS = b'{"messageManager":"OnlineAgentsGetter","x":[%s0]}' % (b"[]," * (10 << 20))
+
+
+def registration(name: str, group: int = 0, robots: tuple[int, ...] = (), body: bytes | None = None) -> bytes:
+    """A headset's registration on a topic, whatever the name."""
+    node = encode_data(AddNode(2, 1, 1, name, "/x", "std_msgs/String")) if body is None else body
+    management = Registration(1, 1, name if body is None else "nd_x", list(robots), [group] if group else [], "/x")
+    metadata = Metadata(2, 1, message_manager=AddNode.manager).encode()
+    return encode_frame(management=encode_management(management), message=encode_message(metadata, node))
+
+
+class Raw:
+    """A TCP agent that sends whatever it is told to."""
+
+    def __init__(self, port: int, agent_type: int = 2, group: int = 0) -> None:
+        self.socket = socket.create_connection(("127.0.0.1", port), timeout=20)
+        self.decoder = MessageDecoder()
+        self.messages: list[tuple[Metadata, bytes]] = []
+        self.socket.sendall(encode_frame(management=encode_management(Configuration(agent_type, 0, group))))
+
+    async def send(self, raw: bytes) -> None:
+        """Send it all, in a thread."""
+        await asyncio.to_thread(self.socket.sendall, raw)
+
+    def read(self) -> list[tuple[Metadata, bytes]]:
+        """All messages that have come so far."""
+        self.socket.setblocking(False)
+        with suppress(BlockingIOError):
+            while data := self.socket.recv(1 << 16):
+                for message in self.decoder.feed(data):
+                    metadata, body = split_message(message)
+                    self.messages.append((Metadata.decode(metadata), bytes(body)))
+        self.socket.settimeout(20)
+        return self.messages
+
+    def refusals(self) -> list[NodeRefused]:
+        """Those that it was told."""
+        return [
+            decode_data(NodeRefused, data) for said, data in self.read() if said.message_manager == NodeRefused.manager
+        ]
+
+
+COSTLY = {
+    "metadata of 2.2 million keys": encode_frame(2, [1], message=encode_message(MANY_KEYS)),
+    "management data of 2.2 million keys": encode_frame(management=MANY_KEYS),
+    "management data of 10 million lists": encode_frame(management=LISTS),
+    "a registration's node of 2.2 million keys": registration("nd_x", robots=(1,), body=MANY_KEYS),
+    "metadata beside management data": encode_frame(management=b"{}", message=encode_message(MANY_KEYS)),
+}
+
+
+@pytest.mark.parametrize("what", COSTLY)
+async def test_a_costly_frame_costs_only_itself(what: str) -> None:
+    """A frame of 30 MB of JSON is not parsed: the gateway answers others meanwhile, its memory comes back, and who
+    sent it stays connected."""
+    async with site() as (_, gateway), await Headset.connect("127.0.0.1", gateway.port) as neighbour:
+        attacker = Raw(gateway.port)
+        await answers(neighbour)
+        before = memory_bytes(gateway.pid)
+        await attacker.send(COSTLY[what])
+        await attacker.send(
+            encode_frame(2, [neighbour.id], message=encode_message(Metadata(2, 0, 1, "Hello").encode()))
+        )
+        message = await asyncio.wait_for(neighbour.receive(), 20)
+        assert message.metadata.message_manager == "Hello"
+        await answers(neighbour)
+        assert memory_bytes(gateway.pid) - before < 48 << 20
+        attacker.socket.close()
+
+
+async def test_names_that_no_key_can_have(start_gateway: StartGateway, connect: Connect, router: str) -> None:
+    """Registrations with a name of 70 000 characters, with none and with control characters are refused and told;
+    headsets that come and register afterwards are served."""
+    gateway = await start_gateway()
+    attacker = Raw(gateway.port)
+    for name in ("x" * 60_000, "", "a\nb", "\x1b[2J"):
+        await attacker.send(registration(name, group=200, robots=(1,)))
+    await until(lambda: len(attacker.refusals()) == 4)
+    assert all(refused.reason for refused in attacker.refusals())
+    async with macs_zenoh.join("ros", id=1, group=200, connect=[router]) as robot:
+
+        async def accept(call: macs_zenoh.Call) -> bytes:
+            return b""
+
+        robot.serve("add_node", accept)
+        neighbour = await connect(gateway)
+        topic = await neighbour.subscribe("/chatter", "std_msgs/String", groups=[200])
+        await until(lambda: any("nd__chatter" in key for key in gateway._delivery.streams))
+        assert topic is not None
+        await answers(neighbour)
+
+
+async def test_topic_data_of_a_robot_under_any_name(start_gateway: StartGateway, connect: Connect) -> None:
+    """A TCP robot that streams under a name of 70 000 characters, or one with control characters, loses those frames
+    and nothing else; nobody else notices."""
+    gateway = await start_gateway()
+    robot = Raw(gateway.port, agent_type=1)
+    neighbour = await connect(gateway)
+    management = b'{"messageManager":"RosAgentSubscriberDataForwarder","destAgents":{"2":[1]}}'
+    for name in ("x" * 70_000, "x" * 3000, "\n", "\U0001f916" * 255):
+        metadata = Metadata(1, 1, 0, "m", 1, name, "std_msgs/String").encode()
+        await robot.send(encode_frame(management=management, message=encode_message(metadata, b"data")))
+    hello = Metadata(1, 1, 0, "Hello").encode()
+    await robot.send(encode_frame(2, [neighbour.id], message=encode_message(hello)))
+    message = await asyncio.wait_for(neighbour.receive(), 20)
+    assert message.metadata.message_manager == "Hello"
+    await answers(await connect(gateway))
+
+
+async def test_what_waits_is_read_before_silence_is_judged(start_gateway: StartGateway) -> None:
+    """A loop that was held up for longer than the silence that ends a connection cuts nobody who has spoken; who
+    really is silent is cut."""
+    gateway = await start_gateway(silence_s=0.5, handshake_s=0.6)
+    with ExitStack() as stack:
+        agents = [Raw(gateway.port) for _ in range(20)]
+        late = [socket.create_connection(("127.0.0.1", gateway.port)) for _ in range(20)]
+        for agent in agents:
+            stack.callback(agent.socket.close)
+        for one in late:
+            stack.callback(one.close)
+        await until(lambda: len(gateway.agents) == 40)
+        await until(lambda: len(list(gateway.agents.online())) == 20)
+        said = encode_frame(management=b'{"messageManager":"HeartbeatHandler"}')
+        big = encode_frame(2, [1], message=encode_message(Metadata(2, 0).encode(), bytes(300_000)))
+        for agent in agents:
+            agent.socket.sendall(big + said)
+        for one in late:
+            one.sendall(encode_frame(management=encode_management(Configuration(2, 0))))
+        time.sleep(1.5)  # nothing else runs here, which is the point
+        online = []
+        for _ in range(30):  # within the silence that is allowed from now on
+            await asyncio.sleep(0.01)
+            online.append(len(list(gateway.agents.online())))
+        assert max(online) == 40
+        await until(lambda: not len(gateway.agents))
+
+
+async def test_half_frames_are_not_kept_for_ever(start_gateway: StartGateway, connect: Connect) -> None:
+    """Who begins a frame and sends a byte of it now and then is cut; who sends a large one slowly is not."""
+    gateway = await start_gateway()
+    gateway._limits = gateway._limits._replace(partial_window_s=1.0, partial_bytes_per_s=10_000)
+    neighbour = await connect(gateway)
+    attacker, slow = Raw(gateway.port), Raw(gateway.port)
+    await attacker.send(MACS.pack(2, [1], [], 0, 30 << 20) + bytes(1 << 20))
+    big = encode_frame(2, [neighbour.id], message=encode_message(Metadata(2, 0, 0, "Big").encode(), bytes(600_000)))
+
+    async def trickle() -> None:
+        with suppress(OSError):
+            while True:
+                await attacker.send(b"\0")
+                await asyncio.sleep(0.1)
+
+    trickling = asyncio.create_task(trickle())
+    for at in range(0, len(big), 100_000):
+        await slow.send(big[at : at + 100_000])
+        await asyncio.sleep(0.5)
+    while (message := await asyncio.wait_for(neighbour.receive(), 20)).metadata.message_manager != "Big":
+        pass
+    assert len(message.data) == 600_000
+    await until(lambda: gateway.drops["unfinished_frame"] == 1, 20)
+    trickling.cancel()
+    await answers(neighbour)
+    slow.socket.close()
+    attacker.socket.close()
+
+
+async def test_a_fault_of_ours_is_contained(
+    start_gateway: StartGateway, connect: Connect, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An exception that nobody thought of, in the work for one agent, cuts neither it nor anybody else; it is counted
+    for the agent whose value it was."""
+    gateway = await start_gateway()
+    attacker = Raw(gateway.port)
+    await until(lambda: len(list(gateway.agents.online())) == 1)
+    real = gateway._answer_online
+
+    def broken(connection: object, request_id: int) -> None:
+        if request_id == 666:
+            raise ZeroDivisionError
+        real(connection, request_id)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(gateway, "_answer_online", broken)
+    question = encode_management(macs_zenoh.messages.OnlineRequest(2, 1))
+    raw = encode_frame(management=question, message=encode_message(Metadata(request_id=666).encode()))
+    await attacker.send(raw * 3 + raw.replace(b"666", b"667"))
+    await until(lambda: any(said.request_id == 667 for said, _ in attacker.read()))
+    await answers(await connect(gateway))
+    (connection,) = [one for one in gateway.agents.online() if one.drops["failed"]]
+    assert connection.drops["failed"] == 3
+    assert sum("logged once, counted as failed" in record.getMessage() for record in caplog.records) == 1
+    attacker.socket.close()
