@@ -20,13 +20,14 @@ from typing import Any
 
 from macs_zenoh.mesh.awake import Awake
 
-from . import awareness, cases, robot_speed
+from . import awareness, cases, robot_speed, scale
 from .figures import Figure, table
 from .plan import Plan
 from .processes import ProgramFailed, Stage
 
 WITH_ROS = {**robot_speed.CASES, **awareness.CASES}
-CASES = {**cases.CASES, **WITH_ROS}
+WITHOUT_ROS = {**cases.CASES, **scale.CASES}
+CASES = {**WITHOUT_ROS, **WITH_ROS}
 
 
 def main() -> int:
@@ -91,7 +92,7 @@ def _possible() -> list[str]:
             print(f"{Awake.DEVICE} may not be written: robot-awake is left out", file=sys.stderr)
         return [name for name in CASES if may_wake or name != "robot-awake"]
     print(f"no rclpy: {', '.join(WITH_ROS)} are left out", file=sys.stderr)
-    return list(cases.CASES)
+    return list(WITHOUT_ROS)
 
 
 def _text(report: dict[str, Any], figures: list[Figure], *, profiled: bool) -> str:

@@ -122,10 +122,10 @@ class Headsets:
         """How long a message is on the wire that carries so much data."""
         return {"message_bytes": len(self._frame(size, [], [])) - MACS.header_bytes}
 
-    def register(self) -> dict[str, Any]:
-        """Every headset registers on the topic of robot 1."""
+    def register(self, robots: int = 1) -> dict[str, Any]:
+        """Every headset registers on the topic of robot 1, or of the first so many."""
         for headset in self.headsets:
-            headset.socket.sendall(frames.registration(headset.id, TOPIC, [1], []))
+            headset.socket.sendall(frames.registration(headset.id, TOPIC, list(range(1, robots + 1)), []))
         return {"registered": len(self.headsets)}
 
     # -- receiving -----------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@
     │   └── OutOfRange
     ├── ConfigError               the configuration
     ├── Refused                   the other end answered, and said no
+    │   └── HeldByAnother
     └── Unreachable               the world
         └── CallTimeout
 
@@ -141,6 +142,14 @@ class Refused(MacsError):
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = reason
+
+
+class HeldByAnother(Refused):
+    """Somebody else has what only one can have. ``holder`` is (agent type, agent id)."""
+
+    def __init__(self, reason: str, holder: tuple[int, int]) -> None:
+        super().__init__(reason)
+        self.holder = holder
 
 
 class Unreachable(MacsError):

@@ -1,7 +1,8 @@
 """What a gateway asks of robots for its headsets: interface nodes added and removed, by calls that are answered.
 
-Each call is one task per robot and node; a newer one for the same node replaces it. A robot that does not answer is
-asked again while it is online; a refusal is final until the headset asks again or the robot comes back.
+Each call is for one robot and node; a newer one for the same node replaces it. A robot that does not answer is asked
+again while it is online; a refusal is final until the headset asks again or the robot comes back. Of the calls to one
+robot only so many are open at one time, and headsets take turns: one that asks for much makes no other wait.
 """
 
 from __future__ import annotations
@@ -10,15 +11,19 @@ import asyncio
 import logging
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 
 from msgspec import structs
 
 from macs_zenoh.directory import Change, Directory
-from macs_zenoh.errors import OutOfRange, Refused, Unreachable
+from macs_zenoh.errors import HeldByAnother, OutOfRange, Refused, Unreachable
+from macs_zenoh.limits import NODE_AGENTS
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.messages import ROS, AddNode, Metadata, NodeRefused, NodeType, RemoveNode, encode_data, node_name
-from macs_zenoh.registrations import AgentKey, Registrations, Robots, Streams, Task
+from macs_zenoh.registrations import AgentKey, Registrations, Robots, StreamKey, Task, removal
 from macs_zenoh.routing import call
+from macs_zenoh.turns import Turns
 from macs_zenoh.wire import Layout
 
 log = logging.getLogger("macs.gateway")
@@ -30,7 +35,26 @@ ATTEMPTS = 120
 MOVE_S = 1.0
 """How long an agent's change to another id waits for a robot."""
 
-TaskKey = tuple[int, AgentKey, int, str]
+OPEN_CALLS = 256
+"""Calls to one robot that may be open at one time."""
+OPEN_CALLS_EACH = 16
+"""Those of one headset among them."""
+CALLS_EACH = 8192
+"""Calls of one headset, to all robots, that may be wanted at one time."""
+
+CallKey = tuple[int, int, str]
+"""(robot id, node type, node name)."""
+
+StreamChanges = list[tuple[StreamKey, set[AgentKey] | None]]
+"""Topics of robots that somebody here is registered on since before, and who; None: nobody any more."""
+
+
+@dataclass(eq=False)
+class _Call:
+    task: Task
+    attempt: int = 0
+    running: asyncio.Task[None] | None = None
+    again: asyncio.TimerHandle | None = None
 
 
 class RobotCalls:
@@ -42,60 +66,86 @@ class RobotCalls:
         directory: Directory,
         layout: Layout,
         *,
-        on_streams: Callable[[Streams], None],
+        on_streams: Callable[[StreamChanges], None],
         on_refused: Callable[[AgentKey, NodeRefused], None],
     ) -> None:
         self._mesh = mesh
-        self._directory = directory
         self._layout = layout
         self._on_streams = on_streams
         self._on_refused = on_refused
         self._registrations = Registrations()
-        self._running: dict[TaskKey, asyncio.Task[None]] = {}
-        self._seen: Robots = {}
+        self._online: Robots = {agent.id: agent.group for agent in directory.of_type(ROS)}
+        self._calls: dict[AgentKey, dict[CallKey, _Call]] = {}
+        self._turns: dict[int, Turns[CallKey, _Call]] = {}
+        self._closed = False
 
     def close(self) -> None:
         """End all calls."""
-        for running in self._running.values():
-            running.cancel()
+        self._closed = True
+        for calls in self._calls.values():
+            for wanted in calls.values():
+                for going_on in (wanted.running, wanted.again):
+                    if going_on is not None:
+                        going_on.cancel()
+        self._calls.clear()
+        self._turns.clear()
 
     def register(self, node: AddNode | RemoveNode, robot_ids: list[int], groups: list[int]) -> None:
         """A headset registers on, or leaves, a node of these robots."""
-        robots = self._robots()
         if isinstance(node, AddNode) and node.node_name != node_name(node.tos_name):  # it would get another's commands
-            self._refused(Task(next(iter(robot_ids), 0), node), f"{node.node_name[:80]!r} is not its node name")
+            self.refuse(node, next(iter(robot_ids), 0), f"{node.node_name[:80]!r} is not its node name")
             return
         if isinstance(node, AddNode):
-            tasks = self._registrations.add(node, robot_ids, groups, robots)
+            if len(robot_ids) > NODE_AGENTS:
+                self.refuse(node, 0, f"a registration names at most {NODE_AGENTS} robots; use groups for more")
+                return
+            tasks = self._registrations.add(node, robot_ids, groups, self._online)
         else:
-            tasks = self._registrations.remove(node, robot_ids, groups, robots)
+            tasks = self._registrations.remove(node, robot_ids, groups, self._online)
         self._streams_changed()
         for task in tasks:
             self._start(task)
 
     def leave(self, agent: AgentKey) -> None:
-        """A headset is gone. Robots drop it when its presence ends; here it is only forgotten."""
+        """A headset is gone. Robots drop it when its presence ends; here it is only forgotten, except for what is on
+        its way: that could reach a robot after the news that the headset has left."""
         self._registrations.leave(agent)
         self._streams_changed()
+        for wanted in self._forget_calls(agent):
+            if wanted.running is not None and isinstance(wanted.task.node, AddNode):
+                self._start(Task(wanted.task.robot_id, removal(wanted.task.node)))
+
+    def count_of(self, agent: AgentKey) -> int:
+        """How many registrations an agent has."""
+        return self._registrations.count_of(agent)
 
     def find(self, agent: AgentKey, node_type: int, node_name: str) -> AddNode | None:
         """What an agent registered on a node."""
         return self._registrations.find(agent, node_type, node_name)
 
     def presence(self, change: Change) -> None:
-        """A robot that comes, comes back or changes its group is told everything that is registered for it."""
+        """A robot that comes, comes back or changes its group is told everything that is registered for it, and what
+        it has to take back of a group that it has left. Where a headset has left, another may have its place."""
         agent, online = change
         if agent.type != ROS:
+            if not online:
+                for task in self._registrations.holder_left(agent.key, self._online):
+                    self._start(task)
             return
-        if online:
-            for task in self._registrations.of_robot(agent.id, agent.group):
-                self._start(task)
+        if not online:
+            self._online.pop(agent.id, None)
+            return
+        was_online = agent.id in self._online
+        self._online[agent.id] = agent.group
+        left = self._registrations.seen(agent.id, agent.group)
         self._streams_changed()
+        for task in [*(left if was_online else ()), *self._registrations.of_robot(agent.id, agent.group)]:
+            self._start(task)
 
     def to_prepare(self, agent: AgentKey, agent_id: int) -> list[Task]:
         """What makes robots know an agent under the id that it is about to have, too. Services, which take one agent
         only, are left to `rename`."""
-        tasks = self._registrations.of_agent(agent, self._robots())
+        tasks = self._registrations.of_agent(agent, self._online)
         nodes = [(task.robot_id, task.node) for task in tasks if task.node.node_type != NodeType.SERVICE]
         return [Task(r, structs.replace(node, registrant_agent_id=agent_id)) for r, node in nodes]
 
@@ -107,18 +157,17 @@ class RobotCalls:
     def take_back(self, tasks: list[Task]) -> None:
         """The agent left before it had the other id. No presence ends under that id, so robots have to be told."""
         for task in tasks:
-            self._start(Task(task.robot_id, _removal(task.node)))
+            self._start(Task(task.robot_id, removal(task.node)))
 
     async def rename(self, agent: AgentKey, agent_id: int, told: list[Task], slow: set[int]) -> None:
         """An agent has another id now; robots forget the one before. ``told`` is what `prepare` gave."""
-        before = self._registrations.of_agent(agent, self._robots())
+        before = self._registrations.of_agent(agent, self._online)
         self._registrations.rename(agent, agent_id)
         self._streams_changed()  # it is registered under the new id
-        for key in [key for key in self._running if key[1] == agent]:
-            self._running.pop(key).cancel()
-        forget = [Task(task.robot_id, _removal(task.node)) for task in before]
+        self._forget_calls(agent)
+        forget = [Task(task.robot_id, removal(task.node)) for task in before]
         forgotten = await self._try(forget, slow)
-        for task in [*forget, *self._registrations.of_agent((agent[0], agent_id), self._robots())]:
+        for task in [*forget, *self._registrations.of_agent((agent[0], agent_id), self._online)]:
             if task not in told and task not in forgotten:
                 self._start(task)
 
@@ -141,62 +190,120 @@ class RobotCalls:
 
     def repeat(self, agent: AgentKey) -> None:
         """Tell robots again everything that one agent registered."""
-        for task in self._registrations.of_agent(agent, self._robots()):
+        for task in self._registrations.of_agent(agent, self._online):
             self._start(task)
 
     def repeat_all(self) -> None:
         """Our own link was lost: robots may have seen our headsets leave, so tell them everything again."""
-        for robot_id, group in self._robots().items():
+        for robot_id, group in self._online.items():
             for task in self._registrations.of_robot(robot_id, group):
                 self._start(task)
 
-    def _robots(self) -> Robots:
-        return {agent.id: agent.group for agent in self._directory.of_type(ROS)}
-
-    def _streams_changed(self) -> None:
-        """Streams of robots that are away stay: a reliable one goes on where it was when its robot is back."""
-        self._seen.update(self._robots())
-        self._on_streams(self._registrations.streams(NodeType.SUBSCRIBER, self._seen))
-
-    def _start(self, task: Task) -> None:
-        node = task.node
-        key = (task.robot_id, (node.registrant_agent_type, node.registrant_agent_id), node.node_type, node.node_name)
-        if (before := self._running.pop(key, None)) is not None:
-            before.cancel()
-        running = asyncio.get_running_loop().create_task(self._run(task))
-        self._running[key] = running
-        running.add_done_callback(lambda done: self._running.pop(key) if self._running.get(key) is done else None)
-
-    async def _run(self, task: Task) -> None:
-        node = task.node
-        what = f"headset {node.registrant_agent_id}: {_describe(node)} on robot {task.robot_id}"
-        for attempt in range(ATTEMPTS):
-            try:
-                await self._ask(task)
-                log.info("%s: done", what)
-                return
-            except (Refused, OutOfRange) as refusal:  # by the robot, or here by a traffic rule
-                log.warning("%s was refused: %s", what, refusal)
-                self._refused(task, str(refusal))
-                return
-            except Unreachable as error:
-                log.debug("%s: %s", what, error)
-            await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
-            if isinstance(node, AddNode) and not self._registrations.holds(task, self._robots()):
-                return  # taken back; or the robot is away, and is told everything when it returns
-        log.warning("%s: the robot does not answer", what)
-
-    def _refused(self, task: Task, reason: str) -> None:
-        node = task.node
+    def refuse(self, node: AddNode | RemoveNode, robot_id: int, reason: str) -> None:
+        """Tell a headset that it does not get a node of a robot, 0 being all of them."""
         if isinstance(node, AddNode):
             refused = NodeRefused(
-                robot_id=task.robot_id,
+                robot_id=robot_id,
                 node_type=node.node_type,
                 node_name=node.node_name,
                 tos_name=node.tos_name,
                 reason=reason,
             )
             self._on_refused((node.registrant_agent_type, node.registrant_agent_id), refused)
+
+    def _streams_changed(self) -> None:
+        changes = list(self._registrations.news())
+        if changes:
+            self._on_streams(changes)
+
+    # -- calls ---------------------------------------------------------------------------------------------------
+
+    def _start(self, task: Task, attempt: int = 0) -> None:
+        agent, key = _keys(task)
+        calls = self._calls.setdefault(agent, {})
+        if (before := calls.pop(key, None)) is not None:
+            self._end(before)
+        if len(calls) >= CALLS_EACH:
+            self.refuse(task.node, task.robot_id, f"{CALLS_EACH} registrations wait already; try again")
+            return
+        wanted = calls[key] = _Call(task, attempt)
+        turns = self._turns.get(task.robot_id)
+        if turns is None:
+            turns = self._turns[task.robot_id] = Turns(OPEN_CALLS_EACH, OPEN_CALLS)
+        turns.put(agent, key, wanted)
+        self._next(task.robot_id, turns)
+
+    def _next(self, robot_id: int, turns: Turns[CallKey, _Call]) -> None:
+        while not self._closed and (turn := turns.take()) is not None:
+            agent, _, wanted = turn
+            wanted.running = asyncio.get_running_loop().create_task(self._run(wanted))
+            wanted.running.add_done_callback(partial(self._has_run, robot_id, turns, agent))
+        if not turns.open and self._turns.get(robot_id) is turns:
+            del self._turns[robot_id]
+
+    def _has_run(self, robot_id: int, turns: Turns[CallKey, _Call], agent: AgentKey, _: asyncio.Task[None]) -> None:
+        turns.done(agent)
+        self._next(robot_id, turns)
+
+    def _end(self, wanted: _Call) -> None:
+        """A call is not wanted any more."""
+        agent, key = _keys(wanted.task)
+        if wanted.running is not None:
+            wanted.running.cancel()
+        if wanted.again is not None:
+            wanted.again.cancel()
+        if (turns := self._turns.get(wanted.task.robot_id)) is not None:
+            turns.drop(agent, key)
+
+    def _forget_calls(self, agent: AgentKey) -> list[_Call]:
+        """No call of this agent is wanted any more. Returns them."""
+        calls = list(self._calls.pop(agent, {}).values())
+        for wanted in calls:
+            self._end(wanted)
+        return calls
+
+    def _is_over(self, wanted: _Call) -> None:
+        agent, key = _keys(wanted.task)
+        calls = self._calls.get(agent, {})
+        if calls.get(key) is wanted:
+            del calls[key]
+        if not calls:
+            self._calls.pop(agent, None)
+
+    async def _run(self, wanted: _Call) -> None:
+        task = wanted.task
+        try:
+            await self._ask(task)
+            log.debug("%s: done", _What(task))
+        except (Refused, OutOfRange) as refusal:  # by the robot, or here by a traffic rule
+            log.warning("%s was refused: %s", _What(task), refusal)
+            if isinstance(refusal, HeldByAnother):
+                self._registrations.refused(task, refusal.holder)
+            self.refuse(task.node, task.robot_id, str(refusal))
+        except Unreachable as error:
+            log.debug("%s: %s", _What(task), error)
+            wanted.running = None
+            pause_s = RETRY_S[min(wanted.attempt, len(RETRY_S) - 1)]
+            wanted.again = asyncio.get_running_loop().call_later(pause_s, self._again, wanted)
+            return
+        except Exception:  # whatever a headset asked for, it must not be wanted for ever
+            log.exception("%s failed", _What(task))
+        self._is_over(wanted)
+
+    def _again(self, wanted: _Call) -> None:
+        """Make a call once more, unless it was taken back; a robot that is away is told everything when it returns."""
+        task = wanted.task
+        self._is_over(wanted)
+        if isinstance(task.node, AddNode):
+            holds = self._registrations.holds(task, self._online)
+        else:
+            holds = task.robot_id in self._online
+        if not holds:
+            return
+        if wanted.attempt + 1 < ATTEMPTS:
+            self._start(task, wanted.attempt + 1)
+        else:
+            log.warning("%s: the robot does not answer", _What(task))
 
     async def _ask(self, task: Task) -> None:
         node = task.node
@@ -207,8 +314,20 @@ class RobotCalls:
         await self._mesh.query(key, frame, timeout_s=CALL_TIMEOUT_S)
 
 
-def _removal(node: AddNode | RemoveNode) -> RemoveNode:
-    return RemoveNode(node.registrant_agent_type, node.registrant_agent_id, node.node_type, node.node_name)
+def _keys(task: Task) -> tuple[AgentKey, CallKey]:
+    node = task.node
+    return (node.registrant_agent_type, node.registrant_agent_id), (task.robot_id, node.node_type, node.node_name)
+
+
+class _What:
+    """A call in words, for the log: made only where they are read."""
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+
+    def __str__(self) -> str:
+        robot_id, node = self._task
+        return f"headset {node.registrant_agent_id}: {_describe(node)} on robot {robot_id}"
 
 
 def _describe(node: AddNode | RemoveNode) -> str:

@@ -46,7 +46,7 @@ from macs_zenoh.peer import (
     Streamed,
 )
 from macs_zenoh.presence import Presence
-from macs_zenoh.registrations import AgentKey, Streams
+from macs_zenoh.registrations import AgentKey
 from macs_zenoh.routing import keys_of
 from macs_zenoh.wire import FrameDecoder, Layout, encode_message
 
@@ -58,7 +58,7 @@ from .door import Door
 from .leases import Leases
 from .own_keys import OwnKeys
 from .renumbering import Renumbering
-from .robots import RobotCalls
+from .robots import RobotCalls, StreamChanges
 from .waiting import NAMED_S, WaitingRoom
 
 log = logging.getLogger("macs.gateway")
@@ -427,18 +427,17 @@ class Gateway:
 
     # -- subscriptions -------------------------------------------------------------------------------------------
 
-    def _streams_wanted(self, streams: Streams) -> None:
-        """Listen to exactly these streams of robots, for those who are registered there."""
-        wanted = {
-            STREAM.of(type=ROS, id=robot_id, node=node): Stream((ROS, robot_id), node, registrants)
-            for (robot_id, node), registrants in streams.items()
-        }
-        before, self._delivery.streams = self._delivery.streams, wanted
-        for key in wanted.keys() - before.keys():
-            # whether a robot keeps a stream for recovery is seen from its messages: others cost nothing more
-            self._subscribe(key, self._delivery.stream, at_once=self._delivery.stream_at_once, reliable=True)
-        for key in before.keys() - wanted.keys():
-            self._unsubscribe(key)
+    def _streams_wanted(self, changes: StreamChanges) -> None:
+        """Listen to exactly those streams of robots on which somebody is registered."""
+        for (robot_id, node), registrants in changes:
+            key = STREAM.of(type=ROS, id=robot_id, node=node)
+            if registrants is None:
+                self._delivery.streams.pop(key, None)
+                self._unsubscribe(key)
+            else:
+                self._delivery.streams[key] = Stream((ROS, robot_id), node, registrants)
+                # whether a robot keeps a stream for recovery is seen from its messages: others cost nothing more
+                self._subscribe(key, self._delivery.stream, at_once=self._delivery.stream_at_once, reliable=True)
 
     def _subscribe(
         self, key: str, on_batch: OnBatch, *, at_once: AtOnce | None = None, reliable: bool = False

@@ -21,7 +21,7 @@ from bridge.ros.safety import EmergencyStop
 from bridge.ros.session import RosSession
 from bridge.ros.types import InterfaceName
 from macs_zenoh.config import Priority
-from macs_zenoh.errors import Refused
+from macs_zenoh.errors import HeldByAnother, Refused
 from macs_zenoh.keyexpr import type_name, type_number
 from macs_zenoh.messages import ROS, AddNode, Metadata, NodeType, RemoveNode, encode_data
 from macs_zenoh.reading import Message
@@ -189,7 +189,8 @@ class InterfaceNode(ABC):
         if registrant in self.registrants:
             return
         if self.MAX_REGISTRANTS is not None and len(self.registrants) >= self.MAX_REGISTRANTS:
-            raise Refused(f"{self.topic} is already registered by another agent, and {self.ROLE} has only one")
+            reason = f"{self.topic} is already registered by another agent, and {self.ROLE} has only one"
+            raise HeldByAnother(reason, next(iter(self.registrants)))
         self.registrants.add(registrant)
         self.registrants_changed()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -16,7 +17,16 @@ import zenoh
 
 from macs_zenoh import ping
 from macs_zenoh.config import MeshSettings, TrafficRule
-from macs_zenoh.errors import CallTimeout, ConfigError, MacsError, NotServed, OutOfRange, Refused, Unreachable
+from macs_zenoh.errors import (
+    CallTimeout,
+    ConfigError,
+    HeldByAnother,
+    MacsError,
+    NotServed,
+    OutOfRange,
+    Refused,
+    Unreachable,
+)
 from macs_zenoh.keyexpr import PING
 from macs_zenoh.shaping import Shaper
 from macs_zenoh.versions import installed
@@ -30,6 +40,9 @@ from .samples import AtOnce, Handler, OnBatch, OnMiss, Payload, Subscription, To
 from .threads import shared_threads
 
 log = logging.getLogger("macs.mesh")
+
+HOLDER = re.compile(r"([0-9]{1,3})/([0-9]{1,5})")
+"""Who has what was refused: agent type and id."""
 
 
 class Mesh:
@@ -356,6 +369,9 @@ class Mesh:
                     reply = await handler(name, payload)
                     if reply is not None:
                         query.reply(query.key_expr, reply)
+                except HeldByAnother as refusal:
+                    holder = "{}/{}".format(*refusal.holder)
+                    query.reply_err(msgspec.json.encode({"refused": refusal.reason, "holder": holder}))
                 except Refused as refusal:
                     query.reply_err(msgspec.json.encode({"refused": refusal.reason}))
                 except MacsError as error:
@@ -443,7 +459,10 @@ def _problem(key: str, payload: bytes, timeout_s: float) -> MacsError:
     except msgspec.DecodeError:
         return Unreachable(key, payload.decode(errors="replace")[:200])
     if "refused" in answer:
-        return Refused(answer["refused"])
+        holder = HOLDER.fullmatch(answer.get("holder", ""))
+        if holder is None:
+            return Refused(answer["refused"])
+        return HeldByAnother(answer["refused"], (int(holder[1]), int(holder[2])))
     return Unreachable(key, answer.get("failed", "unknown failure"))
 
 

@@ -35,6 +35,7 @@ class Story:
     def __init__(self) -> None:
         self.registrations = Registrations()
         self.robots: dict[int, int] = {}
+        self.seen: dict[int, int] = {}
         self.have: dict[int, set[Key]] = {}
         self.wanted: dict[Key, tuple[set[int], set[int]]] = {}
 
@@ -75,9 +76,17 @@ class Story:
 
     def come(self, robot_id: int, group: int) -> None:
         """A robot starts, with no nodes."""
-        self.robots[robot_id] = group
+        self.robots[robot_id] = self.seen[robot_id] = group
         self.have[robot_id] = set()
+        self.registrations.seen(robot_id, group)
         self.tell(self.registrations.of_robot(robot_id, group))
+
+    def regroup(self, robot_id: int, group: int) -> None:
+        """A robot that is there changes its group, if it is."""
+        if robot_id in self.robots:
+            self.robots[robot_id] = self.seen[robot_id] = group
+            self.tell(self.registrations.seen(robot_id, group))
+            self.tell(self.registrations.of_robot(robot_id, group))
 
     def go(self, robot_id: int) -> None:
         """A robot stops."""
@@ -100,6 +109,7 @@ steps = st.lists(
     | st.tuples(st.just("deregister"), wishes)
     | st.tuples(st.just("leave"), st.tuples(headsets))
     | st.tuples(st.just("come"), st.tuples(robots, st.integers(0, 2)))
+    | st.tuples(st.just("regroup"), st.tuples(robots, st.integers(0, 2)))
     | st.tuples(st.just("go"), st.tuples(robots)),
     max_size=30,
 )
@@ -122,17 +132,25 @@ def test_robots_have_what_is_wanted_of_them(story_steps: list[tuple[str, tuple[o
 
 @given(steps)
 def test_streams_are_those_that_somebody_wants(story_steps: list[tuple[str, tuple[object, ...]]]) -> None:
-    """A gateway listens to the topics of robots that have a registrant here, and of those named by id though away,
-    and knows for each who is registered."""
+    """A gateway listens to the topics of robots that have a registrant here, also while one is away that it has seen,
+    and knows for each who is registered; what it was told of since it last asked is all that has changed."""
     story = Story()
+    known: dict[tuple[int, str], set[AgentKey]] = {}
     for what, arguments in story_steps:
         getattr(story, what)(*arguments)
         expected: dict[tuple[int, str], set[AgentKey]] = {}
         for (agent, node_type, name), (ids, groups) in story.wanted.items():
             if node_type == NodeType.SUBSCRIBER:
-                for robot_id in ids | {robot for robot, group in story.robots.items() if group and group in groups}:
-                    expected.setdefault((robot_id, name), set()).add(agent)
-        assert story.registrations.streams(NodeType.SUBSCRIBER, story.robots) == expected
+                for robot_id, group in story.seen.items():
+                    if robot_id in ids or (group and group in groups):
+                        expected.setdefault((robot_id, name), set()).add(agent)
+        assert story.registrations.streams == expected
+        for key, registrants in story.registrations.news():
+            if registrants is None:
+                del known[key]
+            else:
+                known[key] = registrants
+        assert known == expected
 
 
 # -- examples --------------------------------------------------------------------------------------------------------
@@ -220,3 +238,31 @@ def test_another_id_takes_all_registrations_along() -> None:
     assert registrations.of_agent((2, 6), robots) == [Task(1, adding(6, NODES[0]))]
     assert registrations.of_robot(9, 3) == [Task(9, adding(300, NODES[0]))]
     assert registrations.remove(removing(300, NODES[1]), [1], [], robots) == [Task(1, removing(300, NODES[1]))]
+
+
+def test_robots_that_nobody_has_seen_cost_nothing() -> None:
+    """A registration that names robots that are not there makes no stream; when one comes, its own."""
+    registrations = Registrations()
+    registrations.add(adding(7, NODES[0]), range(1, 1000), [], {})
+    assert registrations.streams == {}
+    registrations.seen(500, 0)
+    assert list(registrations.news()) == [((500, NODES[0]), {(2, 7)})]
+
+
+def test_who_holds_a_service_keeps_it() -> None:
+    """What a robot refused because another agent has it is not asked again when the robot comes back, but when that
+    agent has left, or when the headset asks again."""
+    registrations = Registrations()
+    node = adding(7, NODES[0], node_type=4)
+    (task,) = registrations.add(node, [1], [], {1: 0})
+    registrations.refused(task, (2, 8))
+    assert registrations.of_robot(1, 0) == []
+    assert registrations.holder_left((2, 9), {1: 0}) == []
+    assert registrations.holder_left((2, 8), {1: 0}) == [task]
+    assert registrations.of_robot(1, 0) == [task]
+    registrations.refused(task, (2, 8))
+    assert registrations.add(node, [], [], {1: 0}) == [task]
+    assert registrations.of_robot(1, 0) == [task]
+    registrations.refused(task, (2, 8))
+    assert registrations.holder_left((2, 8), {}) == []
+    assert registrations.of_robot(1, 0) == [task]

@@ -1,0 +1,70 @@
+"""What agents cost a gateway by coming, registering and leaving: how the cost of each grows with their number."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from .figures import Figure
+from .plan import Case, Plan
+from .processes import Program, ProgramFailed, Stage
+
+ROBOTS = 10
+NUMBERS = (50, 200, 800)
+JOINS = 2000
+REST_S = 0.4
+"""Long enough for what follows a change to have happened; a gateway at rest takes 0.3 % of a core."""
+
+
+def scale(stage: Stage, plan: Plan) -> Iterator[Figure]:
+    """A gateway's CPU for each headset that joins, registers on a topic of ten robots, and leaves, by their number."""
+    router = stage.router()
+    robots, _ = stage.worker("robots", router, ROBOTS)
+    port = stage.gateway(router)
+    gateway = next(program for program in stage.programs if program.name == "gateway")
+    first: dict[str, list[float]] = {}
+    for number in (*NUMBERS, JOINS):
+        rounds = [_round(stage, robots, gateway, port, number) for _ in range(plan.rounds)]
+        for what in rounds[0]:
+            values = [each[what] for each in rounds]
+            base = first.setdefault(what, values)
+            yield Figure(f"{number} headsets {what}", values, base, f"{NUMBERS[0]} headsets", "us each", at_most=2.0)
+
+
+def _round(stage: Stage, robots: Program, gateway: Program, port: int, number: int) -> dict[str, float]:
+    """Microseconds of CPU that the gateway took for each headset."""
+    robots.ask("forget")
+    began = _used_s(gateway)
+    crowd, _ = stage.worker("headset", port, number, 0)
+    _wait(robots, "headsets", number)
+    joined = _used_s(gateway)
+    costs = {"join": joined - began}
+    if number != JOINS:
+        crowd.ask("register", robots=ROBOTS)
+        _wait(robots, "registered", number * ROBOTS)
+        costs["register"] = _used_s(gateway) - joined
+    before = _used_s(gateway)
+    crowd.stop()
+    _wait(robots, "headsets", 0)
+    costs["leave"] = _used_s(gateway) - before
+    return {what: used_s * 1e6 / number for what, used_s in costs.items()}
+
+
+def _wait(robots: Program, what: str, number: int) -> None:
+    deadline = time.monotonic() + 30
+    while (now := robots.ask("count")[what]) != number:
+        if time.monotonic() > deadline:
+            raise ProgramFailed(f"{now} of {number} {what}\n{robots.log_tail()}")
+        time.sleep(0.02)
+    time.sleep(REST_S)
+
+
+def _used_s(program: Program) -> float:
+    """CPU time that a program has taken so far, in user and kernel."""
+    fields = Path(f"/proc/{program.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+CASES: dict[str, Case] = {"scale": scale}

@@ -1,0 +1,47 @@
+"""What all have together, those at one address, and each, stays within bounds; who has little can have some."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from macs_zenoh.budget import Budget
+
+
+def test_each_address_and_all_have_bounds() -> None:
+    """The reason says which bound is reached."""
+    budget = Budget("nodes", each=32, per_address=40, total=64)
+    assert budget.judge("a", "here", 32) is None
+    assert budget.judge("a", "here", 33) == "each may have 32 nodes"
+    budget.set("a", "here", 32)
+    assert budget.judge("b", "here", 9) == "all at one address may have 40 nodes"
+    assert budget.judge("b", "there", 16) is None
+    budget.set("b", "there", 16)
+    assert budget.judge("c", "elsewhere", 3) == "all together may have 64 nodes"
+
+
+def test_the_last_quarter_is_for_those_who_have_little() -> None:
+    """Whoever takes much cannot take what others need to begin with; and what is given back is there again."""
+    budget = Budget("nodes", each=32, per_address=1000, total=64)
+    budget.set("a", "x", 32)
+    budget.set("b", "y", 16)
+    assert budget.judge("b", "y") is not None
+    assert budget.judge("c", "z", 2) is None
+    budget.set("a", "x", 0)
+    assert (budget.used, budget.of("a"), budget.of("b")) == (16, 0, 16)
+    assert budget.judge("b", "y", 16) is None
+
+
+@given(st.lists(st.tuples(st.integers(1, 5), st.integers(0, 20)), max_size=60))
+def test_who_asks_first_stays_within_bounds(story: list[tuple[int, int]]) -> None:
+    """As long as holders ask before they take more, no bound is exceeded."""
+    budget = Budget("bytes", each=16, per_address=20, total=30)
+    has: dict[int, int] = {}
+    for holder, amount in story:
+        address = f"address {holder % 2}"
+        if amount < has.get(holder, 0) or budget.judge(holder, address, amount - has.get(holder, 0)) is None:
+            budget.set(holder, address, amount)
+            has[holder] = amount
+        assert budget.used == sum(has.values()) <= 30
+        assert sum(amount for who, amount in has.items() if who % 2) <= 20
+        assert budget.of(holder) == has.get(holder, 0) <= 16
