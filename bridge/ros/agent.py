@@ -42,6 +42,9 @@ NODE_NAME = "rosagent"
 
 REQUESTS = frozenset({FunctionalityRequest.manager, STATUS, ControlRequest.manager})
 """Managers of plain messages that a robot answers."""
+ABSENT_S = 5.0
+"""How long an agent may be registered without being online: its registration can come before its presence, and also
+after its end, when it left in that moment."""
 STOP_MESSAGES_S = 0.1
 """How long ROS nodes get, at the end, to take the last messages: what a writer that ends has sent is lost unread."""
 
@@ -163,8 +166,17 @@ class RobotAgent:
     # -- verbs ---------------------------------------------------------------------------------------------------
 
     async def _add_node(self, call: Call) -> bytes:
-        await self.nodes.add(_own(decode_data(AddNode, call.data), call))
+        request = _own(decode_data(AddNode, call.data), call)
+        await self.nodes.add(request)
+        registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
+        if registrant not in self.agent.directory:
+            asyncio.get_running_loop().call_later(ABSENT_S, self._forget_absent, registrant)
         return b""
+
+    def _forget_absent(self, registrant: Registrant) -> None:
+        """Nobody would ever see it leave."""
+        if registrant not in self.agent.directory:
+            self.nodes.forget(registrant)
 
     async def _remove_node(self, call: Call) -> bytes:
         self.nodes.remove(_own(decode_data(RemoveNode, call.data), call))

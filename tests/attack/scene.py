@@ -301,24 +301,21 @@ class Scene:
         for program in self.site.programs.values():
             forget_peak(program.pid)
         began = time.monotonic()
-        async with self._attacked(attack, self.site, seconds, stops) as finished:
-            under = await self.observe(seconds, stops, finished)
+        async with self._attacked(attack, self.site, seconds, stops):
+            under = await self.observe(seconds, stops)
         broken = await self._as_before(before, began)
         for name, program in self.site.programs.items():
             with suppress(OSError):
                 memory[name].peak = status_bytes(program.pid, "VmHWM")
                 memory[name].after = status_bytes(program.pid, "VmRSS")
-        under.latencies = self.pair.since(began, began + seconds)
         broken += [
             f"the {name} keeps {m.kept / MIB:.0f} MiB" for name, m in memory.items() if m.kept > KEPT_BYTES and m.after
         ]
         return Report(attack.name, attack.single, calm, benign, under, memory, MEMORY_LIMITS, broken)
 
     @asynccontextmanager
-    async def _attacked(
-        self, attack: Attack, site: Site, seconds: float, stops: int | None
-    ) -> AsyncIterator[Callable[[], bool]]:
-        """While the block runs this site is attacked; ended by force a while after its time."""
+    async def _attacked(self, attack: Attack, site: Site, seconds: float, stops: int | None) -> AsyncIterator[None]:
+        """While the block runs this site is attacked."""
         length = seconds if stops is None else 3600.0
         words = (attack.name, str(site.gateway.port), site.endpoint, str(length))
         process = await asyncio.create_subprocess_exec(
@@ -328,7 +325,7 @@ class Scene:
             assert process.stdout is not None
             line = await asyncio.wait_for(process.stdout.readline(), BEGIN_S)
             assert line == b"begins\n", f"{attack.name} did not begin: {line!r}"
-            yield lambda: process.returncode is not None
+            yield
         finally:
             if process.returncode is None:
                 process.kill()
@@ -336,9 +333,7 @@ class Scene:
 
     # -- measuring --
 
-    async def observe(
-        self, seconds: float, stops: int | None = None, finished: Callable[[], bool] = lambda: False
-    ) -> Window:
+    async def observe(self, seconds: float, stops: int | None = None) -> Window:
         """Talk, drive, stop and let go for so long, or until so many stops were pressed."""
         window = Window()
         begin = time.monotonic()

@@ -34,6 +34,7 @@ from macs_zenoh.messages import (
     decode_management,
 )
 from macs_zenoh.messages import encode_data as encode
+from macs_zenoh.routing import call
 from macs_zenoh.wire import parse_frame
 
 ROBOT = 7
@@ -224,6 +225,18 @@ async def test_a_headset_that_vanishes_is_forgotten(robot: RobotAgent, router: s
         await peer.sees("/chatter", subscriptions=1)
     await peer.sees("/chatter", subscriptions=0)
     assert len(robot.nodes) == 0
+
+
+async def test_who_registers_and_is_not_there_is_forgotten(
+    robot: RobotAgent, router: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A registration of an agent that left while it was on its way, and of one that never came, ends by itself."""
+    monkeypatch.setattr("bridge.ros.agent.ABSENT_S", 0.5)
+    async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
+        key, frame = call((1, ROBOT), "add_node", (2, 9), encode(adding("/chatter", registrant=9)), Metadata(2, 9))
+        await mesh.query(key, frame, timeout_s=5)
+        assert len(robot.nodes) == 1, "its presence may come later"
+        await until(lambda: len(robot.nodes) == 0)
 
 
 async def test_the_robot_says_what_it_offers(robot: RobotAgent, headset: Agent, peer: Peer) -> None:
