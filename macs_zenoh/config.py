@@ -40,6 +40,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, get_a
 import msgspec
 from msgspec import Meta
 
+from macs_zenoh import addresses
 from macs_zenoh.errors import ConfigError, UsageError
 from macs_zenoh.keyexpr import expression_problem, type_name, type_number
 
@@ -259,11 +260,14 @@ def _endpoint_problem(endpoint: str, *, lowest_port: int) -> str:
         return f"begins with {protocol!r}, which is no protocol of Zenoh's: {', '.join(PROTOCOLS)}"
     if protocol not in IP_PROTOCOLS:
         return ""
-    found = re.fullmatch(r".+:([0-9]+)", re.split(r"[?#]", rest)[0])
+    place = re.split(r"[?#]", rest)[0]
+    found = re.fullmatch(r"(.+):([0-9]+)", place)
     if found is None:
         return f"needs a host and a port, as in {protocol}/10.0.0.1:7447"
-    if not lowest_port <= int(found[1]) <= 0xFFFF:
-        return f"has the port {found[1]}, allowed is {lowest_port}..65535"
+    if ":" in found[1] and not re.fullmatch(r"\[.+\]", found[1]):
+        return f"needs brackets around its address: {protocol}/{addresses.joined(found[1], found[2])}"
+    if not lowest_port <= int(found[2]) <= 0xFFFF:
+        return f"has the port {found[2]}, allowed is {lowest_port}..65535"
     return ""
 
 
@@ -273,7 +277,8 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     section: ClassVar[str] = "gateway"
 
     host: str = "127.0.0.1"
-    """Address to listen on. The protocol has no authentication, so the network is opened on purpose: 0.0.0.0."""
+    """Address to listen on. The protocol has no authentication, so the network is opened on purpose: 0.0.0.0, or ::
+    for IPv6 as well. With or without brackets."""
     port: Port = 7000
     allow: list[str] = []
     """Networks whose addresses may connect, as in 192.168.1.0/24. Empty: everybody who reaches the port."""
@@ -304,6 +309,10 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     """Share the port with other gateway processes (SO_REUSEPORT); set by ``--workers``."""
 
     def _check(self) -> None:
+        try:
+            msgspec.structs.force_setattr(self, "host", addresses.bare(self.host))
+        except ValueError as error:
+            raise self._wrong("host", str(error)) from None
         for network in self.allow:
             try:
                 ipaddress.ip_network(network, strict=False)

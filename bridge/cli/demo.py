@@ -50,7 +50,7 @@ async def show(host: str, port: int, robot: int, say: Say) -> bool:
     lines = ["", "A headset without hardware, over TCP, as a Unity headset would do it:", ""]
     try:
         async with await Headset.connect(host, port) as headset:
-            lines.append(f"  connected    to {host}:{port}; it is headset {headset.id} on the mesh")
+            lines.append(f"  connected    to {headset.target}; it is headset {headset.id} on the mesh")
             await _Show(headset, Types(), robot, lines.append).play()
         lines += ["", "All of it went headset -> TCP -> gateway -> Zenoh router -> robot agent -> ROS 2, or back."]
         return True

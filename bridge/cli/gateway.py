@@ -13,12 +13,13 @@ from __future__ import annotations
 import argparse
 import asyncio
 import resource
-import socket
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 from bridge.cli import options, running
 from bridge.cli.children import Child, stop_in_order
+from bridge.listening import bound
+from macs_zenoh.addresses import joined
 from macs_zenoh.config import GatewaySettings, Settings, changed
 from macs_zenoh.errors import UsageError
 
@@ -29,7 +30,9 @@ WORKER_ON = "--be-worker-on-port"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--host", help="address to listen on (default: 127.0.0.1; 0.0.0.0 for the network)")
+    parser.add_argument(
+        "--host", help="address to listen on (default: 127.0.0.1; 0.0.0.0 for the network, :: with IPv6)"
+    )
     parser.add_argument("--port", type=int, help="TCP port (default: 7000; 0 for any free one)")
     parser.add_argument(
         "--allow", metavar="NETWORK", action="append", help="who may connect, as 192.168.1.0/24; repeat for more"
@@ -64,13 +67,13 @@ def run(args: argparse.Namespace) -> int:
 async def _supervise(workers: int, settings: GatewaySettings, words: Sequence[str]) -> int:
     """Run several gateways on one port, each with ids of its own; one that ends is started again. ``words``: what was
     said to this one, beginning with the verb."""
-    with _reserve(settings) as reserved:
-        port = str(reserved.getsockname()[1])
+    with _reserved(settings) as number:
+        port = str(number)
         argv = ["bridge", words[0], WORKER_ON, port, *words[1:]]
         children = [Child(f"gw{number}", argv) for number in range(1, workers + 1)]
         tasks = [asyncio.create_task(child.run()) for child in children]
         try:
-            announcing = asyncio.create_task(_announce(children, f"gateway on {settings.host}:{port}"))
+            announcing = asyncio.create_task(_announce(children, f"gateway on {joined(settings.host, port)}"))
             await asyncio.gather(announcing, *tasks)
         finally:
             await stop_in_order([(children, 1.8)])
@@ -85,16 +88,17 @@ async def _announce(children: list[Child], what: str) -> None:
     running.say_ready(what)
 
 
-def _reserve(settings: GatewaySettings) -> socket.socket:
-    """Hold the port, without listening, so that all workers find the same one."""
-    reserved = socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET)
-    reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+@contextmanager
+def _reserved(settings: GatewaySettings) -> Iterator[int]:
+    """Hold a port that nobody has, without listening, so that all workers find the same one. Raises Unreachable."""
+    for alone in bound(settings.host, settings.port):  # other gateways would share it with us, and headsets be torn
+        alone.close()
+    held = bound(settings.host, settings.port, shared=True)
     try:
-        reserved.bind((settings.host, settings.port))
-    except OSError as error:
-        reserved.close()
-        raise UsageError(f"cannot listen on {settings.host}:{settings.port}: {error.strerror}") from error
-    return reserved
+        yield held[0].getsockname()[1]
+    finally:
+        for reserved in held:
+            reserved.close()
 
 
 def _raise_descriptor_limit() -> None:
@@ -115,7 +119,7 @@ async def _serve(settings: Settings) -> int:
         gateway = Gateway(mesh, settings.gateway, own)
         try:
             await gateway.start()
-            running.say_ready(f"gateway on {settings.gateway.host}:{gateway.port}")
+            running.say_ready(f"gateway on {gateway.address}")
             await asyncio.Event().wait()
         finally:
             await gateway.close()

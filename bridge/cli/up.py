@@ -28,6 +28,8 @@ from dataclasses import dataclass
 from bridge.cli import children, options, running
 from bridge.cli.apart import Apart
 from bridge.cli.children import Child, stop_in_order
+from bridge.listening import bound
+from macs_zenoh.addresses import EVERYWHERE, joined, reachable
 from macs_zenoh.config import GatewaySettings, RobotSettings, Settings, changed
 from macs_zenoh.errors import MacsError, Unreachable, UsageError
 
@@ -42,14 +44,13 @@ DEMO_BLOCK = 1
 READY_S = 20.0
 """How long the programs may take to be ready for a show that nobody watches (``--once``); others press Ctrl-C."""
 DRIVE = """'{"linear": {"x": 0.2}}' --rate 10"""
-EVERYWHERE = {"0.0.0.0", "::", ""}  # noqa: S104 - recognised, not bound here
 
 
 class PortTaken(Unreachable):
     """Somebody else listens there."""
 
     def __init__(self, host: str, port: int, advice: str) -> None:
-        super().__init__(f"{host}:{port}", f"the port is taken; {advice}")
+        super().__init__(joined(host, port), f"the port is taken; {advice}")
         self.port = port
 
 
@@ -65,7 +66,9 @@ class NotReady(MacsError):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demo", action="store_true", help="add a demo robot, and a headset that drives it")
     parser.add_argument("--once", action="store_true", help="with --demo: end after the show, 0 if all of it worked")
-    parser.add_argument("--host", help="where gateway and router listen (default: 127.0.0.1; 0.0.0.0: network)")
+    parser.add_argument(
+        "--host", help="where gateway and router listen (default: 127.0.0.1; 0.0.0.0: network, :: with IPv6)"
+    )
     parser.add_argument("--port", type=int, help="TCP port for headsets (default: 7000; 0: a free one)")
     parser.add_argument("--router-port", type=int, help=f"port of the router (default: {ROUTER_PORT}; 0: free)")
     parser.add_argument("--id", type=int, help=f"id of the robot (default: {DEFAULT_ROBOT})")
@@ -112,8 +115,8 @@ class Plan:
         """The router, on the same addresses as the gateway: nothing is open to the network unless asked for."""
         if self.router_port is None:
             return None
-        host = "[::]" if self.gateway.host in EVERYWHERE else self.gateway.host
-        return self._child("router", ["-l", f"tcp/{host}:{self.router_port}"])
+        host = "::" if self.gateway.host in EVERYWHERE else self.gateway.host
+        return self._child("router", ["-l", f"tcp/{joined(host, self.router_port)}"])
 
     def gateway_child(self) -> Child:
         block = [] if self.gateway.block is None else ["--block", str(self.gateway.block)]
@@ -160,7 +163,7 @@ def make_plan(args: argparse.Namespace, settings: Settings) -> Plan:
         gateway=changed(gateway, port=port),
         robot=robot,
         router_port=router_port,
-        routers=routers or [f"tcp/127.0.0.1:{router_port}"],
+        routers=routers or [_local_router(gateway.host, router_port)],
         settings_files=args.settings or [],
         apart=apart,
         once=args.once,
@@ -170,7 +173,7 @@ def make_plan(args: argparse.Namespace, settings: Settings) -> Plan:
 
 def _router_port(host: str, wanted: int | None, apart: Apart | None) -> int:
     port = ROUTER_PORT if wanted is None else wanted
-    advice = f"join the router there with -e tcp/127.0.0.1:{port}, or choose another port with --router-port"
+    advice = f"join the router there with -e {_local_router(host, port)}, or choose another port with --router-port"
     return _port(host, port, advice, apart, chosen=wanted is not None)
 
 
@@ -187,14 +190,18 @@ def _port(host: str, port: int, advice: str, apart: Apart | None, *, chosen: boo
 
 def _free(host: str, port: int) -> int | None:
     """The port, if it can be listened on; a free one for 0."""
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError:
-            return None
-        number: int = probe.getsockname()[1]
-        return number
+    try:
+        probes = bound(host, port)
+    except Unreachable:
+        return None
+    number: int = probes[0].getsockname()[1]
+    for probe in probes:
+        probe.close()
+    return number
+
+
+def _local_router(host: str, port: int | None) -> str:
+    return f"tcp/{joined(reachable(host), port or 0)}"
 
 
 async def _up(plan: Plan) -> int:
@@ -249,7 +256,7 @@ async def _when_ready(plan: Plan, programs: list[Child]) -> int:
     if plan.demo:
         from bridge.cli.demo import show
 
-        worked = await show(plan.gateway.host, plan.gateway.port, plan.robot.id or DEFAULT_ROBOT, _say)
+        worked = await show(reachable(plan.gateway.host), plan.gateway.port, plan.robot.id or DEFAULT_ROBOT, _say)
         if plan.once:
             return 0 if worked else 1
     _say(what_next(plan))
@@ -259,15 +266,14 @@ async def _when_ready(plan: Plan, programs: list[Child]) -> int:
 
 def what_next(plan: Plan) -> str:
     """What to type now, and where to point a headset."""
-    host = "127.0.0.1" if plan.gateway.host in EVERYWHERE else plan.gateway.host
-    target = f"{host}:{plan.gateway.port}"
+    target = joined(reachable(plan.gateway.host), plan.gateway.port)
     local = plan.routers == [f"tcp/127.0.0.1:{ROUTER_PORT}"]
     endpoint = "" if local else "".join(f" -e {router}" for router in plan.routers)
     if plan.apart is not None:
         endpoint += f" --namespace {plan.apart.namespace}"
     seen_from_outside = plan.gateway.host in EVERYWHERE
     topic = "/pose geometry_msgs/PoseStamped" if plan.demo else "/TOPIC pkg/Type"
-    where = f"{_own_address()}:{plan.gateway.port}" if seen_from_outside else f"{target}, from this machine only"
+    where = joined(_own_address(), plan.gateway.port) if seen_from_outside else f"{target}, from this machine only"
     lines = [
         "",
         "It runs. Ctrl-C stops it; meanwhile, in another terminal:",

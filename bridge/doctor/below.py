@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from macs_zenoh.addresses import of_endpoint
+
 from .facts import Certificate, Reach, Tls, TlsProblem
 
 ALERT_S = 0.3
@@ -29,11 +31,7 @@ _VERIFY_CODES: dict[int, TlsProblem] = {
 """OpenSSL's X509_V_ERR_* numbers."""
 
 
-def host_and_port(endpoint: str) -> tuple[str, int] | None:
-    """Where an endpoint like ``tls/[::1]:7447#iface=eth0`` is; None for those without host and port."""
-    address = endpoint.partition("/")[2].partition("#")[0].partition("?")[0]
-    host, _, port = address.rpartition(":")
-    return (host.strip("[]"), int(port)) if host and port.isascii() and port.isdigit() else None
+host_and_port = of_endpoint
 
 
 def tls_settings(endpoint: str, zenoh: Mapping[str, Any]) -> dict[str, Any]:

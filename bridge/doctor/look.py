@@ -19,6 +19,7 @@ import msgspec
 from msgspec import structs
 
 from macs_zenoh import ping
+from macs_zenoh.addresses import of_endpoint
 from macs_zenoh.config import Settings
 from macs_zenoh.errors import CallTimeout, ConfigError, MacsError, Refused, Unreachable, UsageError, WireError
 from macs_zenoh.keyexpr import BLOCK_SIZE, LEASE, NAME, PING, PRESENCE, UNICAST, block_of, type_name, type_number
@@ -197,7 +198,7 @@ class Examination:
     async def _enter(self, facts: Endpoint) -> _Place | None:
         """TCP, TLS, Zenoh: each step only says why the next cannot work."""
         protocol = facts.endpoint.partition("/")[0]
-        where = below.host_and_port(facts.endpoint)
+        where = of_endpoint(facts.endpoint)
         if where is not None and protocol in ("tcp", "tls", "ws"):
             facts.reach, facts.reach_detail = await asyncio.to_thread(below.reach, *where, self._timeout_s)
         if facts.reach not in ("ok", "untried"):

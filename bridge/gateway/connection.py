@@ -15,6 +15,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from typing import Protocol, cast
 
+from macs_zenoh.addresses import joined, of_peer
 from macs_zenoh.messages import AddNode, GoneAgent, Metadata, NodeType, RemoveNode
 from macs_zenoh.peer import Event, Joined, Left, Peer, Rejected, Sent, State
 from macs_zenoh.queues import Chunk, Outbox
@@ -112,8 +113,8 @@ class Connection(asyncio.BufferedProtocol):
         self._transport = transport
         _tune(transport.get_extra_info("socket"))
         peer_name = transport.get_extra_info("peername")
-        self.host = str(peer_name[0]) if peer_name else "?"
-        self.address = f"{self.host}:{peer_name[1]}" if peer_name else "?"
+        self.host = of_peer(str(peer_name[0])) if peer_name else "?"
+        self.address = joined(self.host, peer_name[1]) if peer_name else "?"
         transport.set_write_buffer_limits(high=WRITE_BUFFER_BYTES)
         transport.pause_reading()  # until it is greeted
         self._pauses = 1

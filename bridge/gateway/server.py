@@ -15,6 +15,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from bridge.listening import bound
+from macs_zenoh.addresses import joined
 from macs_zenoh.config import GatewaySettings
 from macs_zenoh.directory import Change
 from macs_zenoh.errors import Refused, Unreachable
@@ -119,7 +121,7 @@ class Gateway:
         self._waiting = WaitingRoom(settings.handshake_s, self._no_id)
         self._routes: dict[Connection, dict[bytes, Route]] = {}
         self._subscriptions: dict[str, Subscription] = {}
-        self._server: asyncio.Server | None = None
+        self._servers: list[asyncio.AbstractServer] = []
         self._run = NO_RUN
         self._brake = Brake()
         mesh.on_room(self._brake.release)
@@ -173,15 +175,21 @@ class Gateway:
         await self._leases.take()
         self._subscribe(BROADCAST.every(), self._delivery.broadcast)
         self._subscriptions["ping"] = self.mesh.answer_pings()
-        host, port = self.settings.host, self.settings.port
-        try:
-            self._server = await asyncio.get_running_loop().create_server(
-                self._connection, host, port, backlog=1024, reuse_port=self.settings.reuse_port
-            )
-        except OSError as error:
-            raise Unreachable(f"{host}:{port}", f"cannot listen there: {error.strerror or error}") from error
-        self.port = self._server.sockets[0].getsockname()[1]
-        log.info("listening on %s:%d", host, self.port)
+        sockets = bound(self.settings.host, self.settings.port, shared=self.settings.reuse_port)
+        self.port = sockets[0].getsockname()[1]
+        for listening in sockets:
+            create = asyncio.get_running_loop().create_server
+            try:
+                self._servers.append(await create(self._connection, sock=listening, backlog=1024))
+            except OSError as error:  # two gateways can hold a port, and one of them can listen
+                why = f"cannot listen there: {error.strerror or error}"
+                raise Unreachable(self.address, why) from error
+        log.info("listening on %s", self.address)
+
+    @property
+    def address(self) -> str:
+        """Where it listens, as headsets are told it."""
+        return joined(self.settings.host, self.port)
 
     def _now(self) -> dict[str, int]:
         """What `macs doctor` is told besides losses."""
@@ -189,8 +197,8 @@ class Gateway:
 
     async def close(self) -> None:
         """Stop accepting, tell the mesh, send what waits for ``FLUSH_S`` at most, leave."""
-        if self._server is not None:
-            self._server.close()
+        for server in self._servers:
+            server.close()
         self._renumbering.close()
         self._robots.close()
         connections = [*self.agents.connections(), *self._waiting]

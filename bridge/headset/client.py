@@ -29,6 +29,7 @@ from types import TracebackType
 
 import msgspec
 
+from macs_zenoh.addresses import joined
 from macs_zenoh.errors import CallTimeout, Unreachable, UsageError, WireError
 from macs_zenoh.limits import ANSWER_BYTES
 from macs_zenoh.messages import (
@@ -176,7 +177,7 @@ class Headset:
     @property
     def target(self) -> str:
         """``host:port`` of the router."""
-        return f"{self.host}:{self.port}"
+        return joined(self.host, self.port)
 
     @property
     def connected(self) -> bool:

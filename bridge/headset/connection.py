@@ -7,6 +7,7 @@ import contextlib
 import socket
 from collections import deque
 
+from macs_zenoh.addresses import joined
 from macs_zenoh.errors import Unreachable
 from macs_zenoh.wire import MessageDecoder
 
@@ -32,7 +33,7 @@ class Connection:
     @classmethod
     async def open(cls, host: str, port: int, *, timeout_s: float, max_message_bytes: int) -> Connection:
         """Connect. Raises Unreachable."""
-        target = f"{host}:{port}"
+        target = joined(host, port)
         try:
             reader, writer = await asyncio.wait_for(asyncio.open_connection(host, port), timeout_s)
         except asyncio.TimeoutError as error:

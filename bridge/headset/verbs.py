@@ -6,6 +6,7 @@ import argparse
 import json
 from typing import Any, NoReturn
 
+from macs_zenoh import addresses
 from macs_zenoh.errors import UsageError
 
 SETTLE_S = 0.5
@@ -61,13 +62,10 @@ def add_run(verbs: Any) -> None:
 
 def parse_target(text: str) -> tuple[str, int]:
     """``HOST:PORT``, ``[IPV6]:PORT`` or ``HOST`` (then port 7000). Raises argparse.ArgumentTypeError."""
-    host, colon, port = text.rpartition(":")
-    if not colon or text.endswith("]"):
-        host, port = text, "7000"
-    host = host.removeprefix("[").removesuffix("]")
-    if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
-        raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT")
-    return host, int(port)
+    try:
+        return addresses.parse(text, 7000)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 RUN_HELP = """\

@@ -12,6 +12,7 @@ from typing import Any
 from rclpy.exceptions import InvalidParameterTypeException, ParameterUninitializedException
 from rclpy.parameter import Parameter
 
+from macs_zenoh.addresses import bare, joined
 from macs_zenoh.config import Settings, changed
 from macs_zenoh.errors import ConfigError
 
@@ -34,8 +35,10 @@ def apply(node: Any, settings: Settings) -> Settings:
         if port is not None and not 0 < port <= 0xFFFF:
             raise ConfigError("ROS parameter router_port", f"{port} is no port")
         address = address or ADDRESS
-        host = f"[{address}]" if ":" in address else address
-        mesh = changed(mesh, connect=[f"tcp/{host}:{port or PORT}"])
+        try:
+            mesh = changed(mesh, connect=[f"tcp/{joined(bare(address), port or PORT)}"])
+        except ValueError as error:
+            raise ConfigError("ROS parameter router_ip_address", str(error)) from None
     return changed(settings, mesh=mesh, robot=robot)
 
 

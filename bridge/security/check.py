@@ -25,11 +25,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from bridge.doctor.below import host_and_port
 from bridge.security import access, certificates
 from bridge.security.expected import Expected, agent_of, inbox_of, presence_of, sender_of
 from bridge.security.files import client_overrides
 from bridge.security.plan import Client, Gateway, Operator, Plan, Robot
+from macs_zenoh.addresses import of_endpoint
 from macs_zenoh.config import MeshSettings, changed
 from macs_zenoh.errors import ConfigError, Refused, Unreachable
 from macs_zenoh.keyexpr import (
@@ -171,7 +171,7 @@ async def _reach(label: str, endpoint: str, timeout_s: float) -> None:
 
     Raises Unreachable.
     """
-    place = host_and_port(endpoint)
+    place = of_endpoint(endpoint)
     if place is None or endpoint.partition("/")[0] not in ("tcp", "tls"):
         return
 

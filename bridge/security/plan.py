@@ -29,6 +29,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
+from macs_zenoh.addresses import joined
 from macs_zenoh.config import AgentId, AgentName, GroupId, MeshSettings, TrafficRule
 from macs_zenoh.errors import ConfigError
 
@@ -73,9 +74,8 @@ class Router(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """Its endpoints for others."""
         if self.endpoints:
             return self.endpoints
-        host = f"[{self.addresses[0]}]" if ":" in self.addresses[0] else self.addresses[0]
         protocol, _, address = re.split("[?#]", self.listen[0])[0].partition("/")
-        return [f"{protocol}/{host}:{address.rpartition(':')[2]}"]
+        return [f"{protocol}/{joined(self.addresses[0], address.rpartition(':')[2])}"]
 
 
 class _Client(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):

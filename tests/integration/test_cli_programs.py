@@ -101,6 +101,63 @@ def children_of(pid: int) -> list[int]:
     return found
 
 
+@pytest.mark.parametrize("workers", [[], ["--workers", "2"]], ids=["alone", "workers"])
+@pytest.mark.parametrize(
+    ("host", "shown", "dialled"),
+    [
+        ("::", "[::]", ["127.0.0.1", "::1"]),
+        ("[::]", "[::]", ["127.0.0.1", "::1"]),
+        ("::1", "[::1]", ["::1"]),
+        ("0.0.0.0", "0.0.0.0", ["127.0.0.1"]),
+        ("localhost", "localhost", ["127.0.0.1"]),
+    ],
+)
+async def test_where_a_gateway_listens_can_be_pasted(
+    endpoint: str, host: str, shown: str, dialled: list[str], workers: list[str]
+) -> None:
+    """`::` is both families, with and without brackets; what `ready:` says is what `macs headset` takes."""
+    async with (
+        Program("router", "-l", endpoint),
+        Program("gateway", "--host", host, "--port", "0", "-e", endpoint, *workers) as gateway,
+    ):
+        where = gateway.ready.removeprefix("gateway on ")
+        assert where == f"{shown}:{gateway.port}"
+        assert (await macs("headset", where, "online"))["ros"] == []
+        for address in dialled:
+            async with await Headset.connect(address, gateway.port) as headset:
+                assert headset.target == (f"[{address}]" if ":" in address else address) + f":{gateway.port}"
+
+
+@pytest.mark.parametrize(
+    ("first", "then"), [([], ["--workers", "2"]), (["--workers", "2"], []), (["--workers", "2"], ["--workers", "3"])]
+)
+async def test_a_port_is_free_when_its_gateway_is_gone(endpoint: str, first: list[str], then: list[str]) -> None:
+    """A gateway that closed its connections leaves no port that others cannot have for a minute."""
+    async with Program("router", "-l", endpoint):
+        async with Program("gateway", "--port", "0", "-e", endpoint, *first) as gateway:
+            port = gateway.port
+            headsets = [await Headset.connect("127.0.0.1", port) for _ in range(4)]
+            await gateway.stop()
+            for headset in headsets:
+                await headset.close()
+        async with Program("gateway", "--port", str(port), "-e", endpoint, *then):
+            async with await Headset.connect("127.0.0.1", port) as headset:
+                assert (await headset.online()).unity_agent_ids == [headset.id]
+
+
+@pytest.mark.parametrize("first", [[], ["--workers", "2"]], ids=["alone", "workers"])
+async def test_workers_share_with_no_other_gateway(endpoint: str, first: list[str]) -> None:
+    """A port of another gateway is taken, also of one that shares it among its own workers."""
+    async with (
+        Program("router", "-l", endpoint),
+        Program("gateway", "--port", "0", "-e", endpoint, *first) as gateway,
+    ):
+        for second in ([], ["--workers", "2"]):
+            code, out, errors = await ended("gateway", "--port", str(gateway.port), "-e", endpoint, *second)
+            assert (code, out) == (1, "")
+            assert f"127.0.0.1:{gateway.port} cannot be reached: cannot listen there" in errors.splitlines()[-1]
+
+
 async def test_a_gateway_waits_for_its_router(endpoint: str) -> None:
     """Started first, a gateway says what it waits for, and works once the router is there."""
     gateway = Program("gateway", "--port", "0", "-e", endpoint)
