@@ -140,9 +140,11 @@ async def test_a_port_is_free_when_its_gateway_is_gone(endpoint: str, first: lis
             await gateway.stop()
             for headset in headsets:
                 await headset.close()
-        async with Program("gateway", "--port", str(port), "-e", endpoint, *then):
-            async with await Headset.connect("127.0.0.1", port) as headset:
-                assert (await headset.online()).unity_agent_ids == [headset.id]
+        async with (
+            Program("gateway", "--port", str(port), "-e", endpoint, *then),
+            await Headset.connect("127.0.0.1", port) as headset,
+        ):
+            assert (await headset.online()).unity_agent_ids == [headset.id]
 
 
 @pytest.mark.parametrize("first", [[], ["--workers", "2"]], ids=["alone", "workers"])
