@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 
+from msgspec import UNSET, structs
+
 from macs_zenoh.errors import Refused
 from macs_zenoh.keyexpr import CALL
 from macs_zenoh.mesh import Mesh, Subscription
@@ -62,6 +64,8 @@ class OwnKeys:
             caller = (int(fields["from_type"]), int(fields["from_id"]))
             node = decode_data(kind, parse_frame(payload, self._layout).body)
             check_own(node, caller)
+            if isinstance(node, AddNode):
+                node = structs.replace(node, unity_cdr=UNSET)  # a robot program passes CDR on as it is
             if not connection.tell(node):
                 return b""  # it has that node already
             metadata = Metadata(*caller, message_manager=kind.manager)

@@ -15,6 +15,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from msgspec import UNSET, structs
+
 from bridge.listening import bound
 from macs_zenoh.addresses import joined
 from macs_zenoh.config import GatewaySettings
@@ -379,9 +381,11 @@ class Gateway:
         elif isinstance(event, Joined):
             self._joined(connection, event)
         elif isinstance(event, Registering):
-            if isinstance(event.node, AddNode):
-                connection.registered(event.node.node_name, event.node.node_type)
-            self._robots.register(event.node, event.robot_ids, event.groups)
+            node = event.node
+            if isinstance(node, AddNode):
+                connection.registered(node.node_name, node.node_type)
+                node = structs.replace(node, unity_cdr=UNSET if connection.peer.extensions else True)
+            self._robots.register(node, event.robot_ids, event.groups)
         elif isinstance(event, RegistrationRefused):
             self._tell_refusal(connection.key, event.refused)
         elif isinstance(event, AskedOnline):
