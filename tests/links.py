@@ -70,7 +70,11 @@ async def counted(router: str, *, buffer_bytes: int | None = None) -> AsyncItera
         if link.is_cut:
             writer.transport.abort()
             return
-        router_reader, router_writer = await asyncio.open_connection(host, int(port))
+        try:
+            router_reader, router_writer = await asyncio.open_connection(host, int(port))
+        except OSError:  # the router is down
+            writer.transport.abort()
+            return
         link.ends |= {writer, router_writer}
         tasks.add(asyncio.create_task(pump(reader, router_writer, up=True)))
         tasks.add(asyncio.create_task(pump(router_reader, writer, up=False)))

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import logging
 import os
 import random
 import signal
@@ -47,6 +48,8 @@ HEADSETS = 6
 MOST_HEADSETS = 16
 PEACE_S = 30.0
 """By when everything must be right again: a lease, a program's start, and a busy machine."""
+STEP_S = 60.0
+"""No single step takes so long."""
 MORE_THREADS = 8
 """Zenoh and asyncio start some late: for large messages, for names to look up, for a second link."""
 MORE_DESCRIPTORS = 16
@@ -348,13 +351,14 @@ async def run(minutes: float, seed: int, *, say: Callable[[str], object] = print
         begin = time.monotonic()
         while time.monotonic() - begin < 60 * minutes:
             for _ in range(running.random.randint(1, 3)):
-                did = await running.step()
+                did = await asyncio.wait_for(running.step(), STEP_S)
                 recent = [*recent[-5:], did]
                 say(f"{time.monotonic() - begin:6.1f} s  {did}")
             try:
                 await running.check()
             except AssertionError as error:
-                raise AssertionError(f"seed {seed}, after {' · '.join(recent)}: {error}") from error
+                logs = "\n".join(f"{name}: {line}" for name, p in running.everything.items() for line in p.log[-8:])
+                raise AssertionError(f"seed {seed}, after {' · '.join(recent)}: {error}\n{logs}") from error
         grown = ", ".join(f"{name} {size / MIB:+.0f} MiB" for name, size in running.largest.items())
         steps = ", ".join(f"{name} {count}" for name, count in sorted(running.steps.items()))
         return (
@@ -373,6 +377,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=int.from_bytes(os.urandom(3), "little"))
     options = parser.parse_args()
+    logging.getLogger("macs").setLevel(logging.ERROR)  # that connections are lost is what is done here
     print(asyncio.run(run(options.minutes, options.seed, say=lambda line: print(line, flush=True))))
     return 0
 
