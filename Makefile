@@ -1,5 +1,6 @@
 # make run    a headset, a mesh and a robot on this machine, without hardware
 # make test   every test;  make lint   ruff and mypy;  make bench   the speed ratios;  make clean
+# make attacks    every attack on a running site, as a table;  make chaos   an hour of kills, floods and cuts
 # make zenohd the router that the tests of networks and deployments run against, built by cargo (minutes, once)
 #
 # Needs python3 (3.10 or newer) with venv, and network access the first time. Everything goes into .venv.
@@ -26,7 +27,7 @@ VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)
 INTERFACES := $(if $(findstring ros,$(EXTRAS)),$(VENV)/.interfaces)
 
 .DEFAULT_GOAL := help
-.PHONY: help run install test lint format bench zenohd clean
+.PHONY: help run install test lint format bench attacks chaos zenohd clean
 
 help:
 	@sed -n '/^$$/q; s/^# \{0,1\}//p' Makefile
@@ -70,6 +71,12 @@ format: install
 
 bench: install
 	@$(BIN)/python -m benchmarks $(ARGS)
+
+attacks: install
+	@$(BIN)/python -m tests.attack $(ARGS)
+
+chaos: install
+	@$(BIN)/python -m tests.attack.chaos $(ARGS)
 
 # The version of the wheel in use, so that both ends of a test are the same Zenoh. Cargo puts it into its own bin, where
 # the tests find it; without it they use the router inside the wheel.

@@ -50,6 +50,7 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="attacks, or how their names begin (default: all)")
     parser.add_argument("--list", action="store_true", help="name them, and say what each sends")
     parser.add_argument("--section", type=int, action="append", help="those that look for faults of this class")
+    parser.add_argument("--seen", action="store_true", help="those with which something was once brought down")
     parser.add_argument("--seconds", type=float, default=4.0, help="how long each lasts (default: 4)")
     parser.add_argument("--stops", type=int, help="go on until so many stops were pressed")
     parser.add_argument("--json", type=Path, help="write the figures to this file as well")
@@ -59,6 +60,7 @@ def main() -> int:
         for row in table.every().values()
         if (not options.names or any(row.name.startswith(name) for name in options.names))
         and (not options.section or row.section in options.section)
+        and (not options.seen or row.seen)
     ]
     if not rows:
         parser.error("there is no such attack; --list names them")

@@ -46,7 +46,7 @@ def crowd(target: Target, count: int, make: Callable[[], Agent | None]) -> list[
 # -- work ------------------------------------------------------------------------------------------------------------
 
 
-@attack(2, "headset", single=True)
+@attack(2, "headset", single=True, seen=True)
 def a_registration_with_65_535_robots(target: Target) -> None:
     """One registration that names every robot id there is."""
     agent = Agent(target.port)
@@ -76,7 +76,7 @@ def ever_new_node_names(target: Target) -> None:
             target.rest(0.02)
 
 
-@attack(2, "headset")
+@attack(2, "headset", seen=True)
 def ever_new_node_names_kept(target: Target) -> None:
     """4 000 registrations and more under different names, none of which ends."""
     agent, number = Agent(target.port), 0
@@ -94,7 +94,7 @@ def registrations_again_and_again(target: Target) -> None:
     flood(target, registration("nd__again", "/again"), registration("nd__again", "/again", add=False))
 
 
-@attack(2, "headset")
+@attack(2, "headset", seen=True)
 def fresh_destinations(target: Target) -> None:
     """Messages to ids that were never used: ten new ones in each frame, of every type."""
     agent, count = Agent(target.port), 0
@@ -111,7 +111,7 @@ def fresh_destinations(target: Target) -> None:
             target.rest(0.02)
 
 
-@attack(2, "headset")
+@attack(2, "headset", seen=True)
 def many_fill_the_robot_with_nodes(target: Target) -> None:
     """300 interface nodes registered at the robot by one headset."""
     agent = Agent(target.port)
@@ -133,7 +133,7 @@ def who_is_online(target: Target) -> None:
     flood(target, asking, agents=2)
 
 
-@attack(2, "headset")
+@attack(2, "headset", seen=True)
 def changing_groups(target: Target) -> None:
     """Configurations that change the group, at full rate."""
     agent_says = [
@@ -184,7 +184,7 @@ def headers_only(target: Target) -> None:
 # -- connections -----------------------------------------------------------------------------------------------------
 
 
-@attack(2, "headset")
+@attack(2, "headset", seen=True)
 def half_frames(target: Target) -> None:
     """Fifty connections that each send 31.9 MiB of a frame, and then a byte every now and then."""
     body = bytes(HUGE - MIB)
@@ -227,7 +227,7 @@ def connections_that_say_nothing(target: Target) -> None:
         agents += crowd(target, 20, lambda: Agent(target.port, configure=False))
 
 
-@attack(2, "headset")
+@attack(2, "headset", seen=True)
 def every_slot(target: Target) -> None:
     """As many configured headsets from one address as are let in, up to 2 500."""
     agents = crowd(target, 2500, lambda: Agent(target.port))
@@ -271,7 +271,7 @@ def half_closed(target: Target) -> None:
         target.rest(0.05)
 
 
-@attack(2, "headset")
+@attack(2, "headset", seen=True)
 def slow_readers(target: Target) -> None:
     """Twenty headsets that do not read, while two others send each of them large messages."""
     deaf = crowd(target, 20, lambda: Agent(target.port, read=False))
@@ -314,7 +314,7 @@ def slow_readers_of_large_frames(target: Target) -> None:
     flood(target, big)
 
 
-@attack(2, "headset")
+@attack(2, "headset", seen=True)
 def reconnecting_to_send(target: Target) -> None:
     """A new connection for every 500 messages, so that what is counted per connection begins anew."""
     burst = frame(metadata=metadata(message_manager="Hello"), to=UNITY, ids=[60_001]) * 500
@@ -328,7 +328,7 @@ def reconnecting_to_send(target: Target) -> None:
 # -- the robot and the stop ------------------------------------------------------------------------------------------
 
 
-@attack(3, "headset")
+@attack(3, "headset", seen=True)
 def status_requests(target: Target) -> None:
     """RobotStatus at full rate."""
     flood(target, request("RobotStatus"))
@@ -421,7 +421,7 @@ def registrations_at_the_robot(target: Target) -> None:
     flood(target, *frames)
 
 
-@attack(3, "headset")
+@attack(3, "headset", seen=True)
 def releasing_all_the_time(target: Target) -> None:
     """``false`` on the emergency stop's topic 50 times per second."""
     agent = Agent(target.port)

@@ -42,7 +42,7 @@ def unknown_keys(size: int) -> bytes:
 # -- names that become keys ------------------------------------------------------------------------------------------
 
 
-@attack(1, "headset", single=True)
+@attack(1, "headset", single=True, seen=True)
 def long_node_name(target: Target) -> None:
     """A registration with a node name of 70 000 characters."""
     repeatedly(target, registration(LONG, "/x"))
@@ -54,7 +54,7 @@ def long_node_name_for_a_group(target: Target) -> None:
     repeatedly(target, registration(LONG, "/x", agents=[], groups=[1, 255]))
 
 
-@attack(1, "tcp robot", single=True)
+@attack(1, "tcp robot", single=True, seen=True)
 def long_node_name_on_a_stream(target: Target) -> None:
     """Topic data of a TCP robot under a node name of 70 000 characters, for every headset."""
     repeatedly(target, _stream({"2": list(range(1, 9))}, LONG), agent_type=ROS)
@@ -89,19 +89,19 @@ def names_near_the_limit_of_a_key(target: Target) -> None:
 # -- much to parse ---------------------------------------------------------------------------------------------------
 
 
-@attack(1, "headset", single=True)
+@attack(1, "headset", single=True, seen=True)
 def unknown_keys_as_metadata(target: Target) -> None:
     """31 MiB of metadata with 2.7 million unknown keys, to all headsets."""
     repeatedly(target, frame(metadata=unknown_keys(HUGE)))
 
 
-@attack(1, "headset", single=True)
+@attack(1, "headset", single=True, seen=True)
 def unknown_keys_as_management(target: Target) -> None:
     """31 MiB of management data with 2.7 million unknown keys."""
     repeatedly(target, frame(unknown_keys(HUGE)))
 
 
-@attack(1, "headset", single=True)
+@attack(1, "headset", single=True, seen=True)
 def empty_lists_as_management(target: Target) -> None:
     """31 MiB of ``[],`` as management data, which become hundreds of MB of lists."""
     repeatedly(target, frame(b'{"messageManager":"HeartbeatHandler","x":[' + b"[]," * (HUGE // 3) + b"[]]}"))
@@ -114,7 +114,7 @@ def empty_lists_as_metadata(target: Target) -> None:
     repeatedly(target, frame(metadata=said, to=ROS, ids=[target.robot]))
 
 
-@attack(1, "headset", single=True)
+@attack(1, "headset", single=True, seen=True)
 def keys_as_data_of_a_request(target: Target) -> None:
     """31 MiB of keys as data of RobotControl, which only the robot reads."""
     repeatedly(target, request("RobotControl", unknown_keys(HUGE)))
@@ -237,7 +237,7 @@ def names_that_are_no_names(target: Target) -> None:
 # -- other people's values -------------------------------------------------------------------------------------------
 
 
-@attack(4, "headset", single=True)
+@attack(4, "headset", single=True, seen=True)
 def empty_node_name_for_a_group(target: Target) -> None:
     """A registration with an empty node name for group 200, and then a TCP robot that joins group 200."""
     while target.running():

@@ -17,9 +17,9 @@ MIB = 1 << 20
 SINGLE_TIMES = 5.0
 FLOOD_S = 0.020
 STOP_S = 0.100
-ROUGH_P99_S = 0.25
-ROUGH_LONGEST_S = 1.5
-ROUGH_STOP_S = 0.6
+ROUGH_P99_S = 1.0
+ROUGH_LONGEST_S = 2.5
+ROUGH_STOP_S = 1.0
 OF_BENIGN = 1.5
 """So much more than under the equal load may be chance."""
 ROUGHLY_OF_BENIGN = 5.0
@@ -99,7 +99,7 @@ class Report:
 
     def roughly(self) -> list[str]:
         """What does not hold, whatever else the machine does."""
-        p99 = max(ROUGH_P99_S, ROUGHLY_OF_BENIGN * self.benign.p99)
+        p99 = max(ROUGH_P99_S, ROUGHLY_OF_BENIGN * self.benign.p99, ROUGHLY_OF_BENIGN * self.calm.p99)
         longest = max(ROUGH_LONGEST_S, 3 * self.benign.longest)
         return self._judge(p99, longest, ROUGH_STOP_S, ROUGHLY_OF_BENIGN)
 

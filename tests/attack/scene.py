@@ -50,7 +50,8 @@ HOLDS_S = 0.1
 """How long after each stop the driver is watched driving in vain."""
 RECOVERY_S = 15.0
 """By when everything must be as before."""
-BEGIN_S = 30.0
+BEGIN_S = 60.0
+"""By when an attacker has made its frames and begins."""
 
 MEMORY_LIMITS = {"gateway": 128 * MIB, "robot": 128 * MIB, "router": 256 * MIB}
 """What one attacker may cost a program. The router is Zenoh's, and its queues are per link."""

@@ -82,7 +82,7 @@ def _to_headset(said: bytes, data: bytes = b"") -> bytes:
 # -- single samples --------------------------------------------------------------------------------------------------
 
 
-@attack(1, "mesh", single=True)
+@attack(1, "mesh", single=True, seen=True)
 def samples_with_31_mib_of_metadata(target: Target) -> None:
     """31 MiB of unknown keys as metadata, on each key space."""
     puts(target, _everybody(target), [_to_headset(unknown_keys(HUGE))], every_s=0.5)
@@ -254,13 +254,13 @@ def streams_at_full_rate(target: Target) -> None:
     puts(target, [f"macs/from/ros/{target.robot}/nd__x"], [frame(said, about, bytes(64))])
 
 
-@attack(3, "mesh")
+@attack(3, "mesh", seen=True)
 def status_queries(target: Target) -> None:
     """The verb ``status`` at full rate."""
     queries(target, "status")
 
 
-@attack(3, "mesh")
+@attack(3, "mesh", seen=True)
 def offers_queries(target: Target) -> None:
     """The verb ``offers`` at full rate: what somebody may ask who may only see."""
     queries(target, "offers")
@@ -328,7 +328,7 @@ def queries_of_all_verbs_from_many(target: Target) -> None:
                 target.rest(0.001)
 
 
-@attack(2, "mesh")
+@attack(2, "mesh", seen=True)
 def twenty_thousand_tokens(target: Target) -> None:
     """20 000 presence tokens of one session."""
     with session(target) as mesh:
@@ -367,7 +367,7 @@ def leases_of_every_block(target: Target) -> None:
                 token.undeclare()
 
 
-@attack(2, "mesh")
+@attack(2, "mesh", seen=True)
 def a_thousand_agents_and_questions(target: Target) -> None:
     """1 000 agents online by tokens, while two headsets ask at full rate who is."""
     from tests.attack.floods import flood

@@ -42,12 +42,14 @@ class Target:
 
 @dataclass(frozen=True)
 class Attack:
-    """One row. ``single``: few frames, each of which must cost nobody anything; otherwise a flood."""
+    """One row. ``single``: few frames, each of which must cost nobody anything; otherwise a flood. ``seen``: with this
+    one a site was once brought down or a stop lost; the others are its kin."""
 
     name: str
     section: int
     by: By
     single: bool
+    seen: bool
     run: Callable[[Target], None]
 
     @property
@@ -59,14 +61,16 @@ class Attack:
 ATTACKS: dict[str, Attack] = {}
 
 
-def attack(section: int, by: By, *, single: bool = False) -> Callable[[Callable[[Target], None]], Attack]:
+def attack(
+    section: int, by: By, *, single: bool = False, seen: bool = False
+) -> Callable[[Callable[[Target], None]], Attack]:
     """Put a function into the table. ``section`` is the class of faults that it looks for:
 
     1 size and cost before parsing, 2 budgets, 3 the way of the stop, 4 other people's values, 5 rights.
     """
 
     def enter(run: Callable[[Target], None]) -> Attack:
-        row = Attack(run.__name__, section, by, single, run)
+        row = Attack(run.__name__, section, by, single, seen, run)
         assert row.says, f"{row.name} does not say what it sends"
         assert ATTACKS.setdefault(row.name, row) is row, f"two attacks are called {row.name}"
         return row
