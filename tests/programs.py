@@ -82,6 +82,10 @@ class Program:
         """Send a signal to it, and to nothing else."""
         self._process.send_signal(number)
 
+    async def wait(self) -> int:
+        """Wait until it ends by itself; its exit code."""
+        return await self._process.wait()
+
     async def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Stop it; its exit code. A program that does not stop in time is killed, and that is an error."""
         if self._process.returncode is None:

@@ -85,6 +85,7 @@ class RobotAgent:
         self.agent.on_presence(self._presence)
         self.agent.on_id(self._id_changed)
         self.agent.mesh.on_link(self._link)
+        self.agent.mesh.last_words(self.nodes.last_words)
         self.agent.mesh.tells = self._troubles
         for verb, handler in (
             ("add_node", self._add_node),

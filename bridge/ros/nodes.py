@@ -194,6 +194,12 @@ class InterfaceNodes:
         for message in self._early.take(key, lambda message: self._meant(key, message) is node):
             node.receive(message)
 
+    def last_words(self) -> None:
+        """This program is about to end without closing anything: no last command may stay. From any thread."""
+        for node in list(self):
+            if isinstance(node, PublisherNode):
+                node.retire()
+
     def close(self) -> None:
         """Remove all nodes."""
         for node in self:

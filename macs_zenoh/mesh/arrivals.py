@@ -14,6 +14,7 @@ from typing import Any
 
 import zenoh
 
+from .panics import end_if_panic
 from .samples import AtOnce, OnBatch, OnNumbered, Payload
 from .threads import keep_attached
 
@@ -78,6 +79,9 @@ class Arrivals:
             publisher.put(zenohs)
         except zenoh.ZError as error:  # the session is closed
             log.debug("put: %s", error)
+        except BaseException as error:
+            end_if_panic(error)
+            raise
         finally:
             self._own.payload = None
 

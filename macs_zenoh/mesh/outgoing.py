@@ -17,6 +17,7 @@ from macs_zenoh.keyexpr import NAMED_ALL, STREAM
 from macs_zenoh.shaping import Shape, Shaper
 
 from .arrivals import Arrivals
+from .panics import call, unwatched
 from .samples import Payload, Traffic
 
 log = logging.getLogger("macs.mesh")
@@ -215,8 +216,9 @@ class Outgoing:
         priority, congestion, express = self.way(key, traffic)
         # an answer that were dropped would be asked for again, so it waits
         answers = zenoh.ext.RepliesConfig(priority=priority, congestion_control=zenoh.CongestionControl.BLOCK)
-        return zenoh.ext.declare_advanced_publisher(
-            self._session,
+        return call(
+            zenoh.ext.declare_advanced_publisher,
+            unwatched(self._session),
             key,
             priority=priority,
             congestion_control=congestion,

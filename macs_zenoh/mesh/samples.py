@@ -9,6 +9,8 @@ from typing import Any
 
 import zenoh
 
+from .panics import call
+
 log = logging.getLogger("macs.mesh")
 
 Payload = bytes | bytearray
@@ -56,7 +58,7 @@ class Subscription:
         declared, self._declared = self._declared, ()
         for entity in declared:
             try:
-                entity.undeclare()
+                call(entity.undeclare)
             except zenoh.ZError as error:
                 log.debug("undeclare: %s", error)
 

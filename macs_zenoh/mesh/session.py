@@ -35,11 +35,15 @@ from .arrivals import Arrivals
 from .awake import Awake
 from .opening import check_files, first_line, insert, zenoh_config
 from .outgoing import Outgoing
+from .panics import call, end_if_panic, end_on_panics, last_words, watched
 from .recovered import Recovered
 from .samples import AtOnce, Handler, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
 from .threads import shared_threads
 
 log = logging.getLogger("macs.mesh")
+
+BEAT_S = 5.0
+"""How often it is tried whether Zenoh still works in this process."""
 
 HOLDER = re.compile(r"([0-9]{1,3})/([0-9]{1,5})")
 """Who has what was refused: agent type and id."""
@@ -68,8 +72,9 @@ class Mesh:
         self.drops: Counter[str] = Counter()
         self.shaper = Shaper(traffic, self.drops)
         self.zid = str(session.zid())
-        self._session = session
+        self._session = session = watched(session)
         self._loop = asyncio.get_running_loop()
+        end_on_panics(self._loop)
         self._arrivals = Arrivals(self._loop, self._from_thread, self.drops)
         self._awake: Awake | None = None
         self._missed: set[str] = set()
@@ -99,6 +104,8 @@ class Mesh:
         # links, not transports, and directly: Zenoh tells of a lost link before it tells that everybody behind it
         # left, and of the lost transport only after that
         on_link = zenoh.handlers.Callback(self._link_changed, indirect=False)
+        self._pulse: zenoh.Publisher | None = None
+        self._beating = self._loop.call_later(BEAT_S, self._beat)
         self._links = session.info.declare_link_events_listener(on_link, history=True)
 
     @classmethod
@@ -153,6 +160,16 @@ class Mesh:
         """Whether so much waits to be sent that callers should slow down; `on_room` tells when it is over."""
         return self._outgoing.backlogged
 
+    def last_words(self, say: Callable[[], None]) -> None:
+        """Call ``say``, from any thread, before a panic of Zenoh ends this program, which does not leave the mesh."""
+        last_words(say)
+
+    def _beat(self) -> None:
+        """Put something to nobody: a panic in a thread of Zenoh's own would show nowhere else."""
+        self._pulse = self._pulse or self._session.declare_publisher(PING.of(zid=self.zid))
+        call(self._pulse.put, b"")
+        self._beating = self._loop.call_later(BEAT_S, self._beat)
+
     def keep_awake(self) -> None:
         """Keep this machine's cores awake while messages or questions pass, if the settings ask for it: for programs
         that pass them on, not for those that only look, or route."""
@@ -173,6 +190,7 @@ class Mesh:
 
     async def close(self) -> None:
         """Leave the mesh: what was put is sent first, tokens end. A process must not exit without it."""
+        self._beating.cancel()
         for task in self._tasks:
             task.cancel()
         if self._awake is not None:
@@ -379,6 +397,9 @@ class Mesh:
                 except Exception:
                     log.exception("call %s failed", name)
                     query.reply_err(msgspec.json.encode({"failed": "internal error, see the log there"}))
+                except BaseException as error:
+                    end_if_panic(error)
+                    raise
 
         def spawn(query: zenoh.Query) -> None:
             task = self._loop.create_task(answer(query))
