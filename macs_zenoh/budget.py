@@ -5,21 +5,29 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable
 
+FEW = 16
+"""Who has less than this part of what each may have has little."""
+
+
+def may_have_one_more(used: int, mine: int, *, each: int, total: int, more: int = 1) -> bool:
+    """Whether somebody who has ``mine`` of ``used`` in all may have one more, or so many.
+
+    The last quarter of the total is for those who have little: whoever takes much cannot keep others from what they
+    need.
+    """
+    has_little = mine + more <= max(1, each // FEW)
+    return mine + more <= each and used + more <= (total if has_little else total - total // 4)
+
 
 class Budget:
-    """Amounts by holder: each has at most ``each``, those at one address ``per_address``, all together ``total``.
-
-    The last quarter of the total is for those who have little, a sixteenth of what each may have: whoever takes much
-    cannot keep others from what they need.
-    """
+    """Amounts by holder: each has at most ``each``, those at one address ``per_address``, all together ``total``, of
+    which the last quarter is for those who have little (`may_have_one_more`)."""
 
     def __init__(self, what: str, *, each: int, per_address: int, total: int) -> None:
         self._what = what
         self._each = each
-        self._few = max(1, each // 16)
         self._per_address = per_address
         self._total = total
-        self._open_to_all = total - total // 4
         self._of: dict[Hashable, int] = {}
         self._at: Counter[str] = Counter()
         self.used = 0
@@ -30,12 +38,12 @@ class Budget:
 
     def judge(self, holder: Hashable, address: str, more: int = 1) -> str | None:
         """Why somebody at this address may not have ``more`` than now, None when it may."""
-        mine = self._of.get(holder, 0) + more
-        if mine > self._each:
+        mine = self._of.get(holder, 0)
+        if mine + more > self._each:
             return f"each may have {self._each} {self._what}"
         if self._at.get(address, 0) + more > self._per_address:
             return f"all at one address may have {self._per_address} {self._what}"
-        if self.used + more > (self._total if mine <= self._few else self._open_to_all):
+        if not may_have_one_more(self.used, mine, each=self._each, total=self._total, more=more):
             return f"all together may have {self._total} {self._what}"
         return None
 

@@ -37,6 +37,15 @@ ANSWER_BYTES = 1 << 20
 REASON_CHARACTERS = 500
 """Of a reason that is passed on to a person."""
 
+NODES_EACH = 1024
+"""Interface nodes that one TCP agent may have registered; recorded programs have tens."""
+
+NODES_PER_ADDRESS = 16 << 10
+"""The same for all that come from one address."""
+
+NODES_IN_ALL = 64 << 10
+"""The same for all of one gateway. Each costs about a KiB; see `budget` for who may have the last of them."""
+
 NODE_AGENTS = 1024
 """Robots that one registration may name by id; groups are for more."""
 

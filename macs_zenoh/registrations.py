@@ -181,10 +181,6 @@ class Registrations:
         wish = self._of_agent.get(agent, {}).get((node_type, node_name))
         return wish.node if wish else None
 
-    def count_of(self, agent: AgentKey) -> int:
-        """How many registrations an agent has."""
-        return len(self._of_agent.get(agent, ()))
-
     def refused(self, task: Task, holder: AgentKey) -> None:
         """A robot refused a registration because another agent has the node."""
         wish = self._find(task.node)

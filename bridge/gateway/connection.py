@@ -11,17 +11,19 @@ import termios
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Protocol, cast
 
 from macs_zenoh.addresses import joined, of_peer
-from macs_zenoh.messages import AddNode, GoneAgent, Metadata, NodeType, RemoveNode
+from macs_zenoh.messages import AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
 from macs_zenoh.peer import Event, Joined, Left, Peer, Rejected, Sent, State
 from macs_zenoh.queues import Chunk, Outbox
+from macs_zenoh.wire import encode_message
 
 from .brake import Brake
 from .shortcut import Shortcut
+from .told import Told
 
 log = logging.getLogger("macs.gateway")
 
@@ -82,7 +84,10 @@ class Connection(asyncio.BufferedProtocol):
         self._timer: asyncio.TimerHandle | None = None
         self._complained: set[str] = set()
         self._nodes: dict[str, set[int]] = {}
-        self._told: dict[tuple[int, int, int, str], AddNode] = {}
+        self.node_count = 0
+        """How many interface nodes the agent has, by type and name."""
+        self.told = Told()
+        """What a robot program was told."""
         self._refused = False
         self._pauses = 0
         self._unread = 0
@@ -258,10 +263,24 @@ class Connection(asyncio.BufferedProtocol):
 
     def registered(self, node_name: str, node_type: int) -> None:
         """The agent has an interface node of this name and type."""
-        self._nodes.setdefault(node_name, set()).add(node_type)
+        types = self._nodes.setdefault(node_name, set())
+        self.node_count += node_type not in types
+        types.add(node_type)
         if node_type == NodeType.SUBSCRIBER and self._shortcut is None and not self._transport.is_closing():
             with suppress(OSError):  # without it topics take the usual way
                 self._shortcut = Shortcut(self._transport.get_extra_info("socket"))
+
+    def is_registered(self, node: AddNode) -> bool:
+        """Whether the agent has this interface node already."""
+        return node.node_type in self._nodes.get(node.node_name, ())
+
+    def unregistered(self, node_name: str, node_type: int) -> None:
+        """The agent has taken it back from everybody."""
+        types = self._nodes.get(node_name, set())
+        self.node_count -= node_type in types
+        types.discard(node_type)
+        if not types:
+            self._nodes.pop(node_name, None)
 
     def takes(self, metadata: Metadata) -> bool:
         """Whether a node's message can be sent: an existing headset goes deaf for good on a message under the name
@@ -273,26 +292,13 @@ class Connection(asyncio.BufferedProtocol):
         """Whether the agent registered the node of this name and type itself."""
         return metadata.node_type in self._nodes.get(metadata.node_name, ())
 
-    def registrants(self) -> list[GoneAgent]:
-        """Who is registered on the nodes of this robot program."""
-        return [GoneAgent(*agent) for agent in dict.fromkeys(key[:2] for key in self._told)]
-
-    def tell(self, node: AddNode | RemoveNode) -> bool:
-        """Whether this robot program has to be told: it makes a second ROS node of a registration heard twice."""
-        key = (node.registrant_agent_type, node.registrant_agent_id, node.node_type, node.node_name)
-        if isinstance(node, RemoveNode):
-            self._told.pop(key, None)
-        elif self._told.get(key) == node:
-            return False
-        else:
-            self._told[key] = node
-        return True
-
-    def untell(self, gone: Iterable[GoneAgent]) -> None:
-        """A robot program that hears of these takes them off its nodes."""
-        if self._told:
-            left = {(agent.agent_type, agent.agent_id) for agent in gone}
-            self._told = {key: node for key, node in self._told.items() if key[:2] not in left}
+    def tell_gone(self, gone: list[GoneAgent]) -> None:
+        """Tell a robot program that these have left, if there are any."""
+        if gone:
+            self.told.untell(gone)
+            metadata = Metadata(message_manager=AgentsGone.manager)
+            self.send_call(encode_message(metadata.encode(), encode_data(AgentsGone(gone))))
+            self.flush()
 
     def flush(self) -> None:
         """Write what was sent since the last flush, in one go."""

@@ -16,10 +16,9 @@ from collections.abc import Callable, Iterable
 
 from macs_zenoh.blocks import Contests
 from macs_zenoh.keyexpr import block_of
-from macs_zenoh.messages import ROS, AgentsGone, Metadata, encode_data
+from macs_zenoh.messages import ROS
 from macs_zenoh.presence import Contested, Presence
 from macs_zenoh.registrations import AgentKey, Task
-from macs_zenoh.wire import encode_message
 
 from .agents import Agents
 from .connection import Connection
@@ -210,7 +209,8 @@ class Renumbering:
         log.info("%s has id %d now", before, new_id)
         self._later(ANSWER_S, lambda: self._forget_former(old, connection))
         if old[0] == ROS:
-            _drop_registrants(connection)
+            # who registered on a robot program asked for its old id, which is another robot's now
+            connection.tell_gone(connection.told.registrants())
         else:
             connection.send_call(connection.peer.welcome())
             connection.flush()
@@ -229,12 +229,3 @@ class Renumbering:
 
         timer = asyncio.get_running_loop().call_later(delay_s, run)
         self._timers.add(timer)
-
-
-def _drop_registrants(robot: Connection) -> None:
-    """Who registered on a robot program asked for its old id, which is another robot's now."""
-    if gone := robot.registrants():
-        metadata = Metadata(message_manager=AgentsGone.manager)
-        robot.untell(gone)
-        robot.send_call(encode_message(metadata.encode(), encode_data(AgentsGone(gone))))
-        robot.flush()

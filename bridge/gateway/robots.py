@@ -115,10 +115,6 @@ class RobotCalls:
             if wanted.running is not None and isinstance(wanted.task.node, AddNode):
                 self._start(Task(wanted.task.robot_id, removal(wanted.task.node)))
 
-    def count_of(self, agent: AgentKey) -> int:
-        """How many registrations an agent has."""
-        return self._registrations.count_of(agent)
-
     def find(self, agent: AgentKey, node_type: int, node_name: str) -> AddNode | None:
         """What an agent registered on a node."""
         return self._registrations.find(agent, node_type, node_name)

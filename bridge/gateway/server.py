@@ -15,14 +15,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from msgspec import UNSET, structs
-
 from bridge.listening import bound
 from macs_zenoh.addresses import joined
+from macs_zenoh.budget import Budget
 from macs_zenoh.config import GatewaySettings
 from macs_zenoh.directory import Change
 from macs_zenoh.errors import Refused, Unreachable
 from macs_zenoh.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
+from macs_zenoh.limits import NODES_EACH, NODES_IN_ALL, NODES_PER_ADDRESS
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Payload, Subscription, Traffic
 from macs_zenoh.messages import (
@@ -70,6 +70,7 @@ log = logging.getLogger("macs.gateway")
 PUBLISHER = int(NodeType.PUBLISHER)
 COMMAND, CALL = Traffic.COMMAND, Traffic.CALL  # looked up by a Python call otherwise, for each message
 KNOWN_ROUTES = 4096
+
 FLUSH_S = 1.0
 NO_MANAGERS: Managers = {}
 
@@ -119,6 +120,7 @@ class Gateway:
         )
         self._scratch = bytearray(FrameDecoder.SMALL_BYTES)  # sockets of one loop receive one after the other
         self._door = Door(settings.allow, settings.max_connections, settings.max_connections_per_address)
+        self._nodes = Budget("interface nodes", each=NODES_EACH, per_address=NODES_PER_ADDRESS, total=NODES_IN_ALL)
         self._numbers = 0
         self._waiting = WaitingRoom(settings.handshake_s, self._no_id)
         self._routes: dict[Connection, dict[bytes, Route]] = {}
@@ -130,7 +132,7 @@ class Gateway:
         self.directory = self._presence.directory
         """Who is online."""
         self._delivery = Delivery(self.agents, self.directory, self._layout)
-        self._own_keys = OwnKeys(mesh, self.agents, self._delivery, self._layout)
+        self._own_keys = OwnKeys(mesh, self.agents, self.directory, self._delivery, self._layout)
         self._leases = Leases(
             mesh,
             settings.block,
@@ -295,6 +297,7 @@ class Gateway:
         self._delivery.forget()
         was_online, empty_group = self.agents.leave(connection)
         self._leases.give_back(connection.agent_id)
+        self._nodes.set(connection, connection.host, 0)
         self._group_emptied(empty_group)
         if was_online:
             self._own_keys.undeclare(connection.key)
@@ -381,17 +384,30 @@ class Gateway:
         elif isinstance(event, Joined):
             self._joined(connection, event)
         elif isinstance(event, Registering):
-            node = event.node
-            if isinstance(node, AddNode):
-                connection.registered(node.node_name, node.node_type)
-                node = structs.replace(node, unity_cdr=UNSET if connection.peer.extensions else True)
-            self._robots.register(node, event.robot_ids, event.groups)
+            self._register(connection, event)
         elif isinstance(event, RegistrationRefused):
             self._tell_refusal(connection.key, event.refused)
         elif isinstance(event, AskedOnline):
             self._answer_online(connection, event.request_id)
         elif isinstance(event, Asked):
             self._manage(connection, event)
+
+    def _register(self, connection: Connection, event: Registering) -> None:
+        """An agent registers on a node of robots, or takes that back."""
+        node = event.node
+        if isinstance(node, AddNode):
+            if (
+                not connection.is_registered(node)
+                and (why := self._nodes.judge(connection, connection.host)) is not None
+            ):
+                connection.complain("too_many_nodes", why)
+                self._robots.refuse(node, next(iter(event.robot_ids), 0), why)
+                return
+            connection.registered(node.node_name, node.node_type)
+        self._robots.register(node, event.robot_ids, event.groups)
+        if not isinstance(node, AddNode) and self._robots.find(connection.key, node.node_type, node.node_name) is None:
+            connection.unregistered(node.node_name, node.node_type)
+        self._nodes.set(connection, connection.host, connection.node_count)
 
     def _manage(self, connection: Connection, event: Asked) -> None:
         """A management message for a manager that somebody added."""
@@ -470,7 +486,7 @@ class Gateway:
             metadata = Metadata(message_manager=AgentsGone.manager)
             message = encode_message(metadata.encode(), encode_data(AgentsGone(gone)))
             for connection in self.agents.online():
-                connection.untell(gone)
+                connection.told.untell(gone)
                 connection.send_call(message)
             self._delivery.flush()
         for change in changes:

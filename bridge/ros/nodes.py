@@ -17,6 +17,7 @@ from bridge.ros.rights import Rights
 from bridge.ros.services import ClientNode, ServiceNode, tell_failure
 from bridge.ros.stop import StopNode
 from bridge.ros.topics import PublisherNode, SubscriberNode
+from macs_zenoh.budget import may_have_one_more
 from macs_zenoh.errors import Refused
 from macs_zenoh.messages import AddNode, NodeType, RemoveNode, node_name
 from macs_zenoh.reading import Message
@@ -32,6 +33,10 @@ KINDS: dict[int, type[InterfaceNode]] = {
 Work = tuple[int, str]
 """What a node is the only one for: its type, and the full name of its topic, service or action. Topics of the robot
 (type 1) are kept by node name, which is part of the key of their stream."""
+
+MIN_SHARE = 16
+"""What one agent may have on a robot that has few interface nodes; otherwise half of them, and less when most are in
+use (`may_have_one_more`)."""
 
 
 class InterfaceNodes:
@@ -80,11 +85,8 @@ class InterfaceNodes:
         meant = self._places.of(key, registrant)
         if meant is not None and meant is not node:  # its messages say no more than the node name
             raise meant.collision(node.topic, key.node_name)
-        is_new = registrant not in node.registrants
-        node.register(registrant, unity=request.unity_cdr is True)
+        node.register(registrant)
         self._places.bind(key, node, registrant)
-        if is_new and node.is_open:
-            node.welcome(registrant)
         self._end_lingering(node, registrant)
         assert node.opening is not None
         await asyncio.shield(node.opening)
@@ -210,6 +212,10 @@ class InterfaceNodes:
     def _create(self, kind: type[InterfaceNode], request: AddNode) -> InterfaceNode:
         if len(self) >= self._max_nodes:
             raise Refused(f"this robot has {self._max_nodes} interface nodes, which is its limit")
+        registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
+        mine = sum(registrant in node.registrants for node in self)
+        if not may_have_one_more(len(self), mine, each=max(MIN_SHARE, self._max_nodes // 2), total=self._max_nodes):
+            raise Refused(f"{registrant} has {mine} interface nodes on this robot; the rest is for others")
         node = kind(self.robot, request)
         self._nodes[_work(node)] = node
         self._places.bind(node.key, node)
@@ -247,8 +253,6 @@ class InterfaceNodes:
             self._pass_early(node, node.key)
         finally:
             node.is_open = True  # not sooner: no message may overtake these
-            for registrant in node.registrants:
-                node.welcome(registrant)
 
     def _linger(self, node: InterfaceNode, registrant: Registrant) -> None:
         """Its gateway may only have lost the way to us: what it will ask for then has to be there."""

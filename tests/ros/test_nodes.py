@@ -386,6 +386,17 @@ async def test_the_number_of_nodes_is_limited(session: RosSession, streams: Stre
     nodes.close()
 
 
+async def test_one_agent_cannot_have_all_nodes(session: RosSession, streams: Streams) -> None:
+    """An agent that registers as much as it can leaves room for what others need."""
+    nodes = InterfaceNodes(Robot(session, 7, streams.put), max_nodes=40)
+    for number in range(20):
+        await nodes.add(adding(f"/t{number}", registrant=5))
+    with pytest.raises(Refused, match="the rest is for others"):
+        await nodes.add(adding("/t20", registrant=5))
+    await nodes.add(adding("/cmd_vel", registrant=6))
+    nodes.close()
+
+
 async def test_a_failing_mesh_does_not_stop_the_node(session: RosSession, peer: Peer, streams: Streams) -> None:
     """An error while a message is put on the mesh costs that message only."""
     calls = []
