@@ -17,7 +17,7 @@ from functools import cache, lru_cache
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from .errors import BadField, BadJson, TooLong, UnknownManager
 from .limits import (
@@ -202,7 +202,11 @@ class Registration(Management, frozen=True):
 
 
 class AddNode(Management, frozen=True):
-    """Headset → robot: create this interface node, or register me on it. ``tos_name`` is the topic or service."""
+    """Headset → robot: create this interface node, or register me on it. ``tos_name`` is the topic or service.
+
+    ``unity_cdr`` is said by the gateway of an existing headset, to robot agents only: its data is CDR as Unity's
+    serializer writes and reads it.
+    """
 
     manager: ClassVar[str] = "InterfaceNodeAdder"
     registrant_agent_type: AgentType
@@ -214,6 +218,7 @@ class AddNode(Management, frozen=True):
     buffer_size: Annotated[int, Meta(ge=0)] = 10
     drop_new: bool = False
     is_latched: bool = False
+    unity_cdr: bool | UnsetType = UNSET
 
 
 class RemoveNode(Management, frozen=True):

@@ -6,6 +6,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
+from msgspec import UNSET, structs
+
 from macs_zenoh.directory import Directory
 from macs_zenoh.errors import HeldByAnother, Refused
 from macs_zenoh.keyexpr import CALL
@@ -68,6 +70,8 @@ class OwnKeys:
             caller = (int(fields["from_type"]), int(fields["from_id"]))
             node = decode_data(kind, parse_frame(payload, self._layout).body)
             check_own(node, caller)
+            if isinstance(node, AddNode):
+                node = structs.replace(node, unity_cdr=UNSET)  # a robot program passes CDR on as it is
             if isinstance(node, AddNode) and (holder := connection.told.holder(node)) is not None:
                 raise HeldByAnother(f"{node.tos_name[:80]} is already registered by another agent", holder)
             if not connection.told.tell(node):

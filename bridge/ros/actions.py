@@ -22,6 +22,7 @@ from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.services import ABSENT_S, Search, first_line
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import resolve
+from bridge.ros.unity_cdr import UnityCdr, to_ros
 from macs_zenoh.errors import Refused
 from macs_zenoh.messages import ActionVerb, AddNode, NodeType
 from macs_zenoh.reading import Message
@@ -68,6 +69,7 @@ class ActionNode(InterfaceNode):
         super().__init__(robot, request)
         self._client: Any = None
         self._types: Any = None
+        self._goal_cdr: UnityCdr | None = None
         self._goals: dict[bytes, Goal] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._watching: asyncio.TimerHandle | None = None
@@ -97,6 +99,7 @@ class ActionNode(InterfaceNode):
         goals = dict(node.get_service_names_and_types()).get(self.topic + SEND_GOAL, [])
         self.interface.check(self.topic, {of_type.removesuffix("_SendGoal") for of_type in goals})
         self._types = resolve(str(self.interface), "action")
+        self._goal_cdr = UnityCdr.of(self._types.Goal)
         # 12 MB, of which robots without actions need nothing
         from rclpy.action import ActionClient
 
@@ -161,7 +164,7 @@ class ActionNode(InterfaceNode):
             return
         goal = self._asked(message, goal_id)
         goal.group = self.robot.group_of(sender)
-        body = message.data[ID_BYTES:]
+        body = to_ros(self._goal_cdr, message.data[ID_BYTES:])
         problem = cdr_problem(body)
         if problem is not None:
             self._reject(goal, f"the goal is no {self.interface}: {problem}")

@@ -133,6 +133,8 @@ class InterfaceNode(ABC):
         self.topic = self.full_name(request.tos_name)
         self.interface = InterfaceName.parse(request.data_exchange_type, self.INTERFACE)
         self.registrants: set[Registrant] = set()
+        self.unity: set[Registrant] = set()
+        """Those of them that write and read CDR as Unity's serializer does (`unity_cdr`)."""
         self.linger_s = 0.0
         """How long an agent stays registered that is not seen on the mesh any more."""
         self.is_open = False
@@ -184,20 +186,23 @@ class InterfaceNode(ABC):
         """The refusal of another topic whose messages could not be told from those of this node."""
         return Refused(f"{topic} and {self.topic} have the same node name {node_name}; use one of them")
 
-    def register(self, registrant: Registrant) -> None:
+    def register(self, registrant: Registrant, *, unity: bool = False) -> None:
         """Add a registrant; twice changes nothing. Raises Refused when the node takes no more."""
-        if registrant in self.registrants:
+        if registrant in self.registrants and unity is (registrant in self.unity):
             return
-        if self.MAX_REGISTRANTS is not None and len(self.registrants) >= self.MAX_REGISTRANTS:
+        others = self.registrants - {registrant}
+        if self.MAX_REGISTRANTS is not None and len(others) >= self.MAX_REGISTRANTS:
             reason = f"{self.topic} is already registered by another agent, and {self.ROLE} has only one"
-            raise HeldByAnother(reason, next(iter(self.registrants)))
+            raise HeldByAnother(reason, next(iter(others)))
         self.registrants.add(registrant)
+        (self.unity.add if unity else self.unity.discard)(registrant)
         self.registrants_changed()
 
     def deregister(self, registrant: Registrant) -> None:
         """Take a registrant off, if it is there."""
         if registrant in self.registrants:
             self.registrants.remove(registrant)
+            self.unity.discard(registrant)
             self.registrants_changed()
 
     def registrants_changed(self) -> None:  # noqa: B027 - only some nodes care

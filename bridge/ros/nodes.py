@@ -85,7 +85,7 @@ class InterfaceNodes:
         meant = self._places.of(key, registrant)
         if meant is not None and meant is not node:  # its messages say no more than the node name
             raise meant.collision(node.topic, key.node_name)
-        node.register(registrant)
+        node.register(registrant, unity=request.unity_cdr is True)
         self._places.bind(key, node, registrant)
         self._end_lingering(node, registrant)
         assert node.opening is not None

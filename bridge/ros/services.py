@@ -21,6 +21,7 @@ from bridge.ros import fields
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import InterfaceName, resolve
+from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
 from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.messages import ROS, AddNode, CallFailure, Metadata, NodeType, decode_data, encode_data
 from macs_zenoh.reading import Message
@@ -113,6 +114,8 @@ class ClientNode(InterfaceNode):
         super().__init__(robot, request)
         self._client: Any = None
         self._service: Any = None
+        self._request_cdr: UnityCdr | None = None
+        self._response_cdr: UnityCdr | None = None
         self._exists = False
         self._deadline_s = robot.rules.call_s(self.topic)
         self._calls: dict[asyncio.Task[None], Message] = {}
@@ -121,6 +124,8 @@ class ClientNode(InterfaceNode):
 
     def open(self) -> None:
         self._service = resolve(str(self.interface), "srv")
+        self._request_cdr = UnityCdr.of(self._service.Request)
+        self._response_cdr = UnityCdr.of(self._service.Response)
         node = self.robot.session.node
         self._exists = check_service_type(node, self.topic, self.interface)
         with ros_errors(self.request.tos_name):
@@ -165,9 +170,13 @@ class ClientNode(InterfaceNode):
         except asyncio.TimeoutError:
             self._fail(message, CallFailed("timeout", f"{self.topic} did not answer within {self._deadline_s:g} s"))
         else:
-            self.robot.send(Registrant.of(message), answer_metadata(self.robot.agent_id, message.metadata), response)
+            asker = Registrant.of(message)
+            if asker in self.unity:
+                response = to_unity(self._response_cdr, response)
+            self.robot.send(asker, answer_metadata(self.robot.agent_id, message.metadata), response)
 
-    async def _ask(self, request: bytes) -> bytes:
+    async def _ask(self, data: bytes) -> bytes:
+        request = to_ros(self._request_cdr, data)
         problem = cdr_problem(request)
         if problem is not None:
             raise CallFailed("invalid", f"the request is no {self.interface}: {problem}")
@@ -280,6 +289,8 @@ class ServiceNode(InterfaceNode):
         super().__init__(robot, request)
         self._service: Any = None
         self._types: Any = None
+        self._request_cdr: UnityCdr | None = None
+        self._response_cdr: UnityCdr | None = None
         self._respond: Callable[[Any, Any], None]
         self._deadline_s = robot.rules.call_s(self.topic)
         self._open_calls: dict[int, OpenCall] = {}
@@ -296,6 +307,8 @@ class ServiceNode(InterfaceNode):
 
     def open(self) -> None:
         self._types = resolve(str(self.interface), "srv")
+        self._request_cdr = UnityCdr.of(self._types.Request)
+        self._response_cdr = UnityCdr.of(self._types.Response)
         fields.failure(self._types.Response, "", self.rule.error_response, "error_response")
         node = self.robot.session.node
         lingers = any(service.service_name == self.topic for service in node.services)
@@ -352,12 +365,13 @@ class ServiceNode(InterfaceNode):
                 reason = "it did not say why"
             self._fail(request_id, f"{sender} failed: {reason}")
             return
-        problem = cdr_problem(message.data)
+        answer = to_ros(self._response_cdr, message.data)
+        problem = cdr_problem(answer)
         if problem is not None:
             self._bad_answer(request_id, sender, problem)
             return
         self._close_call(request_id)
-        self.robot.session.submit(lambda: self._send(request_id, sender, call.header, message.data))
+        self.robot.session.submit(lambda: self._send(request_id, sender, call.header, answer))
 
     def status(self) -> dict[str, Any]:
         return {**super().status(), "open_calls": len(self._open_calls)}
@@ -372,6 +386,8 @@ class ServiceNode(InterfaceNode):
         if registrant is None or len(self._open_calls) > self.robot.rules.settings.max_calls:
             self._fail(request_id, f"{self.topic} takes no calls now")
             return
+        if registrant in self.unity:
+            request = to_unity(self._request_cdr, request)
         # we understand a failure; receivers look at the node name first
         self.robot.send(registrant, self.metadata(CallFailure.manager, request_id), request)
 

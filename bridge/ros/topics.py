@@ -24,6 +24,7 @@ from bridge.ros.rules import DEFAULT_HOLD_S
 from bridge.ros.safety import Control, DeadMan
 from bridge.ros.stream import StreamFraming, cdr_problem
 from bridge.ros.types import InterfaceName, least_cdr_bytes, resolve
+from bridge.ros.unity_cdr import UnityCdr, to_ros
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.messages import AddNode, NodeType, StreamData
 from macs_zenoh.reading import Message
@@ -264,6 +265,7 @@ class PublisherNode(InterfaceNode):
         self._watch: asyncio.TimerHandle | None = None
         self._publisher: Any = None
         self._least_bytes = 4
+        self._cdr: UnityCdr | None = None
         self._expected = 0
         self._matched = asyncio.Event()
         self._loop = asyncio.get_running_loop()
@@ -273,6 +275,7 @@ class PublisherNode(InterfaceNode):
     def open(self) -> None:
         message = resolve(str(self.interface))
         self._least_bytes = least_cdr_bytes(message)
+        self._cdr = UnityCdr.of(message)
         if self.rule.deadman_message is not None:
             self._stop_cdr = bytes(serialize_message(self._stop_message(message)))
         node, topic = self.robot.session.node, self.request.tos_name
@@ -359,7 +362,7 @@ class PublisherNode(InterfaceNode):
         return None
 
     def _command(self, message: Message) -> None:
-        if self._publish(message.data) and self.deadman is not None:
+        if self._publish(to_ros(self._cdr, message.data)) and self.deadman is not None:
             self.deadman.command(Registrant.of(message), time.monotonic())
 
     def _publish(self, cdr: bytes) -> bool:

@@ -23,7 +23,7 @@ _NAME = re.compile(
 )
 _INDEX = Path("share", "ament_index", "resource_index", "rosidl_interfaces")
 
-_PRIMITIVE_BYTES = {
+PRIMITIVE_BYTES = {
     **dict.fromkeys(("boolean", "octet", "char", "uint8", "int8"), 1),
     **dict.fromkeys(("uint16", "int16", "wchar"), 2),
     **dict.fromkeys(("uint32", "int32", "float"), 4),
@@ -125,7 +125,7 @@ def _least_bytes_of(message: type[Any]) -> int:
 
 def _least_bytes(slot: Any) -> int:
     if isinstance(slot, idl.BasicType):
-        return _PRIMITIVE_BYTES.get(slot.typename, 1)
+        return PRIMITIVE_BYTES.get(slot.typename, 1)
     if isinstance(slot, idl.NamespacedType):
         package, kind = slot.namespaces
         return _least_bytes_of(getattr(importlib.import_module(f"{package}.{kind}"), slot.name))

@@ -28,17 +28,31 @@ for _ in range(os.getpid() % 100):  # test runs at the same time begin at differ
 
 
 @pytest.fixture(scope="session")
-def count_action(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """An action, built from its definition; the processes of a test find it as well. No action comes from PyPI."""
+def test_msgs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interface package `macs_test_msgs`, built from its definitions; the processes of a test find it as well.
+
+    Its prefix. No action comes from PyPI, and no type that has every kind of field.
+    """
     into = tmp_path_factory.mktemp("interfaces")
-    package = "macs_test_msgs"
-    with zipfile.ZipFile(build(Path(__file__).parent / package, into).wheel) as wheel:
+    with zipfile.ZipFile(build(Path(__file__).parent / "macs_test_msgs", into).wheel) as wheel:
         wheel.extractall(into)
     prefix = next(into.glob("*.data")) / "data"
     sys.path.insert(0, str(into))
     for variable, value in (("AMENT_PREFIX_PATH", str(prefix)), ("PYTHONPATH", str(into))):
         os.environ[variable] = os.pathsep.join([value, *filter(None, [os.environ.get(variable)])])
-    return importlib.import_module(f"{package}.action").Count
+    return prefix
+
+
+@pytest.fixture(scope="session")
+def count_action(test_msgs: Path) -> Any:
+    """An action."""
+    return importlib.import_module("macs_test_msgs.action").Count
+
+
+@pytest.fixture(scope="session")
+def kinds(test_msgs: Path) -> Any:
+    """A message with every kind of field."""
+    return importlib.import_module("macs_test_msgs.msg").Kinds
 
 
 @pytest.fixture

@@ -1,0 +1,275 @@
+"""What Unity's serializer writes and reads otherwise than ROS 2 does: CDR from the one to the other. Pure.
+
+Existing headsets use the serializer of Unity's ROS-TCP-Connector. It agrees with ROS (Fast CDR 2) in all but three:
+
+* a structure without fields takes no bytes; in ROS it takes one, which is zero (std_msgs/Empty, a Trigger's request)
+* before the items of a sequence it aligns to their size, also when there are none; ROS does not, then (a JointState
+  without velocities: what follows is 4 bytes further on, and reading it there goes beyond the end)
+* it writes a wstring as it writes a string; in ROS the length counts UTF-16 code units, which take 4 bytes each
+
+Existing headsets go deaf on a message that ends before they have read it, and a robot that reads what they wrote as
+ROS's own finds other numbers in it, so types that have any of the three are translated. Most have none.
+"""
+
+from __future__ import annotations
+
+import importlib
+import struct
+from collections.abc import Callable
+from typing import Any
+
+from rosidl_parser import definition as idl  # type: ignore[import-untyped, import-not-found, unused-ignore]
+
+from bridge.ros.types import PRIMITIVE_BYTES
+
+HEADER = b"\x00\x01\x00\x00"
+"""Plain CDR, little endian: all that Unity's serializer knows."""
+_HEADER_BYTES = len(HEADER)
+_LARGE = 8
+"""Items so large are aligned to more than the length before them."""
+_MAX_NOTHINGS = 65536
+"""Structures without fields in one sequence: in Unity's form they take no bytes, so their number bounds nothing."""
+
+_U32 = struct.Struct("<I")
+_Part = Callable[["_Copy"], None]
+
+
+class _Misfit(Exception):
+    """The bytes are not of this type, or not in this form."""
+
+
+class UnityCdr:
+    """The two forms of one type. Made by `of`."""
+
+    def __init__(self, copy: _Part) -> None:
+        self._copy = copy
+
+    @staticmethod
+    def of(message: type[Any]) -> UnityCdr | None:
+        """For a message class, or None when Unity's serializer and ROS agree on it."""
+        return UnityCdr(_structure(message)) if _differs(message) else None
+
+    def to_ros(self, cdr: bytes) -> bytes:
+        """A headset's message as ROS reads it; unchanged when ROS reads it as it is, or nobody does.
+
+        Who wrote it is not asked: bytes that are whole in the one form end too late or too early in the other. Where
+        both fit, they are ROS's.
+        """
+        try:
+            self._copied(cdr, from_unity=False, to_unity=False)
+        except _Misfit:
+            try:
+                return self._copied(cdr, from_unity=True, to_unity=False)
+            except _Misfit:
+                pass
+        return cdr
+
+    def to_unity(self, cdr: bytes) -> bytes | None:
+        """ROS's message as an existing headset reads it; None when it is not of this type."""
+        try:
+            return self._copied(cdr, from_unity=False, to_unity=True, strict=False)
+        except _Misfit:
+            return None
+
+    def _copied(self, cdr: bytes, *, from_unity: bool, to_unity: bool, strict: bool = True) -> bytes:
+        if cdr[:_HEADER_BYTES] != HEADER:
+            raise _Misfit
+        copy = _Copy(cdr, from_unity=from_unity, to_unity=to_unity, strict=strict)
+        self._copy(copy)
+        copy.end()
+        return bytes(copy.out)
+
+
+def to_ros(both: UnityCdr | None, cdr: bytes) -> bytes:
+    """A headset's message as ROS reads it, of a type on which both may agree."""
+    return cdr if both is None else both.to_ros(cdr)
+
+
+def to_unity(both: UnityCdr | None, cdr: bytes) -> bytes:
+    """ROS's message as an existing headset reads it. What is not of its type, ROS has not made: it stays as it is."""
+    return cdr if both is None else both.to_unity(cdr) or cdr
+
+
+class _Copy:
+    """Reads one form and writes the other. ``strict``: padding is zero, and nothing but padding follows the end."""
+
+    def __init__(self, cdr: bytes, *, from_unity: bool, to_unity: bool, strict: bool) -> None:
+        self._cdr = memoryview(cdr)
+        self._at = _HEADER_BYTES
+        self._from_unity = from_unity
+        self._to_unity = to_unity
+        self._strict = strict
+        self.out = bytearray(HEADER)
+
+    def end(self) -> None:
+        """Look at what is left."""
+        rest = len(self._cdr) - self._at
+        if self._strict and (rest and (self._from_unity or rest >= _LARGE or any(self._cdr[self._at :]))):
+            raise _Misfit
+
+    def values(self, size: int, count: int = 1) -> None:
+        """So many numbers of this size, one at least."""
+        self._align_in(size)
+        self._align_out(size)
+        self.out += self._take(size * count)
+
+    def sequence_of_values(self, size: int) -> None:
+        """A length, and so many numbers."""
+        if count := self.length():
+            self.values(size, count)
+            return
+        if self._from_unity:
+            self._align_in(size)
+        if self._to_unity:
+            self._align_out(size)
+
+    def length(self) -> int:
+        """How many items follow. None takes less than a byte, but for those of `nothing`."""
+        count = self._length_in()
+        if count > max(len(self._cdr), _MAX_NOTHINGS):
+            raise _Misfit
+        self._length_out(count)
+        return count
+
+    def text(self) -> None:
+        """A string, with the zero at its end."""
+        text = self._text_in()
+        self._length_out(len(text) + 1)
+        self.out += text
+        self.out.append(0)
+
+    def wide_text(self) -> None:
+        """A wstring."""
+        if self._from_unity:
+            text = bytes(self._text_in()).decode("utf-8", "replace")
+        else:
+            units = self._take(_U32.size * self._length_in())
+            text = bytes(b for at in range(0, len(units), _U32.size) for b in units[at : at + 2]).decode(
+                "utf-16-le", "replace"
+            )
+        if self._to_unity:
+            utf8 = text.encode("utf-8")
+            self._length_out(len(utf8) + 1)
+            self.out += utf8
+            self.out.append(0)
+        else:
+            utf16 = text.encode("utf-16-le")
+            self._length_out(len(utf16) // 2)
+            for at in range(0, len(utf16), 2):
+                self.out += utf16[at : at + 2] + b"\0\0"
+
+    def nothing(self) -> None:
+        """A structure without fields."""
+        if not self._from_unity and self._take(1)[0] and self._strict:
+            raise _Misfit
+        if not self._to_unity:
+            self.out.append(0)
+
+    def _text_in(self) -> memoryview:
+        text = self._take(self._length_in())
+        if text and not text[-1]:
+            return text[:-1]
+        if self._from_unity:
+            raise _Misfit
+        return text  # ROS reads one without its zero, too
+
+    def _length_in(self) -> int:
+        self._align_in(_U32.size)
+        return int(_U32.unpack(self._take(_U32.size))[0])
+
+    def _length_out(self, count: int) -> None:
+        self._align_out(_U32.size)
+        self.out += _U32.pack(count)
+
+    def _align_in(self, size: int) -> None:
+        padding = self._take(-(self._at - _HEADER_BYTES) % size)
+        if self._strict and any(padding):
+            raise _Misfit
+
+    def _align_out(self, size: int) -> None:
+        self.out += bytes(-(len(self.out) - _HEADER_BYTES) % size)
+
+    def _take(self, count: int) -> memoryview:
+        begin, self._at = self._at, self._at + count
+        if self._at > len(self._cdr):
+            raise _Misfit
+        return self._cdr[begin : self._at]
+
+
+# -- from a type to what copies it -----------------------------------------------------------------------------------
+
+
+def _differs(message: type[Any]) -> bool:
+    slots = message.SLOT_TYPES
+    return not slots or any(_slot_differs(slot) for slot in slots)
+
+
+def _slot_differs(slot: Any) -> bool:
+    if isinstance(slot, idl.AbstractWString):
+        return True
+    if isinstance(slot, idl.NamespacedType):
+        return _differs(_class_of(slot))
+    if isinstance(slot, idl.AbstractNestedType):
+        item = slot.value_type
+        if isinstance(item, idl.BasicType) and not isinstance(slot, idl.Array):
+            return PRIMITIVE_BYTES[item.typename] >= _LARGE
+        return _slot_differs(item)
+    return False
+
+
+def _structure(message: type[Any]) -> _Part:
+    parts = [_part(slot) for slot in message.SLOT_TYPES]
+    if not parts:
+        return _Copy.nothing
+
+    def copy_all(copy: _Copy) -> None:
+        for part in parts:
+            part(copy)
+
+    return copy_all
+
+
+def _part(slot: Any) -> _Part:
+    if isinstance(slot, idl.BasicType):
+        size = PRIMITIVE_BYTES[slot.typename]
+        return lambda copy: copy.values(size)
+    if isinstance(slot, idl.NamespacedType):
+        return _structure(_class_of(slot))
+    if isinstance(slot, idl.AbstractWString):
+        return _Copy.wide_text
+    if isinstance(slot, idl.Array):
+        return _array(slot.value_type, int(slot.size))
+    if isinstance(slot, idl.AbstractSequence):
+        return _sequence(slot.value_type)
+    return _Copy.text
+
+
+def _array(item: Any, count: int) -> _Part:
+    if isinstance(item, idl.BasicType):
+        size = PRIMITIVE_BYTES[item.typename]
+        return lambda copy: copy.values(size, count)
+    part = _part(item)
+
+    def copy_items(copy: _Copy) -> None:
+        for _ in range(count):
+            part(copy)
+
+    return copy_items
+
+
+def _sequence(item: Any) -> _Part:
+    if isinstance(item, idl.BasicType):
+        size = PRIMITIVE_BYTES[item.typename]
+        return lambda copy: copy.sequence_of_values(size)
+    part = _part(item)
+
+    def copy_items(copy: _Copy) -> None:
+        for _ in range(copy.length()):
+            part(copy)
+
+    return copy_items
+
+
+def _class_of(slot: Any) -> type[Any]:
+    found: type[Any] = getattr(importlib.import_module(".".join(slot.namespaces)), slot.name)
+    return found
