@@ -132,11 +132,11 @@ class Intake:
                 for event in events:
                     event.add_to_wait_set(wait_set)
                 wait_set.wait(-1)
-                for pointer in wait_set.get_ready_entities("subscription"):
-                    _take(*takers[pointer])
-                for event in events:
+                for event in events:  # of a new publisher before its messages
                     if event.is_ready(wait_set):
                         _call(event.callback, event.take_data())
+                for pointer in wait_set.get_ready_entities("subscription"):
+                    _take(*takers[pointer])
 
     def _enter(self, in_use: ExitStack) -> dict[int, tuple[Subscription, OnRaw]]:
         """The subscriptions that exist, by the pointers under which the wait set knows them."""

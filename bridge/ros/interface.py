@@ -208,6 +208,9 @@ class InterfaceNode(ABC):
     def registrants_changed(self) -> None:  # noqa: B027 - only some nodes care
         """Somebody registered or left."""
 
+    def welcome(self, registrant: Registrant) -> None:  # noqa: B027 - only some nodes have something for it
+        """Somebody registered, and the entity is there. On the loop."""
+
     @abstractmethod
     def open(self) -> None:
         """Create the rclpy entity. In the ROS thread. Raises Refused."""

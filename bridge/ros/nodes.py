@@ -85,8 +85,11 @@ class InterfaceNodes:
         meant = self._places.of(key, registrant)
         if meant is not None and meant is not node:  # its messages say no more than the node name
             raise meant.collision(node.topic, key.node_name)
+        is_new = registrant not in node.registrants
         node.register(registrant, unity=request.unity_cdr is True)
         self._places.bind(key, node, registrant)
+        if is_new and node.is_open:
+            node.welcome(registrant)
         self._end_lingering(node, registrant)
         assert node.opening is not None
         await asyncio.shield(node.opening)
@@ -253,6 +256,8 @@ class InterfaceNodes:
             self._pass_early(node, node.key)
         finally:
             node.is_open = True  # not sooner: no message may overtake these
+            for registrant in node.registrants:
+                node.welcome(registrant)
 
     def _linger(self, node: InterfaceNode, registrant: Registrant) -> None:
         """Its gateway may only have lost the way to us: what it will ask for then has to be there."""

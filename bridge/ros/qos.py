@@ -62,6 +62,18 @@ def for_publisher(subscriptions: Iterable[Any], depth: int, *, latched: bool) ->
     return profile
 
 
+def is_latched(profile: QoSProfile) -> bool:
+    """Whether a publisher holds its last messages for subscriptions that come later."""
+    return bool(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def for_each_of(publishers: int, profile: QoSProfile) -> QoSProfile:
+    """A subscription's profile with room for what each of so many publishers latches, not only one of them."""
+    if is_latched(profile):
+        profile.depth = min(profile.depth * max(1, publishers), max(MAX_DEPTH, profile.depth))
+    return profile
+
+
 def overridden(profile: QoSProfile, rule: TopicRule) -> QoSProfile:
     """The profile with what a robot's settings ask for."""
     if rule.reliability is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
 
 from macs_zenoh.messages import ROS, Metadata, StreamData, encode_management
 from macs_zenoh.wire import MACS, Layout, encode_frame, encode_message
@@ -44,6 +44,44 @@ class StreamFraming:
         _U32.pack_into(prefix, len(prefix) - 4, cdr_bytes)
         self._prefix = bytes(prefix)
         self._cdr_bytes = cdr_bytes
+
+
+class Fanout:
+    """One message to its receivers: one frame, or two when existing headsets among them read it in another form.
+
+    Made anew when the registrants change, and then only read: by several threads.
+    """
+
+    def __init__(
+        self,
+        metadata: Metadata,
+        receivers: Iterable[tuple[int, int]],
+        unity: Collection[tuple[int, int]] = (),
+        layout: Layout = MACS,
+        *,
+        translate: Callable[[bytes], bytes] | None = None,
+    ) -> None:
+        """``unity`` are those that read what ``translate`` makes of a message, if there is such a thing."""
+        self._metadata = metadata
+        self._unity = unity
+        self._layout = layout
+        self._translate = translate
+        self.receivers = frozenset(receivers)
+        others = self.receivers if translate is None else self.receivers - set(unity)
+        translated = self.receivers - others
+        self._frame = StreamFraming(metadata, others, layout) if others or not translated else None
+        self._translated = StreamFraming(metadata, translated, layout) if translated else None
+
+    def __call__(self, cdr: bytes) -> Iterable[bytes]:
+        """The frames of a message."""
+        if self._translated is None or self._translate is None:
+            return (self._frame(cdr),) if self._frame is not None else ()
+        translated = self._translated(self._translate(cdr))
+        return (translated,) if self._frame is None else (self._frame(cdr), translated)
+
+    def only(self, receivers: Iterable[tuple[int, int]]) -> Fanout:
+        """To these alone."""
+        return Fanout(self._metadata, receivers, self._unity, self._layout, translate=self._translate)
 
 
 ENCAPSULATIONS = frozenset((b"\x00\x00", b"\x00\x01"))

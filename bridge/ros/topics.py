@@ -12,19 +12,22 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.serialization import serialize_message
 
 from bridge.ros import fields, qos
+from bridge.ros.intake import OnRaw
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
+from bridge.ros.latched import Newcomers, Receivers, Told, message_of
 from bridge.ros.rules import DEFAULT_HOLD_S
 from bridge.ros.safety import Control, DeadMan
-from bridge.ros.stream import StreamFraming, cdr_problem
+from bridge.ros.stream import Fanout, cdr_problem
 from bridge.ros.types import InterfaceName, least_cdr_bytes, resolve
-from bridge.ros.unity_cdr import UnityCdr, to_ros
+from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.messages import AddNode, NodeType, StreamData
 from macs_zenoh.reading import Message
@@ -48,13 +51,40 @@ class SubscriberNode(InterfaceNode):
         self._rate_lock = threading.Lock()
         self._gaps = Gaps()
         self._loop = asyncio.get_running_loop()
-        self._frame = self._framing()
+        self._translate: Callable[[bytes], bytes] | None = None
+        self._fanout_lock = threading.Lock()
+        self._fanout = self._to_registrants()
+        self._is_latched = True
+        """Whether publishers hold messages for late ones, and until they are known."""
+        self._first: Receivers = frozenset()
+        """Who was registered when the subscription was made that gets what is held for late ones."""
+        self._told = Told()
+        self._newcomers = Newcomers(
+            robot.session, self._subscribe_also, self._publishers, self._profile_of, self._tell_newcomers
+        )
 
     def registrants_changed(self) -> None:
-        self._frame = self._framing()
+        with self._fanout_lock:
+            self._fanout = self._to_registrants()
+
+    def deregister(self, registrant: Registrant) -> None:
+        super().deregister(registrant)
+        self._first -= {registrant}
+        self._told.forget(registrant)
+
+    def welcome(self, registrant: Registrant) -> None:
+        if registrant not in self._first:
+            self._welcome([registrant])
+
+    def _welcome(self, registrants: Iterable[tuple[int, int]]) -> None:
+        if self.rule.durability != "volatile":
+            self._newcomers.welcome(registrants)
 
     def open(self) -> None:
         self._message = resolve(str(self.interface))
+        both = UnityCdr.of(self._message)
+        self._translate = partial(to_unity, both) if both is not None else None
+        self.registrants_changed()  # before the first message comes
         check_topic_type(self.robot.session.node, self.request.tos_name, self.interface)
         self.robot.prioritise_stream(self.key.node_name, self.rule.priority)
         if self.robot.keep_stream(self.key.node_name, self.rule.keep_for_recovery):
@@ -62,6 +92,10 @@ class SubscriberNode(InterfaceNode):
         self._subscribe(self._profile_of(self._publishers()))
 
     def close(self) -> None:
+        self._newcomers.close()
+        self._unsubscribe()
+
+    def _unsubscribe(self) -> None:
         subscription, self._subscription = self._subscription, None
         if subscription is not None:
             self.robot.session.intake.unsubscribe(subscription)
@@ -72,8 +106,14 @@ class SubscriberNode(InterfaceNode):
     def receive(self, message: Message) -> None:
         self.robot.drops.note("no_node", self.key.node_name, "data for a node that only sends")
 
-    def _framing(self) -> StreamFraming:
-        return StreamFraming(self.metadata(StreamData.manager), self.registrants, self.robot.layout)
+    def _to_registrants(self) -> Fanout:
+        return Fanout(
+            self.metadata(StreamData.manager),
+            frozenset(self.registrants),
+            frozenset(self.unity),
+            self.robot.layout,
+            translate=self._translate,
+        )
 
     # -- in the ROS thread ---------------------------------------------------------------------------------------
 
@@ -82,10 +122,18 @@ class SubscriberNode(InterfaceNode):
         return [endpoint.qos_profile for endpoint in found]
 
     def _profile_of(self, publishers: Iterable[Any]) -> Any:
-        profile = qos.for_subscription(publishers, qos.depth_of(self.request.buffer_size))
-        return qos.overridden(profile, self.rule)
+        offered = list(publishers)
+        profile = qos.for_subscription(offered, qos.depth_of(self.request.buffer_size))
+        return qos.for_each_of(len(offered), qos.overridden(profile, self.rule))
+
+    def _subscribe_also(self, profile: Any, on_raw: OnRaw, events: SubscriptionEventCallbacks | None) -> Any:
+        """For newcomers."""
+        return self.robot.session.intake.subscribe(
+            self._message, self.request.tos_name, on_raw, profile, events=events
+        )
 
     def _subscribe(self, profile: Any) -> None:
+        self._first = self._fanout.receivers if qos.is_latched(profile) else frozenset()
         subscribe, topic = self.robot.session.intake.subscribe, self.request.tos_name
         events = SubscriptionEventCallbacks(
             matched=self._publisher_matched,
@@ -106,7 +154,21 @@ class SubscriberNode(InterfaceNode):
         """One message with what rclpy knows about it."""
         if self._gaps.take(info["publication_sequence_number"]):
             self._loop.call_soon_threadsafe(self._loop.call_later, self._gaps.SETTLE_S, self._tell_gaps)
+        if self._is_latched:
+            fanout = self._fanout
+            receivers = self._told.to_tell(message_of(info), fanout.receivers)
+            if receivers != fanout.receivers:
+                self._put(cdr, fanout.only(receivers))
+                return
         self._publish(cdr)
+
+    def _tell_newcomers(self, cdr: bytes, info: Mapping[str, Any], newcomers: Receivers) -> bool:
+        """A message that the topic's publishers hold for late ones."""
+        fanout = self._fanout
+        receivers = self._told.to_tell(message_of(info), newcomers & fanout.receivers)
+        if receivers:
+            self._put(cdr, fanout.only(receivers))
+        return bool(receivers)
 
     def _publish(self, cdr: bytes) -> None:
         if self._rate is None:
@@ -131,15 +193,17 @@ class SubscriberNode(InterfaceNode):
             if latest is not None:
                 self._put(latest)
 
-    def _put(self, cdr: bytes) -> None:
+    def _put(self, cdr: bytes, fanout: Fanout | None = None) -> None:
         try:
-            self.robot.publish_stream(self.key.node_name, self._frame(cdr))
+            for frame in (fanout or self._fanout)(cdr):
+                self.robot.publish_stream(self.key.node_name, frame)
         except MacsError as error:
             self.robot.drops.note("failed", self.topic, str(error))
 
     def _publisher_matched(self, change: Any) -> None:
         self._gaps.publishers(change.current_count)
         if change.current_count_change > 0:
+            self._is_latched = True  # it may be
             self.robot.session.submit(self._follow)
 
     def _publisher_incompatible(self, _change: Any) -> None:
@@ -151,10 +215,14 @@ class SubscriberNode(InterfaceNode):
         if self._subscription is None or not publishers:
             return
         profile = self._profile_of(publishers)
+        self._is_latched = any(map(qos.is_latched, publishers))
         if not qos.same(profile, self._profile):
             log.info("%s: its publishers changed, subscribing again with %s", self.topic, _describe(profile))
-            self.close()
+            self._unsubscribe()
             self._subscribe(profile)
+        elif self._is_latched and not qos.is_latched(profile):
+            # one that does not latch is among them, so what a new one holds does not come by itself
+            self._welcome(self._fanout.receivers)
 
     def _lost(self, status: Any) -> None:
         """ROS itself counts what the network lost, not what it threw away for want of room."""

@@ -117,7 +117,7 @@ def test_what_ros_reads_already_stays_as_it_is(messages: list[Any]) -> None:
 
 
 def test_types_on_which_both_agree_cost_nothing() -> None:
-    """Of all installed types only those are translated that have a sequence of 8 byte numbers, nothing, or a wstring."""
+    """Only types that have a sequence of 8 byte numbers, a structure without fields or a wstring are translated."""
     differ, agree = set(), set()
     for package in sorted((Path(sys.prefix) / types._INDEX).iterdir()):
         for entry in package.read_text().split():
