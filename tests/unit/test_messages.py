@@ -76,7 +76,7 @@ NAMES_OF_FIELDS = {
 OURS = {"InterfaceNodeRefused": {"robotId", "nodeType", "nodeName", "tosName", "reason"}}
 """What existing programs do not have."""
 
-OUR_KEYS = {"AgentclientConfigurer": {"extensions"}}
+OUR_KEYS = {"AgentclientConfigurer": {"extensions"}, "InterfaceNodeAdder": {"unityCdr"}}
 """Keys that existing programs do not write, and existing routers ignore."""
 
 DEEP = 2000
@@ -98,6 +98,8 @@ def values(annotation: Any) -> st.SearchStrategy[Any]:
         return st.dictionaries(*map(values, get_args(annotation)), max_size=4)
     if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
         return structs(annotation)
+    if msgspec.UnsetType in get_args(annotation):
+        return st.just(msgspec.UNSET) | values(get_args(annotation)[0])
     if type(None) in get_args(annotation):
         return st.none() | st.one_of(*[values(kind) for kind in get_args(annotation) if kind is not type(None)])
     return {str: st.text(max_size=20), bool: st.booleans()}[annotation]
