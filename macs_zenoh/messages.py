@@ -204,8 +204,8 @@ class Registration(Management, frozen=True):
 class AddNode(Management, frozen=True):
     """Headset → robot: create this interface node, or register me on it. ``tos_name`` is the topic or service.
 
-    ``unity_cdr`` is said by the gateway of an existing headset, to robot agents only: its data is CDR as Unity's
-    serializer writes and reads it.
+    ``unity_cdr``: my data is CDR as Unity's serializer writes and reads it. For existing headsets their gateway says
+    so; existing robots are not told.
     """
 
     manager: ClassVar[str] = "InterfaceNodeAdder"

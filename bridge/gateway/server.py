@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from msgspec import UNSET, structs
+from msgspec import structs
 
 from bridge.listening import bound
 from macs_zenoh.addresses import joined
@@ -406,7 +406,8 @@ class Gateway:
                 self._robots.refuse(node, next(iter(event.robot_ids), 0), why)
                 return
             connection.registered(node.node_name, node.node_type)
-            node = structs.replace(node, unity_cdr=UNSET if connection.peer.extensions else True)
+            if not connection.peer.extensions:  # an existing program, which cannot say it itself
+                node = structs.replace(node, unity_cdr=True)
         self._robots.register(node, event.robot_ids, event.groups)
         if not isinstance(node, AddNode) and self._robots.find(connection.key, node.node_type, node.node_name) is None:
             connection.unregistered(node.node_name, node.node_type)

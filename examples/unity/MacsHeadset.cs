@@ -402,6 +402,8 @@ namespace Macs
         [DataMember(Name = "bufferSize")] public int BufferSize;
         [DataMember(Name = "dropNew")] public bool DropNew;
         [DataMember(Name = "isLatched")] public bool IsLatched;
+        // What is sent and read here is what Unity's serializer makes and takes; false: just as ROS does (docs/robot.md).
+        [DataMember(Name = "unityCdr")] public bool UnityCdr = true;
     }
 
     [DataContract] class NodeRefused

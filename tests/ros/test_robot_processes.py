@@ -12,18 +12,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
+import unity_serializer
 from rclpy.action import ActionServer
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import Image
-from std_msgs.msg import String
-from std_srvs.srv import SetBool
+from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import Empty, String
+from std_srvs.srv import SetBool, Trigger
 
 from bridge.headset.actions import SUCCEEDED
 from bridge.headset.client import Headset
 from macs_zenoh.errors import Refused, Unreachable
 from tests.programs import Program, free_port
-from tests.ros.ros_peer import Peer, until
+from tests.ros.ros_peer import Peer, get, until
 
 SET = "std_srvs/SetBool"
 
@@ -32,6 +33,7 @@ SET = "std_srvs/SetBool"
 class Site:
     """Everything that runs: three headsets of group 4, robot 1 of group 3."""
 
+    gateway: Program
     robot: Program
     headsets: list[Headset]
 
@@ -56,7 +58,7 @@ async def site(domain: int, count_action: Any) -> AsyncIterator[Site]:
         for headset in headsets:
             while (await headset.online()).ros_agent_ids != [1]:
                 await asyncio.sleep(0.02)
-        yield Site(robot, headsets)
+        yield Site(gateway, robot, headsets)
 
 
 async def serve_set(peer: Peer, name: str) -> None:
@@ -210,3 +212,43 @@ async def test_the_robot_leaves_at_once(site: Site) -> None:
         while (await site.headset.online()).ros_agent_ids:
             await asyncio.sleep(0.02)
         await site.robot.start()
+
+
+async def test_existing_and_newer_headsets_read_a_latched_topic(site: Site, peer: Peer, domain: int) -> None:
+    """Whenever it registers, each headset gets the last JointState once, in the form that its own serializer reads."""
+    state = JointState(name=["a", "b"], position=[1.0, 2.0])
+    publisher = await peer.publisher(
+        JointState, "/joints", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    )
+    publisher.publish(state)
+    existing = await Headset.connect("127.0.0.1", site.gateway.port, extensions=0)
+    async with existing:
+        for headset in (site.headsets[0], existing, site.headsets[1]):
+            joints = await headset.subscribe("/joints", "sensor_msgs/JointState", agents=[1])
+            data = (await asyncio.wait_for(joints.__anext__(), 10)).data
+            if headset is existing:
+                assert data == unity_serializer.write(state)
+            else:
+                assert deserialize_message(data, JointState) == state
+        publisher.publish(state)
+        for headset in (*site.headsets[:2], existing):
+            (joints,) = headset.nodes
+            await asyncio.wait_for(joints.__anext__(), 10)  # type: ignore[attr-defined]
+            assert joints.dropped == 0  # type: ignore[attr-defined]
+
+
+async def test_an_existing_headset_calls_and_commands_without_fields(site: Site, peer: Peer) -> None:
+    """Take-off and a Trigger, as existing headsets write them, over the wire."""
+    taken_off = await peer.subscription(Empty, "/takeoff")
+
+    def answer(request: Any, response: Any) -> Any:
+        response.success = True
+        return response
+
+    await peer.session.run(lambda: peer.session.node.create_service(Trigger, "/land", answer))
+    async with await Headset.connect("127.0.0.1", site.gateway.port, extensions=0) as existing:
+        takeoff = await existing.advertise("/takeoff", "std_msgs/Empty", agents=[1])
+        await takeoff.publish(unity_serializer.write(Empty()))
+        assert await get(taken_off) == Empty()
+        response = await existing.call("/land", "std_srvs/Trigger", 1, unity_serializer.write(Trigger.Request()))
+        assert unity_serializer.read(Trigger.Response, response).success
