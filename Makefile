@@ -58,7 +58,7 @@ $(VENV)/.interfaces: $(STAMP) $(wildcard interfaces/*/package.xml interfaces/*/m
 
 # A whole run that ran no ROS test proves too little, so it fails (tests/conftest.py); a chosen part may.
 test: install
-	@$(if $(ARGS),,MACS_NEED_ROS_TESTS=1) $(BIN)/python -m pytest $(ARGS)
+	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),MACS_NEED_ROS_TESTS=1 $(BIN)/python -m tests.run)
 
 lint: install
 	@$(BIN)/ruff check .

@@ -7,13 +7,30 @@ import signal
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
-settings.register_profile("macs", deadline=None)  # how long an example takes is the machine's affair
-settings.load_profile("macs")
+from tests.isolation import isolate
 
 NEED_ROS_TESTS = "MACS_NEED_ROS_TESTS"
 """Set by ``make test`` and CI: a run in which no ROS test passed is a failed run."""
+
+
+ALONE = (
+    "tests/attack/",
+    "tests/network/",
+    "tests/integration/test_at_once.py",
+    "tests/integration/test_limits.py",
+    "tests/integration/test_shortcut.py",
+    "tests/integration/test_traffic.py",
+    "tests/ros/test_commands_at_once.py",
+    "tests/ros/test_deadman.py",
+    "tests/ros/test_killed.py",
+)
+"""What measures how long something takes, or needs the machine for itself: marked ``alone``."""
+
+# Timings never decide a test: a busy machine is no counterexample.
+settings.register_profile("macs", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("macs")
 
 
 class _RosTests:
@@ -40,8 +57,18 @@ class _RosTests:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        isolate()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         # a shell starts what it runs in the background so; programs that are tested with Ctrl-C would inherit it
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    if os.environ.get(NEED_ROS_TESTS):
+    if (
+        os.environ.get(NEED_ROS_TESTS) and "PYTEST_XDIST_WORKER" not in os.environ
+    ):  # workers report to the first process
         config.pluginmanager.register(_RosTests())
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.nodeid.startswith(ALONE):
+            item.add_marker(pytest.mark.alone)

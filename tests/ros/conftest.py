@@ -21,9 +21,12 @@ from ros_peer import Peer
 
 from bridge.interfaces import build
 from bridge.ros.session import RosSession
+from tests.isolation import worker_number
 
-_domains = itertools.cycle(range(1, 101))
-for _ in range(os.getpid() % 100):  # test runs at the same time begin at different domains
+DOMAINS = 100
+_domains = itertools.cycle(range(1, 1 + DOMAINS))
+# test runs at the same time begin at different domains, and so do the workers of one run that share a network
+for _ in range((os.getpid() + worker_number() * DOMAINS // 8) % DOMAINS):
     next(_domains)
 
 

@@ -223,5 +223,5 @@ async def test_without_the_interfaces_awareness_says_what_to_do() -> None:
     )
     _, log = await asyncio.wait_for(process.communicate(), 20)
     assert process.returncode == 1
-    assert "macs interfaces build interfaces/as2_ca_msgs --install" in log.decode()
+    assert "macs interfaces build as2_ca_msgs --install" in log.decode()
     assert "Traceback" not in log.decode()
