@@ -6,6 +6,8 @@ for its group. Nobody hears its own broadcast or group message; an id list that 
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 from .keyexpr import BROADCAST, CALL, GROUP, UNICAST, block_of
 from .messages import BROADCAST as EVERYBODY
 from .messages import Metadata
@@ -27,6 +29,7 @@ def keys_of(header: Header, from_type: int, from_id: int) -> list[str]:
     return unicast + groups
 
 
+@lru_cache(maxsize=8192)
 def unicast_key(agent_type: int, agent_id: int, from_type: int, from_id: int) -> str:
     """The inbox key of one agent, for one sender."""
     return UNICAST.of(type=agent_type, block=block_of(agent_id), id=agent_id, from_type=from_type, from_id=from_id)

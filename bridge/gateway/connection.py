@@ -19,7 +19,7 @@ from macs_zenoh.addresses import joined, of_peer
 from macs_zenoh.messages import AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
 from macs_zenoh.peer import Event, Joined, Left, Peer, Rejected, Sent, State
 from macs_zenoh.queues import Chunk, Outbox
-from macs_zenoh.wire import encode_message
+from macs_zenoh.wire import FrameDecoder, encode_message
 
 from .brake import Brake
 from .shortcut import Shortcut
@@ -33,6 +33,14 @@ WRITE_BUFFER_BYTES = 256 << 10
 
 READ_S = 0.02
 """How long what waits in a socket has before the agent's time is looked at again."""
+
+
+TURN_S = 0.003
+"""Work for one agent that takes longer lets all others have their turn before it goes on: an event loop may read from
+one socket many times before it looks at the next."""
+
+MOST_READ_BYTES = FrameDecoder.SMALL_BYTES
+LEAST_READ_BYTES = 1024
 
 
 class Owner(Protocol):
@@ -90,6 +98,9 @@ class Connection(asyncio.BufferedProtocol):
         """What a robot program was told."""
         self._refused = False
         self._pauses = 0
+        self._spent_s = 0.0
+        self._read_bytes = MOST_READ_BYTES
+        """How much is read at once: less, when little of it makes much work."""
         self._unread = 0
         """Of what waited in the socket when the agent's time had run out: how much is still to be read."""
         self._looked = False
@@ -143,11 +154,22 @@ class Connection(asyncio.BufferedProtocol):
         self._schedule()
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        return self.peer.space()
+        return self.peer.space()[: self._read_bytes]
 
     def buffer_updated(self, nbytes: int) -> None:
+        began = time.monotonic()
         self._unread -= nbytes
-        self._events(self.peer.advance(nbytes, time.monotonic()))
+        self._events(self.peer.advance(nbytes, began))
+        took_s = time.monotonic() - began
+        self._spent_s += took_s
+        if took_s > TURN_S:
+            self._read_bytes = max(LEAST_READ_BYTES, int(self._read_bytes * TURN_S / took_s))
+        elif took_s < TURN_S / 4 and self._read_bytes < MOST_READ_BYTES:
+            self._read_bytes *= 2
+        if self._spent_s > TURN_S and not self._transport.is_closing():
+            self._spent_s = 0.0
+            self.pause()
+            self._loop.call_soon(self.resume)
 
     def pause_writing(self) -> None:
         self._paused_at = time.monotonic()

@@ -13,7 +13,6 @@ import time
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from msgspec import structs
 
@@ -53,7 +52,6 @@ from macs_zenoh.peer import (
 )
 from macs_zenoh.presence import Presence
 from macs_zenoh.registrations import AgentKey
-from macs_zenoh.routing import keys_of
 from macs_zenoh.wire import FrameDecoder, Layout, encode_message
 
 from .agents import Agents, Group
@@ -65,26 +63,15 @@ from .leases import Leases
 from .own_keys import OwnKeys
 from .renumbering import Renumbering
 from .robots import RobotCalls, StreamChanges
+from .routes import Route, Routes
 from .waiting import NAMED_S, WaitingRoom
 
 log = logging.getLogger("macs.gateway")
 
 PUBLISHER = int(NodeType.PUBLISHER)
 COMMAND, CALL = Traffic.COMMAND, Traffic.CALL  # looked up by a Python call otherwise, for each message
-KNOWN_ROUTES = 4096
-
 FLUSH_S = 1.0
 NO_MANAGERS: Managers = {}
-
-
-class Route(NamedTuple):
-    """Where frames with one destination go: worked out once per connection and destination."""
-
-    keys: list[str]
-    agents: list[AgentKey]
-    """Whom the frames name by id."""
-    limited: bool = False
-    """Whether a traffic rule limits one of the keys, so that frames count one by one."""
 
 
 @dataclass
@@ -125,7 +112,7 @@ class Gateway:
         self._nodes = Budget("interface nodes", each=NODES_EACH, per_address=NODES_PER_ADDRESS, total=NODES_IN_ALL)
         self._numbers = 0
         self._waiting = WaitingRoom(settings.handshake_s, self._no_id)
-        self._routes: dict[Connection, dict[bytes, Route]] = {}
+        self._routes: dict[Connection, Routes] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._servers: list[asyncio.AbstractServer] = []
         self._run = NO_RUN
@@ -264,7 +251,7 @@ class Gateway:
                 scratch=self._scratch,
             )
             self.agents.enter(agent_id, connection)
-            self._routes[connection] = {}
+            self._routes[connection] = Routes(self.directory, self.mesh.limited, time.monotonic())
             connection.greet(peer)
 
     def _is_elsewhere(self, agent_id: int) -> bool:
@@ -285,7 +272,7 @@ class Gateway:
     def _id_changes(self, connection: Connection) -> None:
         """A connection is about to have another id."""
         self._put_run()
-        self._routes[connection] = {}
+        self._routes[connection].forget()
         self._delivery.forget()
 
     def closed(self, connection: Connection) -> None:
@@ -330,15 +317,14 @@ class Gateway:
         frame = sent.frame
         destination = frame.destination
         routes = self._routes[connection]
-        route = routes.get(destination)
+        route = routes.find(destination)
         if route is None:
-            if len(routes) >= KNOWN_ROUTES:
-                routes.clear()
-            header = frame.header
-            keys = keys_of(header, *connection.key)
-            # type 0 goes to everybody, whatever ids it names
-            agents = [(header.agent_type, agent_id) for agent_id in header.ids] if header.agent_type else []
-            route = routes[destination] = Route(keys, agents, any(self.mesh.limited(key) for key in keys))
+            route = routes.work_out(frame, connection.key, time.monotonic())
+            if route.left_out:
+                problem = "it sends to many agents that are not online, or groups that it never named: left out"
+                connection.complain("too_many_strangers", problem, route.left_out)
+                if not route.keys:
+                    return
         if not route.keys:
             connection.complain("no_destination", "a message names no agent and no group", frame.count)
             return

@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 
 from .panics import end_if_panic
-from .samples import AtOnce, OnBatch, OnNumbered, Payload
+from .samples import AtOnce, OnBatch, OnNumbered, Outlet, Payload
 from .threads import keep_attached
 
 log = logging.getLogger("macs.mesh")
@@ -64,15 +64,15 @@ class Arrivals:
         self.stirred = False
         """Whether a message or a question has come or gone since somebody took this back."""
 
-    def put(self, publisher: zenoh.Publisher, payload: Payload) -> None:
+    def put(self, publisher: Outlet, payload: Payload) -> None:
         """Publish. Zenoh calls our own subscriptions back within this, and they take the payload as it is."""
         self._put(publisher, payload, payload)
 
-    def put_here(self, publisher: zenoh.Publisher, payload: Payload) -> None:
+    def put_here(self, publisher: Outlet, payload: Payload) -> None:
         """Publish to our own subscriptions only: Zenoh finds them, and is given nothing to copy."""
         self._put(publisher, payload, b"")
 
-    def _put(self, publisher: zenoh.Publisher, payload: Payload, zenohs: Payload) -> None:
+    def _put(self, publisher: Outlet, payload: Payload, zenohs: Payload) -> None:
         self.stirred = True
         self._own.payload = payload
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import Counter, OrderedDict, deque
@@ -18,17 +19,30 @@ from macs_zenoh.shaping import Shape, Shaper
 
 from .arrivals import Arrivals
 from .panics import call, unwatched
-from .samples import Payload, Traffic
+from .samples import Outlet, Payload, Traffic
 
 log = logging.getLogger("macs.mesh")
 
 CALL = Traffic.CALL  # looked up by a Python call otherwise, for each message
 
 
+class _Bare:
+    """Puts with a key that has not been used often enough for a publisher of its own, which costs ten times a put."""
+
+    def __init__(self, session: zenoh.Session, key: str, **way: Any) -> None:
+        self._session = session
+        self._key = key
+        self._way = way
+
+    def put(self, payload: Payload) -> None:
+        """Publish."""
+        self._session.put(self._key, payload, **self._way)
+
+
 class _Outlet(NamedTuple):
     """Where puts with one key go."""
 
-    publisher: zenoh.Publisher
+    publisher: Outlet
     shape: Shape | None
     """The limits on this key, if there are any."""
     kept: bool = False
@@ -38,10 +52,10 @@ class _Outlet(NamedTuple):
 class _Apart(NamedTuple):
     """Two publishers for one key: our own subscriptions, and everybody else's."""
 
-    here: zenoh.Publisher
-    away: zenoh.Publisher
+    here: Outlet
+    away: Outlet
     settled_at: float
-    """When Zenoh surely knows who listens: until then it sends to the router in any case."""
+    """When Zenoh surely knows who listens: until then it sends to the router in any case. Never for what is bare."""
 
 
 class Outgoing:
@@ -50,6 +64,9 @@ class Outgoing:
     PUBLISHERS = 4096
     LARGE_BYTES = 128 << 10
     SETTLE_S = 2.0
+    FRESH_PUTS = 2
+    """So often a key is put with before it gets a publisher: whoever names thousands of keys once must not cost
+    thousands of declarations."""
 
     HEARTBEAT_S = 0.5
     """How often a reliable source tells its newest number: so late is the loss of a last message noticed."""
@@ -75,6 +92,8 @@ class Outgoing:
         self._kept: dict[str, int] = {}
         self._apart: OrderedDict[str, _Apart] = OrderedDict()
         self._outlets_lock = threading.Lock()
+        self._fresh: OrderedDict[tuple[str, bool], int] = OrderedDict()
+        """How often keys were put with that have no publisher yet, by key and whether apart."""
         self._on_room: list[Callable[[], None]] = []
         self._sender = Sender(backlog_bytes, arrivals.put, lambda: from_thread(self._room))
 
@@ -190,16 +209,42 @@ class Outgoing:
         """A publisher for a key: unlike a bare put, it sends nothing over the link while nobody there listens."""
         outlets = self._outlets[traffic]
         shape = self.shaper.of(key)
+        limits = shape if shape is not None and shape.limited else None
         with self._outlets_lock:
             if key in outlets:  # of two threads the other was faster: one source must number all
                 return outlets[key]
             keep = self._keeps(key, shape)
+            if not keep and self._is_fresh(key, traffic, apart=False):
+                return _Outlet(self._bare(key, traffic), limits)
             publisher = self._keeping(key, traffic, keep) if keep else self._publisher(key, traffic)
-            limits = shape if shape is not None and shape.limited else None
             outlet = outlets[key] = _Outlet(publisher, limits, bool(keep))
             if len(outlets) > self.PUBLISHERS:
                 outlets.popitem(last=False)  # undeclared when the last put with it is done
         return outlet
+
+    def _is_fresh(self, key: str, traffic: Traffic, *, apart: bool) -> bool:
+        """Whether a key is put with for one of the first times. A robot's topics are few and go on: never. With the
+        lock held."""
+        if traffic is Traffic.STREAM:
+            return False
+        puts = self._fresh.pop((key, apart), 0) + 1
+        if puts > self.FRESH_PUTS:
+            return False
+        self._fresh[key, apart] = puts
+        if len(self._fresh) > self.PUBLISHERS:
+            self._fresh.popitem(last=False)
+        return True
+
+    def _bare(self, key: str, traffic: Traffic, where: zenoh.Locality = zenoh.Locality.DEFAULT) -> _Bare:
+        priority, congestion, express = self.way(key, traffic)
+        return _Bare(
+            self._session,
+            key,
+            priority=priority,
+            congestion_control=congestion,
+            express=express,
+            allowed_destination=where,
+        )
 
     def _publisher(self, key: str, traffic: Traffic) -> zenoh.Publisher:
         priority, congestion, express = self.way(key, traffic)
@@ -228,12 +273,17 @@ class Outgoing:
         )
 
     def _declare_apart(self, key: str) -> _Apart:
+        places = (zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE)
+        with self._outlets_lock:
+            if self._is_fresh(key, Traffic.CALL, apart=True):
+                bare = [self._bare(key, Traffic.CALL, place) for place in places]
+                return _Apart(bare[0], bare[1], math.inf)
         priority, congestion, express = self.way(key, Traffic.CALL)
         here, away = (
             self._session.declare_publisher(
                 key, priority=priority, congestion_control=congestion, express=express, allowed_destination=where
             )
-            for where in (zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE)
+            for where in places
         )
         with self._outlets_lock:
             apart = self._apart[key] = _Apart(here, away, time.monotonic() + self.SETTLE_S)
@@ -245,15 +295,13 @@ class Outgoing:
 class Sender:
     """A thread that puts what may take long, in order. It starts with the first such payload."""
 
-    def __init__(
-        self, limit_bytes: int, put: Callable[[zenoh.Publisher, Payload], None], on_room: Callable[[], None]
-    ) -> None:
+    def __init__(self, limit_bytes: int, put: Callable[[Outlet, Payload], None], on_room: Callable[[], None]) -> None:
         self._put = put
         self.backlogged = False
         self._limit_bytes = limit_bytes
         self._on_room = on_room
         self._bytes = 0
-        self._queue: deque[tuple[zenoh.Publisher, Payload]] = deque()
+        self._queue: deque[tuple[Outlet, Payload]] = deque()
         self._wake = threading.Condition()
         self._thread: threading.Thread | None = None
         self._closing = False
@@ -263,7 +311,7 @@ class Sender:
         """Nothing is waiting or being sent."""
         return self._bytes == 0
 
-    def put(self, publisher: zenoh.Publisher, payload: Payload) -> bool:
+    def put(self, publisher: Outlet, payload: Payload) -> bool:
         """Queue it; False when that would be more than the limit (one payload may always wait)."""
         with self._wake:
             if self._closing or (self._bytes and self._bytes + len(payload) > self._limit_bytes):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Awaitable, Callable
 from enum import Enum
-from typing import Any
+from typing import Any, Protocol
 
 import zenoh
 
@@ -14,6 +14,13 @@ from .panics import call
 log = logging.getLogger("macs.mesh")
 
 Payload = bytes | bytearray
+
+
+class Outlet(Protocol):
+    """What puts with one key go through: a publisher of Zenoh's, or what stands for one."""
+
+    def put(self, payload: Payload) -> None:
+        """Publish."""
 
 
 class Traffic(Enum):

@@ -217,3 +217,40 @@ async def test_a_fault_of_ours_is_contained(
     assert connection.drops["failed"] == 3
     assert sum("logged once, counted as failed" in record.getMessage() for record in caplog.records) == 1
     attacker.socket.close()
+
+
+async def test_destinations_that_are_made_up_cost_nothing(start_gateway: StartGateway, connect: Connect) -> None:
+    """A megabyte that names 60 000 destinations leaves no publisher behind, and is told in the log; a neighbour is
+    answered in the middle of it, and who is there is reached by such a frame."""
+    gateway = await start_gateway()
+    neighbour, attacker = await connect(gateway), Raw(gateway.port)
+    hello = encode_message(Metadata(2, 0, 0, "Hello").encode())
+    frames = [
+        encode_frame(2, range(first, first + 10), range(1, 11), message=hello) for first in range(5000, 65_000, 10)
+    ]
+    sending = asyncio.create_task(attacker.send(b"".join(frames)))
+    for _ in range(10):
+        await answers(neighbour)
+    await sending
+    await attacker.send(encode_frame(2, [neighbour.id, 70], message=hello))
+    message = await asyncio.wait_for(neighbour.receive(), 20)
+    assert message.metadata.message_manager == "Hello"
+    outlets = sum(map(len, gateway.mesh._outgoing._outlets.values()))
+    assert outlets < 200
+    (connection,) = [one for one in gateway.agents.online() if one.drops["too_many_strangers"]]
+    assert connection.drops["too_many_strangers"] > 50_000
+
+
+async def test_keys_that_are_used_again_get_a_publisher(start_gateway: StartGateway, connect: Connect) -> None:
+    """Messages to the same agent come in order, whether its key has a publisher yet or not."""
+    gateway = await start_gateway()
+    sender, receiver = await connect(gateway), await connect(gateway)
+    for number in range(20):
+        await sender.send(str(number).encode(), to=2, ids=[receiver.id], manager="Greeting")
+        if number < 4:
+            await answers(sender)
+    found = [int((await asyncio.wait_for(receiver.receive(), 20)).data) for _ in range(20)]
+    assert found == list(range(20))
+    assert any(
+        f"/{receiver.id}/unity/" in key for outlets in gateway.mesh._outgoing._outlets.values() for key in outlets
+    )
