@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import logging
 import os
 import random
 import sys
@@ -68,6 +69,7 @@ def main() -> int:
         for row in rows:
             print(f"{row.section} {row.by:9} {'single' if row.single else 'flood ':6} {row.name}: {row.says}")
         return 0
+    logging.getLogger("macs").setLevel(logging.ERROR)  # the headsets here are told of every stop
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     print("  ".join(judge.HEADINGS))
     reports = asyncio.run(run(rows, options))

@@ -46,8 +46,11 @@ TALK_EVERY_S = 0.01
 DRIVE_EVERY_S = 0.02
 NO_EFFECT_S = 4.0
 """A stop or a dead-man that has done nothing by then counts as none."""
-HOLDS_S = 0.1
+HOLDS_S = 0.15
 """How long after each stop the driver is watched driving in vain."""
+ON_THE_WAY_S = 0.05
+"""Lamp and wheels are two topics: a command published before the lamp was may be heard so long after it. Such a one
+counts as the moment of the effect; one that is later was carried out in spite of the stop."""
 RECOVERY_S = 15.0
 """By when everything must be as before."""
 BEGIN_S = 60.0
@@ -371,7 +374,7 @@ class Scene:
         shown = self.wheels.lamp[-1][0]
         await asyncio.sleep(HOLDS_S)
         after = [heard.at for heard in self.wheels.heard if heard.at > shown and not heard.stop]
-        settled = [at for at in after if at - pressed <= HOLDS_S / 2]
+        settled = [at for at in after if at - shown <= ON_THE_WAY_S]
         window.stops.append(max([shown, *settled]) - pressed)
         window.late_commands += len(after) - len(settled)
         return await self._release(by_headset=by_headset)
@@ -384,7 +387,7 @@ class Scene:
         """Let the robot go on, by who has stopped it, however often that has to be said."""
         deadline = time.monotonic() + 2 * NO_EFFECT_S
         while time.monotonic() < deadline:
-            with suppress(MacsError):
+            with suppress(MacsError, asyncio.TimeoutError):
                 if by_headset:
                     await self._button.publish(STATES[False])
                 else:
