@@ -150,11 +150,22 @@ def heartbeats(target: Target) -> None:
 
 
 @attack(2, "headset")
-def bad_frames(target: Target) -> None:
-    """Frames at full rate that are all wrong: no JSON, unknown managers, inner sizes that lie."""
+def management_that_is_none(target: Target) -> None:
+    """Frames at full rate whose management data is no JSON, or names an unknown manager."""
+    flood(target, frame(b"{"), frame(management("Unknown")))
+
+
+@attack(2, "headset")
+def metadata_that_is_none(target: Target) -> None:
+    """Broadcasts at full rate whose metadata is no object, or nothing."""
+    flood(target, frame(metadata=b"[]"), frame(metadata=b"{"), frame(metadata=b""))
+
+
+@attack(2, "headset")
+def sizes_that_lie(target: Target) -> None:
+    """Frames at full rate whose inner sizes do not add up, or that have no room for any."""
     lie = b"\xff\xff\xff\x7f" + bytes(8)
-    lying = header(2, [1], [], 0, len(lie)) + lie
-    flood(target, frame(b"{"), frame(management("Unknown")), frame(metadata=b"[]"), lying, header(0, [], [], 0, 0))
+    flood(target, header(2, [1], [], 0, len(lie)) + lie, header(0, [], [], 0, 0), header(2, [1], [], 0, 3) + b"abc")
 
 
 @attack(2, "headset")
