@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ast
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+import macs_zenoh
 
 ROOT = Path(__file__).parents[2]
 CORE = sorted((ROOT / "macs_zenoh").rglob("*.py"))
@@ -113,3 +116,19 @@ def test_help_is_instant(path: Path) -> None:
     )
     at_once = {name for name, when_loaded in imported(path) if when_loaded}
     assert not {name for name in at_once if name.startswith(heavy) or name.partition(".")[0] in {"zenoh", "rosbags"}}
+
+
+def test_the_public_names_are_there() -> None:
+    """Each name that macs_zenoh lists can be had, errors among them, and it knows its version."""
+    for name in macs_zenoh.__all__:
+        assert getattr(macs_zenoh, name).__module__.startswith("macs_zenoh.")
+    assert {"MacsError", "UsageError", "ConfigError", "CallTimeout", "OutOfRange"} <= set(macs_zenoh.__all__)
+    assert isinstance(macs_zenoh.__version__, str)
+    with pytest.raises(AttributeError, match="nothing_of_ours"):
+        _ = macs_zenoh.nothing_of_ours  # type: ignore[attr-defined]
+
+
+def test_help_needs_no_zenoh() -> None:
+    """A command line that only explains itself loads neither Zenoh nor asyncio's programs."""
+    code = "import sys, bridge.cli; bridge.cli.build_parser(); sys.exit('zenoh' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
