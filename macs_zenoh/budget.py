@@ -58,3 +58,20 @@ class Budget:
         if self._at[address] <= 0:
             del self._at[address]
         self.used += change
+
+
+class Toll:
+    """Slows whoever asks for more work than ``per_s``: a second's worth is free at once, beyond that each piece is
+    paid for with time."""
+
+    LONGEST_S = 0.25
+    """An existing headset freezes when nobody reads from it for long."""
+
+    def __init__(self, per_s: float) -> None:
+        self._each_s = 1 / per_s
+        self._paid_until = 0.0
+
+    def pay(self, now: float) -> float:
+        """A piece of work is done for it: for how many seconds nothing more should be taken from it."""
+        self._paid_until = max(now - 1.0, self._paid_until) + self._each_s
+        return min(self.LONGEST_S, max(0.0, self._paid_until - now))

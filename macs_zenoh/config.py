@@ -282,9 +282,9 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     port: Port = 7000
     allow: list[str] = []
     """Networks whose addresses may connect, as in 192.168.1.0/24. Empty: everybody who reaches the port."""
-    max_connections: Annotated[int, Meta(ge=1, le=65_535)] = 2048
-    max_connections_per_address: Annotated[int, Meta(ge=1, le=65_535)] = 2048
-    """Lower it where headsets have addresses of their own; behind NAT they share one."""
+    max_connections: Annotated[int, Meta(ge=1, le=65_535)] = 4096
+    max_connections_per_address: Annotated[int, Meta(ge=1, le=65_535)] = 3072
+    """One address never takes all. Lower it where headsets have addresses of their own; behind NAT they share one."""
     max_frame_bytes: Bytes = 32 * 1024 * 1024
     """A larger declared frame closes its connection before a byte of it is stored."""
     max_frames_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0

@@ -6,6 +6,7 @@ it came back, a token that ends is only remembered; its agent leaves when the gr
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -44,12 +45,18 @@ class Directory:
     given it out; the smallest Zenoh id's claim counts, so that everybody who sees them all sees the same. A claim in
     doubt counts last: it may be of an earlier life."""
 
+    PER_SESSION = 16 << 10
+    """Agents of one Zenoh session: a gateway has as many as it has connections."""
+
     def __init__(self, grace_s: float = 2.0) -> None:
         self.grace_s = grace_s
+        self.ignored = 0
+        """Tokens that were too many of one session."""
         self._claims: dict[tuple[int, int], dict[str, AgentInfo]] = {}
         self._ids: dict[int, set[int]] = {}
         self._contested: set[tuple[int, int]] = set()
         self._doubtful: set[AgentInfo] = set()
+        self._tokens_of: Counter[str] = Counter()
         self._linked = True
         self._settled_at = 0.0
 
@@ -110,6 +117,9 @@ class Directory:
             return []
         agent = AgentInfo(int(fields["type"]), int(fields["id"]), int(fields["group"]), str(fields["zid"]))
         if alive:
+            if self._tokens_of[agent.zid] >= self.PER_SESSION and agent.zid not in self._claims.get(agent.key, {}):
+                self.ignored += 1
+                return []
             return self._claim(agent)
         if not self._linked or now < self._settled_at:
             return self._doubt(agent)
@@ -152,6 +162,7 @@ class Directory:
         claims = self._claims.setdefault(agent.key, {})
         before = self._current(agent.key) if claims else None
         self._doubtful.discard(agent)
+        self._tokens_of[agent.zid] += agent.zid not in claims
         claims[agent.zid] = agent
         if len(claims) > 1:
             self._contested.add(agent.key)
@@ -165,6 +176,9 @@ class Directory:
             return []  # already replaced, e.g. by the same agent in another group
         before = self._current(agent.key)
         del claims[agent.zid]
+        self._tokens_of[agent.zid] -= 1
+        if not self._tokens_of[agent.zid]:
+            del self._tokens_of[agent.zid]
         if len(claims) < 2:
             self._contested.discard(agent.key)
         if not claims:

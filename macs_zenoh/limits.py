@@ -37,6 +37,9 @@ ANSWER_BYTES = 1 << 20
 REASON_CHARACTERS = 500
 """Of a reason that is passed on to a person."""
 
+REQUESTS_PER_S = 1000
+"""Management messages of one TCP agent, a second's worth at once; one that sends more is read from more slowly."""
+
 NODES_EACH = 1024
 """Interface nodes that one TCP agent may have registered; recorded programs have tens."""
 

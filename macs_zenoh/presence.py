@@ -6,12 +6,19 @@ Agents and gateways see the same mesh through this one class; `directory` has th
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 
 from .directory import AgentInfo, Change, Directory
 from .keyexpr import PRESENCE
 from .mesh import Mesh, Subscription, Token
+
+log = logging.getLogger("macs.presence")
+
+AT_ONCE = 200
+"""Tokens that are handled without a break, which takes about a millisecond."""
 
 CONTESTED_S = 0.05
 """Pause between two looks at what is contested: each costs what all of it costs, and a merge changes it in steps."""
@@ -41,7 +48,9 @@ class Presence:
         self._change = asyncio.Event()
         self._was_contested = False
         self._looking: asyncio.TimerHandle | None = None
-        self._telling: asyncio.Handle | None = None
+        self._news: deque[tuple[str, bool]] = deque()
+        self._handling: asyncio.Handle | None = None
+        self._complained = False
         self._sweep: asyncio.TimerHandle | None = None
         self._watching: Subscription | None = None
         self._unseen: set[str] = set()
@@ -62,22 +71,42 @@ class Presence:
         self._confirming = asyncio.get_running_loop().create_task(self._confirm())
 
     async def _confirm(self) -> None:
-        """Let go of who left between the answer and the watcher's beginning."""
+        """Let go of who left between the answer and the watcher's beginning. It asks twice: under load an answer can
+        be empty."""
         await asyncio.sleep(CONFIRM_S)
-        still = await self._mesh.tokens(PRESENCE.every())
-        for key in self._unseen.difference(still):
+        for _ in range(2):
+            if self._unseen:
+                self._unseen.difference_update(await self._mesh.tokens(PRESENCE.every()))
+        for key in self._unseen:
             self._token(key, False)
         self._unseen.clear()
+        self._tell()
 
     def _watched(self, key: str, alive: bool) -> None:
-        self._unseen.discard(key)
-        self._token(key, alive)
+        """A token came or ended. Those that come together are handled in pieces, between which others have their turn:
+        one session can have thousands."""
+        self._news.append((key, alive))
+        if self._handling is None:
+            self._handling = asyncio.get_running_loop().call_soon(self._handle)
+
+    def _handle(self) -> None:
+        self._handling = None
+        for _ in range(min(len(self._news), AT_ONCE)):
+            key, alive = self._news.popleft()
+            self._unseen.discard(key)
+            self._changes += self.directory.token(key, alive, time.monotonic())
+        if self._news:
+            self._handling = asyncio.get_running_loop().call_soon(self._handle)
+        if self.directory.ignored and not self._complained:
+            self._complained = True
+            log.warning("a session has more than %d agents: the rest is ignored (logged once)", Directory.PER_SESSION)
+        self._tell()
 
     def close(self) -> None:
         """Follow no more."""
         if self._watching is not None:
             self._watching.close()
-        for handle in (self._telling, self._looking, self._sweep, self._confirming):
+        for handle in (self._handling, self._looking, self._sweep, self._confirming):
             if handle is not None:
                 handle.cancel()
 
@@ -101,17 +130,12 @@ class Presence:
 
     def _token(self, key: str, alive: bool) -> None:
         self._changes += self.directory.token(key, alive, time.monotonic())
-        if self._telling is None:  # after the tokens that are waiting to be handled now
-            self._telling = asyncio.get_running_loop().call_soon(self._tell)
 
     def _link(self, up: bool) -> None:
         self.directory.link(up, time.monotonic())
         self._schedule_sweep()
 
     def _tell(self) -> None:
-        if self._telling is not None:
-            self._telling.cancel()
-            self._telling = None
         changes, self._changes = self._changes, []
         if changes:
             self._change.set()

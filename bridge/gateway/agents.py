@@ -45,18 +45,22 @@ class Agents:
         """A connection was given an id."""
         self._by_id[agent_id] = connection
 
-    def join(self, connection: Connection, token: Token) -> Group | None:
-        """An agent told its type and group, maybe other ones than before; its presence is ``token``.
+    def join(self, connection: Connection, token: Token) -> tuple[Token | None, Group | None]:
+        """An agent told its type and group, maybe another one than before; its presence is ``token``.
 
-        Returns a group that has lost its last member by that.
+        Returns its presence before, for the caller to close, and a group that has lost its last member.
         """
-        _, emptied = self._unjoin(connection)
+        before, emptied = self._unjoin(connection)
         self._tokens[connection] = token
         if connection.peer.group:
             group = (connection.peer.agent_type, connection.peer.group)
             self._group_of[connection] = group
             self._groups.setdefault(group, set()).add(connection)
-        return emptied if emptied not in self._groups else None
+        return before, emptied if emptied not in self._groups else None
+
+    def group_of(self, connection: Connection) -> int:
+        """The group that others see an agent in, 0 for none: while it changes often, not always the last one."""
+        return self._group_of.get(connection, (0, 0))[1]
 
     def renumber(self, connection: Connection, agent_id: int) -> None:
         """An agent has another id from now on; its former one stays known until `forget_former`."""
@@ -83,7 +87,10 @@ class Agents:
     def leave(self, connection: Connection) -> tuple[bool, Group | None]:
         """A connection ended. Returns whether it was online, and a group that lost its last member."""
         self._by_id.pop(connection.agent_id, None)
-        return self._unjoin(connection)
+        token, emptied = self._unjoin(connection)
+        if token is not None:
+            token.close()
+        return token is not None, emptied
 
     def find(self, agent_type: object, agent_id: object) -> Connection | None:
         """The online agent with this type and id, if it is ours."""
@@ -96,16 +103,14 @@ class Agents:
         """Our online agents of a type in a group."""
         return list(self._groups.get((agent_type, group), ()))
 
-    def _unjoin(self, connection: Connection) -> tuple[bool, Group | None]:
+    def _unjoin(self, connection: Connection) -> tuple[Token | None, Group | None]:
         token = self._tokens.pop(connection, None)
-        if token is not None:
-            token.close()
         group = self._group_of.pop(connection, None)
         if group is None:
-            return token is not None, None
+            return token, None
         members = self._groups[group]
         members.discard(connection)
         if members:
-            return token is not None, None
+            return token, None
         del self._groups[group]
-        return token is not None, group
+        return token, group

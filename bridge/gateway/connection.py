@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import logging
+import math
 import socket
 import sys
 import termios
@@ -16,6 +17,8 @@ from contextlib import suppress
 from typing import Protocol, cast
 
 from macs_zenoh.addresses import joined, of_peer
+from macs_zenoh.budget import Toll
+from macs_zenoh.limits import REQUESTS_PER_S
 from macs_zenoh.messages import AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
 from macs_zenoh.peer import Event, Joined, Left, Peer, Rejected, Sent, State
 from macs_zenoh.queues import Chunk, Outbox
@@ -107,6 +110,11 @@ class Connection(asyncio.BufferedProtocol):
         self.congested = False
         """Whether so much waits for this agent that its senders should slow down."""
         self.brake = Brake()
+        self._toll = Toll(REQUESTS_PER_S)
+        self._tolled: asyncio.TimerHandle | None = None
+        self.grouped_at = -math.inf
+        """When it came into the group that others see it in, by the loop's clock."""
+        self.regrouping: asyncio.TimerHandle | None = None
 
     @property
     def agent_id(self) -> int:
@@ -185,8 +193,9 @@ class Connection(asyncio.BufferedProtocol):
             self.brake.release()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
+        for timer in (self._timer, self._tolled, self.regrouping):
+            if timer is not None:
+                timer.cancel()
         with self._writing:
             shortcut, self._shortcut = self._shortcut, None
             if shortcut is not None:
@@ -347,6 +356,18 @@ class Connection(asyncio.BufferedProtocol):
         self._pauses -= 1
         if self._pauses == 0 and not self._transport.is_closing():
             self._transport.resume_reading()
+
+    def charge(self) -> None:
+        """The agent asked for something that costs: one that does so too often is not read from for a moment."""
+        hold_s = self._toll.pay(time.monotonic())
+        if hold_s > 0 and self._tolled is None:
+            self.complain("slowed_down", f"it asks for more than {REQUESTS_PER_S} things a second")
+            self.pause()
+            self._tolled = self._loop.call_later(hold_s, self._go_on)
+
+    def _go_on(self) -> None:
+        self._tolled = None
+        self.resume()
 
     # -- life ----------------------------------------------------------------------------------------------------
 

@@ -20,6 +20,7 @@ from bridge.listening import bound
 from macs_zenoh.addresses import joined
 from macs_zenoh.budget import Budget
 from macs_zenoh.config import GatewaySettings
+from macs_zenoh.credit import Credits
 from macs_zenoh.directory import Change
 from macs_zenoh.errors import Refused, Unreachable
 from macs_zenoh.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
@@ -60,6 +61,7 @@ from .connection import Connection
 from .delivery import Delivery, Stream
 from .door import Door
 from .leases import Leases
+from .listener import Listener, descriptors
 from .own_keys import OwnKeys
 from .renumbering import Renumbering
 from .robots import RobotCalls, StreamChanges
@@ -70,7 +72,16 @@ log = logging.getLogger("macs.gateway")
 
 PUBLISHER = int(NodeType.PUBLISHER)
 COMMAND, CALL = Traffic.COMMAND, Traffic.CALL  # looked up by a Python call otherwise, for each message
+OTHER_DESCRIPTORS = 64
+"""What a gateway has open besides its connections, of which each takes up to two."""
 FLUSH_S = 1.0
+
+CALM_S = 0.25
+"""So long after one change of its group an agent's next one is seen by others."""
+
+OVERLAP_S = 0.1
+"""How long an agent is seen in its former group as well: in no moment it seems to be gone."""
+
 NO_MANAGERS: Managers = {}
 
 
@@ -110,11 +121,14 @@ class Gateway:
         self._scratch = bytearray(FrameDecoder.SMALL_BYTES)  # sockets of one loop receive one after the other
         self._door = Door(settings.allow, settings.max_connections, settings.max_connections_per_address)
         self._nodes = Budget("interface nodes", each=NODES_EACH, per_address=NODES_PER_ADDRESS, total=NODES_IN_ALL)
+        self._credits: Credits[str] = Credits(settings.max_frames_per_s)
+        self._online_reply = b""
+        """Who is online, as the answer to whoever asks; empty when that has changed."""
         self._numbers = 0
         self._waiting = WaitingRoom(settings.handshake_s, self._no_id)
         self._routes: dict[Connection, Routes] = {}
         self._subscriptions: dict[str, Subscription] = {}
-        self._servers: list[asyncio.AbstractServer] = []
+        self._listeners: list[Listener] = []
         self._run = NO_RUN
         self._brake = Brake()
         mesh.on_room(self._brake.release)
@@ -171,13 +185,22 @@ class Gateway:
         sockets = bound(self.settings.host, self.settings.port, shared=self.settings.reuse_port)
         self.port = sockets[0].getsockname()[1]
         for listening in sockets:
-            create = asyncio.get_running_loop().create_server
             try:
-                self._servers.append(await create(self._connection, sock=listening, backlog=1024))
+                self._listeners.append(Listener(listening, self._connection, self._turned_away))
             except OSError as error:  # two gateways can hold a port, and one of them can listen
                 why = f"cannot listen there: {error.strerror or error}"
                 raise Unreachable(self.address, why) from error
         log.info("listening on %s", self.address)
+        if (room := (descriptors() - OTHER_DESCRIPTORS) // 2) < self.settings.max_connections:
+            problem = "%d connections at most have room, not gateway.max_connections = %d: few files may be open"
+            log.warning(problem, room, self.settings.max_connections)
+
+    def _turned_away(self, whom: str) -> None:
+        """There was no descriptor for a connection."""
+        self._drops["no_descriptors"] += 1
+        if self._drops["no_descriptors"] == 1:
+            problem = "%s: turned away, for there are no descriptors left (ulimit -n; logged once, counted as %s)"
+            log.error(problem, whom, "no_descriptors")
 
     @property
     def address(self) -> str:
@@ -190,8 +213,8 @@ class Gateway:
 
     async def close(self) -> None:
         """Stop accepting, tell the mesh, send what waits for ``FLUSH_S`` at most, leave."""
-        for server in self._servers:
-            server.close()
+        for listener in self._listeners:
+            listener.close()
         self._renumbering.close()
         self._robots.close()
         connections = [*self.agents.connections(), *self._waiting]
@@ -241,11 +264,13 @@ class Gateway:
                 return
             connection = self._waiting.next()
             self._numbers += 1
+            now = time.monotonic()
             peer = Peer(
                 agent_id,
                 self._numbers,
-                time.monotonic(),
+                now,
                 limits=self._limits,
+                credit=self._credits.enter(connection.host, now),
                 custom=self._custom,
                 layout=self._layout,
                 scratch=self._scratch,
@@ -271,6 +296,7 @@ class Gateway:
 
     def _id_changes(self, connection: Connection) -> None:
         """A connection is about to have another id."""
+        self._online_reply = b""
         self._put_run()
         self._routes[connection].forget()
         self._delivery.forget()
@@ -282,11 +308,13 @@ class Gateway:
             self._waiting.leave(connection)
             return
         self._routes.pop(connection, None)
+        self._online_reply = b""
         self._drops += connection.all_drops()
         self._delivery.forget()
         was_online, empty_group = self.agents.leave(connection)
         self._leases.give_back(connection.agent_id)
         self._nodes.set(connection, connection.host, 0)
+        self._credits.leave(connection.host, connection.peer.credit, time.monotonic())
         self._group_emptied(empty_group)
         if was_online:
             self._own_keys.undeclare(connection.key)
@@ -371,14 +399,18 @@ class Gateway:
                 self.mesh.put(key, frame.data, Traffic.STREAM)
         elif isinstance(event, Joined):
             self._joined(connection, event)
+            connection.charge()
         elif isinstance(event, Registering):
             self._register(connection, event)
+            connection.charge()
         elif isinstance(event, RegistrationRefused):
             self._tell_refusal(connection.key, event.refused)
         elif isinstance(event, AskedOnline):
             self._answer_online(connection, event.request_id)
+            connection.charge()
         elif isinstance(event, Asked):
             self._manage(connection, event)
+            connection.charge()
 
     def _register(self, connection: Connection, event: Registering) -> None:
         """An agent registers on a node of robots, or takes that back."""
@@ -425,23 +457,52 @@ class Gateway:
         self._delivery.flush()
 
     def _joined(self, connection: Connection, event: Joined) -> None:
-        kind, agent_id = connection.key
+        if self.agents.find(*connection.key) is connection:
+            self._regroup(connection)
+            return
         self._own_keys.declare(connection)
-        if event.group:
-            self._subscribe(GROUP.every(type=kind, group=event.group), self._delivery.group)
-        # the token last: whoever sees the agent can reach it
-        token = self._presence.declare(kind, agent_id, event.group)
-        self._group_emptied(self.agents.join(connection, token))
-        self._delivery.forget()
+        self._enter_group(connection)
         self._renumbering.joined(connection)
         log.info("%s is online%s", connection, f" in group {event.group}" if event.group else "")
 
+    def _enter_group(self, connection: Connection) -> None:
+        """Let others see an agent in the group that it has told."""
+        kind, agent_id = connection.key
+        group = connection.peer.group
+        if group:
+            self._subscribe(GROUP.every(type=kind, group=group), self._delivery.group)
+        # the token last: whoever sees the agent can reach it
+        token = self._presence.declare(kind, agent_id, group)
+        before, emptied = self.agents.join(connection, token)
+        self._group_emptied(emptied)
+        loop = asyncio.get_running_loop()
+        connection.grouped_at = loop.time()
+        if before is not None:
+            loop.call_later(OVERLAP_S, before.close)
+        self._delivery.forget()
+        self._online_reply = b""
+
+    def _regroup(self, connection: Connection) -> None:
+        """An agent is in another group. Of many changes others see the first at once, and then the last."""
+        loop = asyncio.get_running_loop()
+        due = connection.grouped_at + CALM_S
+        if loop.time() < due:
+            if connection.regrouping is None:
+                connection.regrouping = loop.call_at(due, self._regroup, connection)
+            return
+        connection.regrouping = None
+        if self.agents.group_of(connection) != connection.peer.group:
+            self._enter_group(connection)
+            log.debug("%s is in group %d", connection, connection.peer.group)
+
     def _answer_online(self, connection: Connection, request_id: int) -> None:
-        ids = {kind: {agent.id for agent in self._presence.elsewhere(kind)} for kind in (ROS, UNITY)}
-        for own in self.agents.online():  # what we know ourselves comes back through the mesh a moment later
-            ids.setdefault(own.key[0], set()).add(own.agent_id)
-        reply = OnlineReply(ros_agent_ids=sorted(ids[ROS]), unity_agent_ids=sorted(ids[UNITY]))
-        self._reply(connection, Metadata(request_id=request_id), encode_data(reply))
+        if not self._online_reply:
+            ids = {kind: {agent.id for agent in self._presence.elsewhere(kind)} for kind in (ROS, UNITY)}
+            for own in self.agents.online():  # what we know ourselves comes back through the mesh a moment later
+                ids.setdefault(own.key[0], set()).add(own.agent_id)
+            reply = OnlineReply(ros_agent_ids=sorted(ids[ROS]), unity_agent_ids=sorted(ids[UNITY]))
+            self._online_reply = encode_data(reply)
+        self._reply(connection, Metadata(request_id=request_id), self._online_reply)
 
     # -- subscriptions -------------------------------------------------------------------------------------------
 
@@ -471,6 +532,7 @@ class Gateway:
     # -- presence ------------------------------------------------------------------------------------------------
 
     def _tell(self, changes: list[Change]) -> None:
+        self._online_reply = b""
         gone = [GoneAgent(agent.type, agent.id) for agent, online in changes if not online]
         if gone:
             metadata = Metadata(message_manager=AgentsGone.manager)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
+
+from .listener import descriptors
 
 
 class Shortcut:
@@ -15,6 +18,9 @@ class Shortcut:
     def __init__(self, sock: socket.socket) -> None:
         """Raises OSError when there are no descriptors left."""
         self._descriptor = os.dup(sock.fileno())
+        if self._descriptor >= descriptors():
+            os.close(self._descriptor)
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
     def send(self, message: bytes) -> int:
         """How many bytes the socket took. Of one that has failed, all: its owner will notice."""

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import socket
 import struct
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -13,10 +14,12 @@ import pytest
 
 from bridge.gateway import Gateway
 from bridge.gateway.leases import Leases
+from bridge.headset import frames
 from macs_zenoh import ping
 from macs_zenoh.keyexpr import LEASE, PING
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.messages import ROS, UNITY, Configuration, Welcome, decode_data, encode_management
+from macs_zenoh.presence import Presence
 from macs_zenoh.wire import MessageDecoder, encode_frame, split_message
 from tests.integration.conftest import StartGateway, until
 from tests.programs import Program, free_port
@@ -28,6 +31,10 @@ class Plain:
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader, self.writer = reader, writer
         self.id = 0
+
+    async def read(self) -> bytes:
+        """What comes next."""
+        return await self._reader.read(65536)
 
     async def join(self, agent_type: int) -> None:
         """Wait for the greeting and answer it."""
@@ -135,3 +142,69 @@ async def test_when_there_are_no_ids_a_newcomer_is_closed(start_gateway: StartGa
         await until(lambda: len(gateway.agents) == 255)
         async with crowd(gateway.port, 1) as late:
             assert late[0].id == agents[7].id
+
+
+async def test_changing_groups_is_no_departure(start_gateway: StartGateway) -> None:
+    """An agent that changes its group many times at once is online all the time, ends in the last one, and costs
+    others two changes, not hundreds."""
+    near, far = await start_gateway(), await start_gateway()
+    changes: list[tuple[int, bool]] = []
+    async with crowd(near.port, 1) as agents, await Mesh.open(far.mesh.settings) as watcher:
+        me = (UNITY, agents[0].id)
+        await until(lambda: me in far.directory)
+        presence = Presence(watcher, lambda news: changes.extend((c.agent.group, c.online) for c in news), nothing)
+        await presence.start()
+        for burst in (5, 300):
+            for group in [*range(1, burst), 77]:
+                configuration = Configuration(agent_type=UNITY, agent_id=me[1], group_id=group % 200, request_id=1)
+                agents[0].writer.write(encode_frame(management=encode_management(configuration)))
+            await until(lambda: changes and changes[-1] == (77, True))
+            await until(lambda: (agent := far.directory.get(*me)) is not None and agent.group == 77)
+            await asyncio.sleep(0.5)
+        assert all(online for _, online in changes)
+        assert len(changes) < 12
+        presence.close()
+
+
+def nothing(_: object) -> None:
+    """What nobody wants to know."""
+
+
+async def test_who_asks_too_much_is_slowed(start_gateway: StartGateway) -> None:
+    """Somebody who asks all the time who is online is read from more slowly, and counted; a neighbour is answered."""
+    gateway = await start_gateway()
+    async with crowd(gateway.port, 2) as (greedy, neighbour):
+        greedy.writer.write(frames.online_request(greedy.id, 1) * 3000)
+        before = len(gateway.agents)
+        await until(lambda: gateway.agents.find(UNITY, greedy.id).drops["slowed_down"])  # type: ignore[union-attr]
+        neighbour.writer.write(frames.online_request(neighbour.id, 1))
+        assert await asyncio.wait_for(neighbour.read(), 5)
+        assert before == 2
+
+
+async def test_without_descriptors_it_is_said() -> None:
+    """A gateway that has no descriptors left turns newcomers away, says so and how many, keeps serving those that are
+    there, and lets others in when there is room again. At its start it says that they will not be enough."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    few = ("sh", "-c", 'ulimit -n 128; exec "$@"', "sh")
+    async with (
+        Program("router", "-l", endpoint),
+        Program("gateway", "--port", "0", "-e", endpoint, within=few) as gateway,
+        crowd(gateway.port, 20) as there,
+    ):
+        assert "connections at most have room" in "\n".join(gateway.log)
+        newcomers = [await asyncio.open_connection("127.0.0.1", gateway.port) for _ in range(150)]
+        ends = [await asyncio.wait_for(reader.read(1), 10) for reader, _ in newcomers]
+        assert 20 < ends.count(b"") < 150
+        for _, writer in newcomers:
+            writer.close()
+        there[0].writer.write(frames.online_request(there[0].id, 1))
+        assert await asyncio.wait_for(there[0].read(), 5)
+        deadline = time.monotonic() + 20
+        while True:
+            try:
+                async with crowd(gateway.port, 20):
+                    break
+            except ConnectionError:  # it has not yet seen that the others are gone
+                assert time.monotonic() < deadline
+    assert "there are no descriptors left" in "\n".join(gateway.log)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from macs_zenoh.budget import Budget
+from macs_zenoh.budget import Budget, Toll
 
 
 def test_each_address_and_all_have_bounds() -> None:
@@ -45,3 +45,17 @@ def test_who_asks_first_stays_within_bounds(story: list[tuple[int, int]]) -> Non
         assert budget.used == sum(has.values()) <= 30
         assert sum(amount for who, amount in has.items() if who % 2) <= 20
         assert budget.of(holder) == has.get(holder, 0) <= 16
+
+
+def test_work_beyond_a_seconds_worth_is_paid_with_time() -> None:
+    """So much is free at once; beyond that it is as much per second as said, with pauses that nobody minds."""
+    toll = Toll(per_s=100)
+    assert [toll.pay(50.0) for _ in range(100)] == [0.0] * 100
+    now, done = 50.0, 0
+    while now < 60.0:
+        hold_s = toll.pay(now)
+        assert 0 < hold_s <= Toll.LONGEST_S
+        now += hold_s
+        done += 1
+    assert 950 <= done <= 1050
+    assert toll.pay(70.0) == 0.0

@@ -247,3 +247,15 @@ def test_other_keys_are_not_presence() -> None:
     ]
     assert [directory.token(other, True, 0.0) for other in others] == [[], [], [], []]
     assert len(directory) == 0
+
+
+def test_one_session_cannot_fill_the_directory() -> None:
+    """Of one session only so many agents count; those of others do, and room is made by those that leave."""
+    directory = Directory()
+    for number in range(Directory.PER_SESSION + 10):
+        directory.token(key(AgentInfo(3 + number // 60_000, number % 60_000 + 1, 0, "a")), True, 0.0)
+    assert (len(directory), directory.ignored) == (Directory.PER_SESSION, 10)
+    assert directory.token(key(AgentInfo(2, 1, 0, "b")), True, 0.0)
+    assert directory.token(key(AgentInfo(3, 1, 0, "a")), False, 0.0)
+    assert directory.token(key(AgentInfo(2, 2, 0, "a")), True, 0.0)
+    assert not directory.token(key(AgentInfo(2, 3, 0, "a")), True, 0.0)

@@ -1,0 +1,91 @@
+"""The door itself: accepts connections as long as there are descriptors, and says when there are none.
+
+libuv closes whom it has no descriptor for without a word, so this is done here. Some descriptors are kept for what a
+gateway needs besides: its links to routers, above all.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import resource
+import socket
+from collections.abc import Callable
+
+log = logging.getLogger("macs.gateway")
+
+BACKLOG = 1024
+AT_ONCE = 64
+"""How many are accepted before others have their turn."""
+
+PAUSE_S = 0.2
+"""So long nobody is accepted when the system has no room: who connects meanwhile waits."""
+
+KEPT = 64
+"""Descriptors that connections do not get; of few, an eighth."""
+
+
+def descriptors() -> int:
+    """How many descriptors connections may have."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return limit - min(KEPT, limit // 8) if limit != resource.RLIM_INFINITY else 1 << 30
+
+
+class Listener:
+    """One listening socket. ``on_turned_away(address)`` hears of whom there was no descriptor for."""
+
+    def __init__(
+        self,
+        listening: socket.socket,
+        protocol: Callable[[], asyncio.BaseProtocol],
+        on_turned_away: Callable[[str], None],
+    ) -> None:
+        """Raises OSError when somebody else listens there."""
+        self._listening = listening
+        self._protocol = protocol
+        self._on_turned_away = on_turned_away
+        self._loop = asyncio.get_running_loop()
+        self._again: asyncio.TimerHandle | None = None
+        self._accepting: set[asyncio.Task[object]] = set()
+        listening.setblocking(False)
+        listening.listen(BACKLOG)
+        self._listen()
+
+    def close(self) -> None:
+        """Accept nobody any more."""
+        if self._again is not None:
+            self._again.cancel()
+        if self._listening.fileno() >= 0:
+            self._loop.remove_reader(self._listening.fileno())
+        self._listening.close()
+
+    def _listen(self) -> None:
+        self._again = None
+        self._loop.add_reader(self._listening.fileno(), self._accept)
+
+    def _accept(self) -> None:
+        for _ in range(AT_ONCE):
+            try:
+                accepted, address = self._listening.accept()
+            except (BlockingIOError, InterruptedError, ConnectionAbortedError):
+                return
+            except OSError as error:  # EMFILE, ENFILE, ENOBUFS, ENOMEM
+                self._on_turned_away(error.strerror or str(error))
+                self._loop.remove_reader(self._listening.fileno())
+                self._again = self._loop.call_later(PAUSE_S, self._listen)
+                return
+            if accepted.fileno() >= descriptors():  # the lowest free number: so many are in use
+                accepted.close()
+                self._on_turned_away(str(address[0]))
+                continue
+            accepted.setblocking(False)
+            task: asyncio.Task[object] = self._loop.create_task(self._connected(accepted))
+            self._accepting.add(task)
+            task.add_done_callback(self._accepting.discard)
+
+    async def _connected(self, accepted: socket.socket) -> None:
+        try:
+            await self._loop.connect_accepted_socket(self._protocol, accepted)
+        except OSError as error:  # it is gone already
+            log.debug("a connection ended at once: %s", error)
+            accepted.close()
