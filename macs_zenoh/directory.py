@@ -12,15 +12,42 @@ from typing import NamedTuple
 
 from .keyexpr import PRESENCE, type_name
 
+EPOCH = "."
+"""Between a Zenoh id and an epoch. No Zenoh id has one."""
+
 
 class AgentInfo(NamedTuple):
     """One agent as the mesh sees it. ``type`` is the number; ``group`` 0 means none; ``zid`` is the Zenoh
-    session that declared it (the agent's own, or its gateway's)."""
+    session that declared it (the agent's own, or its gateway's), and ``epoch`` which of all that had the id in that
+    session it is: what belongs to one of them is not the next one's."""
 
     type: int
     id: int
     group: int
     zid: str
+    epoch: int = 0
+
+    @classmethod
+    def parse(cls, key: str) -> AgentInfo | None:
+        """Of a presence key; None for other keys."""
+        fields = PRESENCE.parse(key)
+        if fields is None:
+            return None
+        zid, _, epoch = str(fields["zid"]).partition(EPOCH)
+        if epoch and not (epoch.isascii() and epoch.isdigit() and len(epoch) < 20):
+            return None
+        return cls(int(fields["type"]), int(fields["id"]), int(fields["group"]), zid, int(epoch or 0))
+
+    @property
+    def presence(self) -> str:
+        """The key of its token."""
+        session = f"{self.zid}{EPOCH}{self.epoch}" if self.epoch else self.zid
+        return PRESENCE.of(type=self.type, id=self.id, group=self.group, zid=session)
+
+    @property
+    def session(self) -> tuple[str, int]:
+        """Who it is among all that have or had its id."""
+        return (self.zid, self.epoch)
 
     @property
     def type_name(self) -> str:
@@ -112,10 +139,9 @@ class Directory:
 
     def token(self, key: str, alive: bool, now: float) -> list[Change]:
         """A presence token appeared or ended. Keys that are no presence keys are ignored."""
-        fields = PRESENCE.parse(key)
-        if fields is None:
+        agent = AgentInfo.parse(key)
+        if agent is None:
             return []
-        agent = AgentInfo(int(fields["type"]), int(fields["id"]), int(fields["group"]), str(fields["zid"]))
         if alive:
             if self._tokens_of[agent.zid] >= self.PER_SESSION and agent.zid not in self._claims.get(agent.key, {}):
                 self.ignored += 1
@@ -161,6 +187,7 @@ class Directory:
     def _claim(self, agent: AgentInfo) -> list[Change]:
         claims = self._claims.setdefault(agent.key, {})
         before = self._current(agent.key) if claims else None
+        replaced = before is not None and before.zid == agent.zid and before.epoch != agent.epoch
         self._doubtful.discard(agent)
         self._tokens_of[agent.zid] += agent.zid not in claims
         claims[agent.zid] = agent
@@ -168,7 +195,8 @@ class Directory:
             self._contested.add(agent.key)
         self._ids.setdefault(agent.type, set()).add(agent.id)
         current = self._current(agent.key)
-        return [] if before == current else [Change(current, online=True)]
+        gone = [Change(before, online=False)] if before is not None and replaced else []
+        return [] if before == current else [*gone, Change(current, online=True)]
 
     def _release(self, agent: AgentInfo) -> list[Change]:
         claims = self._claims.get(agent.key, {})

@@ -110,10 +110,12 @@ class Presence:
             if handle is not None:
                 handle.cancel()
 
-    def declare(self, agent_type: int, agent_id: int, group: int) -> Token:
-        """Be online under this id, until the token is closed. Subscribe the inbox before: who is seen is sent to."""
-        key = PRESENCE.of(type=agent_type, id=agent_id, group=group, zid=self._mesh.zid)
-        return self._mesh.declare_token(key)
+    def declare(self, agent_type: int, agent_id: int, group: int, epoch: int = 0) -> Token:
+        """Be online under this id, until the token is closed. Subscribe the inbox before: who is seen is sent to.
+
+        ``epoch`` is another one for each agent that this session gives the id.
+        """
+        return self._mesh.declare_token(AgentInfo(agent_type, agent_id, group, self._mesh.zid, epoch).presence)
 
     def elsewhere(self, agent_type: int) -> list[AgentInfo]:
         """The online agents of a type whose token is not only ours."""

@@ -11,7 +11,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
-from macs_zenoh.keyexpr import LEASE, NAME, PRESENCE, block_of, type_name
+from macs_zenoh.directory import AgentInfo
+from macs_zenoh.keyexpr import LEASE, NAME, block_of, type_name
 from macs_zenoh.messages import UNITY
 
 from .facts import Certificate, Clock, Endpoint, Facts, Program, RouterInfo, Way
@@ -307,8 +308,8 @@ def _blocks_twice(facts: Facts) -> Iterator[Finding]:
 def _ids_twice(facts: Facts) -> Iterator[Finding]:
     holders: dict[str, set[str]] = defaultdict(set)
     for key in _keys(facts, "presence"):
-        if fields := PRESENCE.parse(key):
-            holders[f"{type_name(int(fields['type']))}/{fields['id']}"].add(str(fields["zid"]))
+        if claim := AgentInfo.parse(key):
+            holders[f"{claim.type_name}/{claim.id}"].add(claim.zid)
     for agent, zids in sorted(holders.items()):
         if len(zids) > 1:
             yield found("id_twice", agent, count=len(zids), who=_zids(zids))

@@ -21,6 +21,7 @@ from msgspec import structs
 from macs_zenoh import ping
 from macs_zenoh.addresses import of_endpoint
 from macs_zenoh.config import Settings
+from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import CallTimeout, ConfigError, MacsError, Refused, Unreachable, UsageError, WireError
 from macs_zenoh.keyexpr import BLOCK_SIZE, LEASE, NAME, PING, PRESENCE, UNICAST, block_of, type_name, type_number
 from macs_zenoh.mesh import Mesh, Subscription, Traffic, configuration
@@ -512,8 +513,8 @@ def _programs(endpoints: list[Endpoint]) -> list[Program]:
         return found.setdefault(zid, Program(zid=zid, agents=[]))
 
     for key in dict.fromkeys(key for endpoint in endpoints for key in endpoint.presence):
-        if fields := PRESENCE.parse(key):
-            of(str(fields["zid"])).agents.append(f"{type_name(int(fields['type']))}/{fields['id']}")
+        if agent := AgentInfo.parse(key):
+            of(agent.zid).agents.append(f"{agent.type_name}/{agent.id}")
     for key in dict.fromkeys(key for endpoint in endpoints for key in endpoint.leases):
         if fields := LEASE.parse(key):
             of(str(fields["zid"])).blocks.append(int(fields["block"]))

@@ -204,7 +204,8 @@ class Renumbering:
         self._on_change(connection)
         self._agents.renumber(connection, new_id)
         self._own_keys.declare(connection)
-        token = self._presence.declare(old[0], new_id, self._agents.group_of(connection))
+        number = connection.peer.connection_number
+        token = self._presence.declare(old[0], new_id, self._agents.group_of(connection), number)
         old_token = self._agents.replace_token(connection, token)
         log.info("%s has id %d now", before, new_id)
         self._later(ANSWER_S, lambda: self._forget_former(old, connection))

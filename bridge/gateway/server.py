@@ -472,7 +472,7 @@ class Gateway:
         if group:
             self._subscribe(GROUP.every(type=kind, group=group), self._delivery.group)
         # the token last: whoever sees the agent can reach it
-        token = self._presence.declare(kind, agent_id, group)
+        token = self._presence.declare(kind, agent_id, group, connection.peer.connection_number)
         before, emptied = self.agents.join(connection, token)
         self._group_emptied(emptied)
         loop = asyncio.get_running_loop()

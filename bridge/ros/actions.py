@@ -42,7 +42,8 @@ class Goal:
     """One goal: who gets its feedback and result, and what became of it."""
 
     id: bytes
-    owner: Registrant
+    owner: Registrant | None
+    """None: it has left, and nobody is told until somebody asks with the goal's id."""
     group: int
     request_id: int
     node_name: str
@@ -54,6 +55,8 @@ class Goal:
     finished_at: float | None = None
     cancel_wanted: bool = False
     handle: Any = None
+    former: Registrant | None = None
+    """Who had it when it left. It goes on hearing of the goal if it comes back before another has its id."""
 
 
 class ActionNode(InterfaceNode):
@@ -121,10 +124,18 @@ class ActionNode(InterfaceNode):
             client.destroy()
 
     def left(self, agent: Registrant) -> None:
-        if self.rule.cancel_on_leave:
-            for goal in list(self._goals.values()):
-                if goal.owner == agent:
+        for goal in list(self._goals.values()):
+            if goal.owner == agent:
+                goal.owner, goal.former = None, agent
+                if self.rule.cancel_on_leave:
                     self._cancel(goal)
+            elif goal.former == agent:  # its id is another one's now
+                goal.former = None
+
+    def returned(self, agent: Registrant) -> None:
+        for goal in self._goals.values():
+            if goal.owner is None and goal.former == agent:
+                goal.owner, goal.former = agent, None
 
     def emergency_stop(self, by: str) -> None:
         if self.held:
@@ -160,6 +171,8 @@ class ActionNode(InterfaceNode):
         sender = Registrant.of(message)
         goal = self._goals.get(goal_id)
         if goal is not None:  # asked again, for want of an answer
+            if goal.owner is None:
+                self._adopt(goal, message)
             self._tell(goal, ActionVerb.ACCEPTED, int(goal.handle is not None))
             return
         goal = self._asked(message, goal_id)
@@ -178,8 +191,7 @@ class ActionNode(InterfaceNode):
 
     def _ask_result(self, goal: Goal, message: Message) -> None:
         """Whoever asks gets the result, now or later, and the feedback from now on."""
-        goal.owner, goal.request_id = Registrant.of(message), message.metadata.request_id
-        goal.node_name = message.metadata.node_name
+        self._adopt(goal, message)
         if goal.finished_at is not None:
             self._tell(goal, ActionVerb.RESULT, goal.status, goal.result)
 
@@ -191,6 +203,11 @@ class ActionNode(InterfaceNode):
         ]
         asked = self._asked(message, bytes(ID_BYTES))
         self._tell(asked, ActionVerb.LIST, 0, msgspec.json.encode(goals))
+
+    def _adopt(self, goal: Goal, message: Message) -> None:
+        """From now on who sent this is told of the goal."""
+        goal.owner, goal.request_id = Registrant.of(message), message.metadata.request_id
+        goal.node_name, goal.former = message.metadata.node_name, None
 
     def _asked(self, message: Message, goal_id: bytes) -> Goal:
         """A goal as far as a message tells it, to answer."""
@@ -277,6 +294,8 @@ class ActionNode(InterfaceNode):
         self._check_use()
 
     def _tell(self, goal: Goal, verb: ActionVerb, code: int, rest: bytes = b"") -> None:
+        if goal.owner is None:
+            return
         metadata = structs.replace(self.metadata(verb.value, goal.request_id), node_name=goal.node_name)
         self.robot.send(goal.owner, metadata, goal.id + struct.pack("B", code) + rest)
 
@@ -363,6 +382,6 @@ def _shown(goal: Goal) -> dict[str, Any]:
     return {
         "goal": goal.id.hex(),
         "status": goal.status,
-        "owner": str(goal.owner),
+        "owner": str(goal.owner or goal.former or ""),
         "finished": goal.finished_at is not None,
     }

@@ -45,6 +45,8 @@ REQUESTS = frozenset({FunctionalityRequest.manager, STATUS, ControlRequest.manag
 ABSENT_S = 5.0
 """How long an agent may be registered without being online: its registration can come before its presence, and also
 after its end, when it left in that moment."""
+SESSIONS = 8192
+"""Of so many agents the robot remembers who had their ids last."""
 STOP_MESSAGES_S = 0.1
 """How long ROS nodes get, at the end, to take the last messages: what a writer that ends has sent is lost unread."""
 
@@ -72,7 +74,9 @@ class RobotAgent:
         self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
         self.checked = CheckedSettings(robot.rules, robot.drops)
         self.offers = Offers(robot, agent.publish_stream, self.checked.look)
-        self._answering: set[asyncio.Task[None]] = set()
+        self._answering: dict[asyncio.Task[None], Registrant] = {}
+        self._sessions: dict[Registrant, tuple[str, int]] = {}
+        """Who has an id, or had it last."""
 
     async def start(self) -> None:
         """Serve from now on."""
@@ -106,8 +110,8 @@ class RobotAgent:
                 self._manage(message)
             elif message.metadata.message_manager in REQUESTS:
                 # an answer may take a while; an emergency stop behind it must not wait
-                self._answering.add(answer := asyncio.create_task(self._answer(message)))
-                answer.add_done_callback(self._answering.discard)
+                self._answering[answer := asyncio.create_task(self._answer(message))] = Registrant.of(message)
+                answer.add_done_callback(self._answering.pop)
         except Exception:
             # a message that hits a fault of ours must not make the robot deaf for all that follow
             log.exception("a message from %s/%d failed", message.sender_type, message.sender_id)
@@ -235,10 +239,25 @@ class RobotAgent:
 
     def _presence(self, agent: AgentInfo, online: bool) -> None:
         self.nodes.rights.changed()
+        agent_key = Registrant(agent.type, agent.id)
         if not online:
-            gone = Registrant(agent.type, agent.id)
-            self.nodes.forget(gone)
-            self.offers.forget(gone)
+            self._forget(agent_key)
+            return
+        before = self._sessions.pop(agent_key, None)
+        if len(self._sessions) >= SESSIONS:
+            del self._sessions[next(iter(self._sessions))]
+        self._sessions[agent_key] = agent.session
+        if before == agent.session:
+            self.nodes.returned(agent_key)
+        elif before is not None:  # whether it was seen to leave or not: what it had is not the next one's
+            self._forget(agent_key, for_good=True)
+
+    def _forget(self, gone: Registrant, *, for_good: bool = False) -> None:
+        self.nodes.forget(gone, for_good=for_good)
+        self.offers.forget(gone)
+        for answer, asker in list(self._answering.items()):
+            if asker == gone:
+                answer.cancel()
 
 
 def _ignore(_: Message) -> None:

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
+from macs_zenoh.keyexpr import type_number
 from macs_zenoh.reading import Message
 
 
@@ -56,6 +57,11 @@ class EarlyMessages:
         if len(taken) < len(waiting):
             self._waiting[key] = deque(early for early in waiting if not any(early.message is t for t in taken))
         return taken
+
+    def drop(self, sender: tuple[int, int]) -> None:
+        """Forget what somebody sent who has left: its id may be another one's by the time there is a node."""
+        for key in list(self._waiting):
+            self.take(key, lambda message: (type_number(message.sender_type), message.sender_id) == sender)
 
     def expire(self, now: float) -> dict[NodeKey, list[Message]]:
         """Give up those that waited too long, and return them by node."""

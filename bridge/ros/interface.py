@@ -236,6 +236,9 @@ class InterfaceNode(ABC):
     def left(self, agent: Registrant) -> None:  # noqa: B027 - only some nodes care
         """An agent left the mesh, registered here or not. On the loop."""
 
+    def returned(self, agent: Registrant) -> None:  # noqa: B027 - only some nodes care
+        """An agent that left is there again, and nobody had its id meanwhile. On the loop."""
+
     def cut_off(self) -> None:  # noqa: B027 - only some nodes care
         """The robot has lost the mesh. On the loop."""
 

@@ -134,15 +134,22 @@ class InterfaceNodes:
             if not any(self._places.names_of(node, registrant)):
                 self._deregister(node, registrant)
 
-    def forget(self, registrant: Registrant) -> None:
-        """Take an agent that left off every node. Its commands count as stopped, registered or not."""
+    def forget(self, registrant: Registrant, *, for_good: bool = False) -> None:
+        """Take an agent that left off every node. Its commands count as stopped, registered or not. ``for_good``: it
+        will not come back, its id is another one's."""
+        self._early.drop(registrant)
         for node in self:
             node.left(registrant)
             if registrant in node.registrants:
-                if node.linger_s:
+                if node.linger_s and not for_good:
                     self._linger(node, registrant)
                 else:
                     self._deregister(node, registrant)
+
+    def returned(self, registrant: Registrant) -> None:
+        """An agent that seemed to have left is there again, the same one."""
+        for node in self:
+            node.returned(registrant)
 
     def forget_all(self) -> None:
         """Remove all that anybody registered; only the emergency stop stays."""

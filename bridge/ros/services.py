@@ -156,6 +156,13 @@ class ClientNode(InterfaceNode):
         self._calls[call] = message
         call.add_done_callback(self._calls.pop)
 
+    def left(self, agent: Registrant) -> None:
+        """Its id may be another one's when the answer comes."""
+        for call, message in list(self._calls.items()):
+            if Registrant.of(message) == agent:
+                call.cancel()
+                self.robot.drops.note("late_answer", self.topic, f"{agent} left before its call was answered")
+
     def refused(self, message: Message, reason: str) -> None:
         self._fail(message, CallFailed("refused", reason))
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from geometry_msgs.msg import Twist
 from rclpy.serialization import serialize_message
+from rclpy.task import Future
 
 from bridge.ros.session import RosSession
 from macs_zenoh.messages import AddNode, Metadata, NodeType, RemoveNode, node_name
@@ -44,6 +45,19 @@ class Peer:
         await until(
             lambda: node.count_publishers(topic) == publishers and node.count_subscribers(topic) == subscriptions
         )
+
+
+def pause(node: Any, seconds: float) -> Any:
+    """A future of rclpy that is done after a time."""
+    future = Future()
+
+    def wake() -> None:
+        timer.cancel()
+        node.destroy_timer(timer)
+        future.set_result(None)
+
+    timer = node.create_timer(seconds, wake)
+    return future
 
 
 async def until(condition: Callable[[], Any], timeout_s: float = 10.0) -> None:

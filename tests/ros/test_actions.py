@@ -11,8 +11,7 @@ import pytest
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.serialization import deserialize_message, serialize_message
-from rclpy.task import Future
-from ros_peer import Peer, adding, until
+from ros_peer import Peer, adding, pause, until
 
 from bridge.headset.actions import ABORTED, CANCELED, SUCCEEDED, ActionClient, Goal
 from bridge.headset.frames import NodeSpec
@@ -64,19 +63,6 @@ class Counter:
         return result
 
 
-def pause(node: Any, seconds: float) -> Any:
-    """A future of rclpy that is done after a time."""
-    future = Future()
-
-    def wake() -> None:
-        timer.cancel()
-        node.destroy_timer(timer)
-        future.set_result(None)
-
-    timer = node.create_timer(seconds, wake)
-    return future
-
-
 class Headset:
     """A headset's action client, joined to robot 7's nodes without a wire between them."""
 
@@ -84,6 +70,7 @@ class Headset:
         self.id = agent_id
         self.nodes: InterfaceNodes
         self.online = True
+        self.heard = 0
         self.client = ActionClient(self, NodeSpec(NodeType.ACTION, "/count", COUNT, 100))
 
     async def send_frame(self, frame: bytes) -> None:
@@ -95,6 +82,7 @@ class Headset:
     def forget(self, node: Any) -> None: ...
 
     def hear(self, metadata: Metadata, data: bytes) -> None:
+        self.heard += 1
         if self.online:
             self.client.receive(Incoming(metadata, data))
 
@@ -210,6 +198,26 @@ async def test_a_successor_of_the_group_finds_the_goal(site: SimpleNamespace) ->
     assert (await mine.result(5)).status == CANCELED
 
 
+async def test_a_goal_is_not_the_next_ones_who_has_the_id(site: SimpleNamespace) -> None:
+    """Who gets a freed id hears nothing of its predecessor's goal, neither feedback nor result nor its number; who has
+    only been away goes on hearing of it."""
+    goal = await site.nine.client.send_goal(7, site.goal(1000, 0.005))
+    site.nodes.forget(Registrant(2, 9))
+    site.nodes.returned(Registrant(2, 9))
+    seen = [deserialize_message(await anext(goal), site.action.Feedback).at for _ in range(3)]
+    site.nodes.forget(Registrant(2, 9))
+    site.nodes.forget(Registrant(2, 9), for_good=True)  # another one came
+    site.nodes.returned(Registrant(2, 9))
+    heard = site.nine.heard
+    assert site.nodes.get(NodeType.ACTION, "nd__count").status()["goals"][0]["owner"] == ""
+    assert await site.nine.client.goals(7) == []
+    await asyncio.sleep(0.1)
+    assert site.nine.heard == heard + 1, "more than the empty list"
+    mine = await site.nine.client.resume(7, goal.id)  # with the goal's id it is found again
+    assert deserialize_message(await anext(mine), site.action.Feedback).at > seen[-1]
+    await mine.cancel()
+
+
 async def test_goals_end_with_their_headset_where_a_rule_says_so(site: SimpleNamespace) -> None:
     """With cancel_on_leave a headset's goals are canceled when it leaves, also one not yet accepted; others' go on."""
     counter = await site.peer.session.run(lambda: Counter(site.peer, site.action, "/other"))
@@ -258,8 +266,8 @@ async def test_results_are_not_kept_for_ever(site: SimpleNamespace, monkeypatch:
     site.nodes.robot.rules.settings = RobotSettings(call_s=settings.call_s, result_s=0.1)
     monkeypatch.setattr("bridge.ros.actions.WATCH_S", 0.05)
     goal = await site.five.client.send_goal(7, site.goal(1))
-    site.nodes.forget(Registrant(2, 5))
     await goal.result(5)
+    site.nodes.forget(Registrant(2, 5))
     await until(lambda: site.nodes.get(NodeType.ACTION, "nd__count") is None)
 
 

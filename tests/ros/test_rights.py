@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -14,16 +15,24 @@ from ros_peer import Peer, adding, drive, get, removing, until
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
+from bridge.ros.agent import RobotAgent, open_robot
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.requests import ControlRequest, control
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
-from macs_zenoh.config import RobotSettings, TopicRule
+from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule
+from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import Refused
-from macs_zenoh.messages import ActionVerb, CallFailure, Metadata, NodeType
+from macs_zenoh.keyexpr import PRESENCE
+from macs_zenoh.mesh import Mesh, Sample, Token, Traffic
+from macs_zenoh.messages import ActionVerb, AddNode, CallFailure, Metadata, NodeType, encode_data
 from macs_zenoh.reading import Message
+from macs_zenoh.routing import call, inbox, keys_of
+from macs_zenoh.wire import MACS, encode_frame, encode_message, parse_frame
+from tests.programs import free_port
 
+ROBOT = 7
 OPERATOR, STRANGER = 5, 6
 TWIST = "geometry_msgs/Twist"
 RULES = [
@@ -243,3 +252,120 @@ async def test_a_right_ends_when_it_is_taken_away(session: RosSession) -> None:
         assert nodes.drops == {"not_allowed": 1}
     finally:
         nodes.close()
+
+
+# -- an id is who has it now -----------------------------------------------------------------------------------------
+
+
+class Lodging:
+    """Agents that a session takes in one after the other under one id, as a gateway does."""
+
+    ID = 300
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self.inbox: asyncio.Queue[bytes] = asyncio.Queue()
+        self._reading = mesh.subscribe(inbox(2, self.ID), self._take)
+        self._token: Token | None = None
+
+    def _take(self, batch: list[Sample]) -> None:
+        for _, payload in batch:
+            self.inbox.put_nowait(bytes(payload))
+
+    def next(self, epoch: int) -> None:
+        """The one before leaves, and at once another one comes."""
+        if self._token is not None:
+            self._token.close()
+        self._token = self.mesh.declare_token(AgentInfo(2, self.ID, 0, self.mesh.zid, epoch).presence)
+
+    def send(self, metadata: Metadata, data: bytes) -> None:
+        frame = encode_frame(1, [ROBOT], message=encode_message(metadata.sent_by(2, self.ID).encode(), data))
+        for key in keys_of(parse_frame(frame).header, 2, self.ID):
+            self.mesh.put(key, frame, Traffic.CALL)
+
+    async def register(self, request: AddNode) -> None:
+        key, frame = call((1, ROBOT), "add_node", (2, self.ID), encode_data(request), Metadata(2, self.ID), MACS)
+        await self.mesh.query(key, frame, timeout_s=5)
+
+
+@pytest.fixture
+async def router() -> AsyncIterator[str]:
+    """A Zenoh router; its endpoint."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    async with await Mesh.open(MeshSettings(mode="router", listen=[endpoint])):
+        yield endpoint
+
+
+async def test_nothing_of_an_agent_is_its_successors(router: str, domain: int, peer: Peer) -> None:
+    """When an agent leaves and another one gets its id at once, its registrations, its control, its calls and
+    their answers have ended, and the other begins with nothing."""
+    answer = threading.Event()
+    asked = asyncio.Queue[bool]()
+    loop = asyncio.get_running_loop()
+
+    def serve(request: Any, response: Any) -> Any:
+        loop.call_soon_threadsafe(asked.put_nowait, request.data)
+        answer.wait(10)
+        response.success = True
+        return response
+
+    await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/slow", serve))
+    settings = Settings(
+        mesh=MeshSettings(connect=[router]),
+        robot=RobotSettings(id=ROBOT, rules=[TopicRule(match="/cmd_vel", exclusive=True, hold_s=60)]),
+    )
+    async with (
+        open_robot(settings, domain_id=domain) as robot,
+        await Mesh.open(MeshSettings(connect=[router])) as mesh,
+    ):
+        await until(lambda: robot.session.node.count_services("/slow") == 1)
+        lodging = Lodging(mesh)
+        lodging.next(1)
+        await until(lambda: (2, Lodging.ID) in robot.agent.directory)
+        await lodging.register(publishing("/cmd_vel", Lodging.ID))
+        await lodging.register(adding("/slow", "std_srvs/SetBool", node_type=NodeType.CLIENT, registrant=Lodging.ID))
+        lodging.send(Metadata(node_type=NodeType.PUBLISHER, node_name="nd__cmd_vel"), drive(1).data)
+        question = Metadata(request_id=41, node_type=NodeType.CLIENT, node_name="nd__slow")
+        lodging.send(question, bytes(serialize_message(SetBool.Request(data=True))))
+        await get(asked)
+        drive_node = robot.nodes.on_topic(NodeType.PUBLISHER, "/cmd_vel")
+        assert drive_node is not None
+        assert drive_node.status()["control"]["holder"] == f"unity/{Lodging.ID}"
+
+        lodging.next(2)
+        await until(lambda: len(robot.nodes) == 0)
+        found = robot.agent.directory.get(2, Lodging.ID)
+        assert found is not None
+        assert found.epoch == 2
+        answer.set()
+        await asyncio.sleep(0.3)
+        await lodging.register(adding("/slow", "std_srvs/SetBool", node_type=NodeType.CLIENT, registrant=Lodging.ID))
+        lodging.send(question, bytes(serialize_message(SetBool.Request(data=False))))
+        assert await get(asked) is False
+        assert parse_frame(await get(lodging.inbox)).body
+        assert lodging.inbox.empty(), "its predecessor's answer came as well"
+
+
+async def test_a_session_that_only_lost_its_way_keeps_what_it_had(router: str, domain: int) -> None:
+    """The same agent is no other one for having been away: what lingers for it stays."""
+    rule = TopicRule(match="/log", keep_for_recovery=10)
+    settings = Settings(mesh=MeshSettings(connect=[router]), robot=RobotSettings(id=ROBOT, rules=[rule]))
+    async with (
+        open_robot(settings, domain_id=domain) as robot,
+        await Mesh.open(MeshSettings(connect=[router])) as mesh,
+    ):
+        lodging = Lodging(mesh)
+        lodging.next(1)
+        await until(lambda: _epoch(robot) == 1)
+        await lodging.register(adding("/log", registrant=Lodging.ID))
+        lodging.next(1)
+        await mesh.tokens(PRESENCE.every())
+        await asyncio.sleep(0.2)
+        assert len(robot.nodes) == 1
+        lodging.next(2)
+        await until(lambda: len(robot.nodes) == 0)
+
+
+def _epoch(robot: RobotAgent) -> int:
+    found = robot.agent.directory.get(2, Lodging.ID)
+    return found.epoch if found is not None else 0

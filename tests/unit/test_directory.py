@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from macs_zenoh.directory import AgentInfo, Change, Directory
-from macs_zenoh.keyexpr import LEASE, PRESENCE, UNICAST
+from macs_zenoh.keyexpr import LEASE, UNICAST
 
 GRACE_S = 2.0
 ROBOT = AgentInfo(1, 7, 3, "a1")
@@ -29,7 +29,7 @@ steps = st.lists(
 
 def key(agent: AgentInfo) -> str:
     """An agent's presence token."""
-    return PRESENCE.of(type=agent.type, id=agent.id, group=agent.group, zid=agent.zid)
+    return agent.presence
 
 
 class Story:
@@ -223,6 +223,30 @@ def test_a_token_told_twice_is_told_once() -> None:
     assert story.happen("alive", robot) == []
     assert story.happen("ended", robot) == [Change(robot, online=False)]
     assert story.happen("ended", robot) == []
+
+
+def test_the_next_one_with_an_id_is_another_agent() -> None:
+    """A gateway that gives an id again says so by the epoch, also to who never saw the first one leave: in one burst,
+    or while its own link was down. What ends late is the first one's."""
+    first, second = AgentInfo(2, 300, 3, "a1", 17), AgentInfo(2, 300, 3, "a1", 18)
+    for happening in ([], [("ended", first)]):
+        story = Story()
+        story.happen("alive", first)
+        story.happen("link", False)
+        for what, agent in happening:
+            assert story.happen(what, agent) == []
+        story.happen("link", True)
+        assert story.happen("alive", second) == [Change(first, online=False), Change(second, online=True)]
+        assert story.happen("ended", first) == []
+        assert list(story.directory) == [second]
+
+
+@pytest.mark.parametrize("agent", [AgentInfo(2, 300, 3, "a1"), AgentInfo(1, 7, 0, "b2", 12345)])
+def test_a_token_says_who_it_is(agent: AgentInfo) -> None:
+    """A key with and without an epoch; one that is no number is none of ours."""
+    assert AgentInfo.parse(agent.presence) == agent
+    for wrong in ("x", "-1", "\u0661", "9" * 20, "1.2"):
+        assert AgentInfo.parse(f"macs/live/ros/7/0/a1.{wrong}") is None
 
 
 def test_ids_are_per_type() -> None:
