@@ -204,7 +204,8 @@ async def test_a_goal_is_not_the_next_ones_who_has_the_id(site: SimpleNamespace)
     goal = await site.nine.client.send_goal(7, site.goal(1000, 0.005))
     site.nodes.forget(Registrant(2, 9))
     site.nodes.returned(Registrant(2, 9))
-    seen = [deserialize_message(await anext(goal), site.action.Feedback).at for _ in range(3)]
+    steps = aiter(goal)
+    seen = [deserialize_message(await anext(steps), site.action.Feedback).at for _ in range(3)]
     site.nodes.forget(Registrant(2, 9))
     site.nodes.forget(Registrant(2, 9), for_good=True)  # another one came
     site.nodes.returned(Registrant(2, 9))
@@ -214,7 +215,7 @@ async def test_a_goal_is_not_the_next_ones_who_has_the_id(site: SimpleNamespace)
     await asyncio.sleep(0.1)
     assert site.nine.heard == heard + 1, "more than the empty list"
     mine = await site.nine.client.resume(7, goal.id)  # with the goal's id it is found again
-    assert deserialize_message(await anext(mine), site.action.Feedback).at > seen[-1]
+    assert deserialize_message(await anext(aiter(mine)), site.action.Feedback).at > seen[-1]
     await mine.cancel()
 
 
