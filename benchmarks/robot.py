@@ -13,6 +13,7 @@ from typing import Any
 import uvloop
 
 import macs_zenoh
+from macs_zenoh.existing import CDR
 from macs_zenoh.messages import ROS, UNITY, AddNode, Metadata, NodeType, StreamData, decode_data, encode_management
 from macs_zenoh.wire import encode_frame, encode_message
 
@@ -48,7 +49,7 @@ class Robot:
             node_name=self.node.node_name,
             data_exchange_type=self.node.data_exchange_type,
         )
-        message = encode_message(metadata.encode(), bytes(size))
+        message = encode_message(metadata.encode(), (CDR + bytes(size))[:size])
         targets = StreamData({str(UNITY): sorted(self.registrants)})
         frame = encode_frame(ROS, management=encode_management(targets), message=message)
         for _ in range(count):

@@ -305,6 +305,9 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     """Own management messages, as my_package.world_class_manager:WorldClassManager (docs/managers.md)."""
     tell_refusals: bool = True
     """Tell a headset when a robot refused its registration, by a management message that existing programs ignore."""
+    robot_packages: list[str] = []
+    """Packages of ROS types that existing robot programs here have, besides the common ones and those of the topics
+    and services that they name. A type of another package ends such a program's thread, so it is refused."""
     reuse_port: bool = False
     """Share the port with other gateway processes (SO_REUSEPORT); set by ``--workers``."""
 

@@ -308,6 +308,12 @@ class CallFailure(Struct, frozen=True, rename="camel"):
     reason: str
 
 
+class Refusal(Struct, frozen=True):
+    """In place of an answer to a plain request, in the data part: why there is none, for a person."""
+
+    refused: str
+
+
 class FunctionalityRequest(Management, frozen=True):
     """Anyone → robot: report your topics and services."""
 

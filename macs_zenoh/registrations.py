@@ -181,6 +181,16 @@ class Registrations:
         wish = self._of_agent.get(agent, {}).get((node_type, node_name))
         return wish.node if wish else None
 
+    def registered(self, agent: AgentKey, node_type: int, node_name: str, robot_id: int) -> bool:
+        """Whether an agent registered a node on this robot, by its id or its group."""
+        wish = self._of_agent.get(agent, {}).get((node_type, node_name))
+        return wish is not None and wish.covers(robot_id, self._seen.get(robot_id, 0))
+
+    def where(self, agent: AgentKey, node_type: int, node_name: str) -> tuple[list[int], list[int]]:
+        """The robots and groups on which an agent registered a node."""
+        wish = self._of_agent.get(agent, {}).get((node_type, node_name))
+        return (list(wish.robot_ids), list(wish.groups)) if wish is not None else ([], [])
+
     def refused(self, task: Task, holder: AgentKey) -> None:
         """A robot refused a registration because another agent has the node."""
         wish = self._find(task.node)

@@ -215,6 +215,15 @@ class Frame:
         """The data part of the message, of the first frame."""
         return memoryview(self.data)[self._body_at : self._size]
 
+    def carries(self, beginning: bytes) -> bool:
+        """Whether the data of each frame begins like this, and goes on."""
+        data, size, at = self.data, self._size, self._body_at
+        if size - at <= len(beginning):
+            return False
+        if len(data) == size:
+            return data.startswith(beginning, at)
+        return all(data.startswith(beginning, start + at) for start in range(0, len(data), size))
+
     def check(self) -> None:
         """Raise BadSizes unless the sizes inside the message add up, TooLong when its metadata is more than any needs.
         A frame that fails must never be forwarded."""

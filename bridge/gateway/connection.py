@@ -12,23 +12,30 @@ import termios
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from typing import Protocol, cast
 
 from macs_zenoh.addresses import joined, of_peer
 from macs_zenoh.budget import Toll
+from macs_zenoh.existing import Asked, Verdict, to_headset, to_newer, to_robot
 from macs_zenoh.limits import REQUESTS_PER_S
-from macs_zenoh.messages import AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
+from macs_zenoh.messages import ROS, AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
 from macs_zenoh.peer import Event, Joined, Left, Peer, Rejected, Sent, State
 from macs_zenoh.queues import Chunk, Outbox
-from macs_zenoh.wire import FrameDecoder, encode_message
+from macs_zenoh.robot_nodes import RobotNodes
+from macs_zenoh.wire import FrameDecoder, Header, encode_message
 
 from .brake import Brake
 from .shortcut import Shortcut
-from .told import Told
 
 log = logging.getLogger("macs.gateway")
+
+LAST_TYPES = 4096
+"""Of how many names of nodes it is remembered which type the agent last had."""
+
+VERDICTS = 1024
+"""How many metadata are remembered per connection as already judged."""
 
 WRITE_BUFFER_BYTES = 256 << 10
 """What the transport may hold before messages wait in the outbox, where a call can still overtake topic data."""
@@ -70,11 +77,16 @@ class Owner(Protocol):
     def stream_depth(self, connection: Connection, node: str) -> tuple[int, bool]:
         """How many messages of a node may wait, and whether new ones are dropped rather than old ones."""
 
+    def registered_there(self, connection: Connection, metadata: Metadata) -> bool:
+        """Whether the agent registered a message's node on the robot that sends it."""
+
 
 class Connection(asyncio.BufferedProtocol):
     """A TCP agent's socket. Everything it means is decided in `Peer` and by its gateway."""
 
-    def __init__(self, owner: Owner, *, outbox_bytes: int, stall_s: float) -> None:
+    def __init__(
+        self, owner: Owner, *, outbox_bytes: int, stall_s: float, robot_packages: Collection[str] = ()
+    ) -> None:
         self.owner = owner
         self.peer: Peer
         self.greeted = False
@@ -97,8 +109,14 @@ class Connection(asyncio.BufferedProtocol):
         self._nodes: dict[str, set[int]] = {}
         self.node_count = 0
         """How many interface nodes the agent has, by type and name."""
-        self.told = Told()
-        """What a robot program was told."""
+        self._last_types: dict[str, int] = {}
+        """An existing headset keeps its nodes by name: of two types under one name it has the last."""
+        self._verdicts: dict[Metadata, Verdict] = {}
+        self.existing = True
+        """Whether the agent is an existing program, which gets only what those are known to survive."""
+        self.asked = Asked()
+        self.robot_nodes = RobotNodes(robot_packages)
+        """Of a robot program: what it was told."""
         self._refused = False
         self._pauses = 0
         self._spent_s = 0.0
@@ -219,6 +237,9 @@ class Connection(asyncio.BufferedProtocol):
                 elif isinstance(event, Left):
                     self.close(event.reason)
                 else:
+                    if isinstance(event, Joined):
+                        self.existing = not self.peer.extensions
+                        self._verdicts.clear()
                     self.owner.handle(self, event)
                     if isinstance(event, Joined):
                         self._schedule()  # from now on silence counts, which may be less than what the handshake has
@@ -297,6 +318,11 @@ class Connection(asyncio.BufferedProtocol):
         types = self._nodes.setdefault(node_name, set())
         self.node_count += node_type not in types
         types.add(node_type)
+        self._last_types.pop(node_name, None)
+        self._last_types[node_name] = node_type
+        if len(self._last_types) > LAST_TYPES:
+            del self._last_types[next(iter(self._last_types))]
+        self._verdicts.clear()
         if node_type == NodeType.SUBSCRIBER and self._shortcut is None and not self._transport.is_closing():
             with suppress(OSError):  # without it topics take the usual way
                 self._shortcut = Shortcut(self._transport.get_extra_info("socket"))
@@ -312,12 +338,42 @@ class Connection(asyncio.BufferedProtocol):
         types.discard(node_type)
         if not types:
             self._nodes.pop(node_name, None)
+        self._verdicts.clear()
 
-    def takes(self, metadata: Metadata) -> bool:
-        """Whether a node's message can be sent: an existing headset goes deaf for good on a message under the name
-        of one of its nodes that has another type."""
-        types = self._nodes.get(metadata.node_name)
-        return types is None or metadata.node_type in types
+    def verdict(self, metadata: Metadata) -> Verdict:
+        """Whether a message with this metadata may be sent, and what its data must be."""
+        verdict = self._verdicts.get(metadata)
+        if verdict is None:
+            verdict = self._judge(metadata)
+            if verdict.stays:
+                if len(self._verdicts) >= VERDICTS:
+                    self._verdicts.clear()
+                self._verdicts[metadata] = verdict
+        return verdict
+
+    def _judge(self, metadata: Metadata) -> Verdict:
+        if not self.existing:
+            return to_newer(metadata, self._nodes)
+        if self.peer.agent_type == ROS:
+            node = self.robot_nodes.find(metadata.node_type, metadata.node_name)
+            return to_robot(metadata, node, self.asked)
+        registered_there = bool(metadata.node_name) and self.owner.registered_there(self, metadata)
+        return to_headset(metadata, self._last_types, self.asked, registered_there=registered_there)
+
+    def asks(self, metadata: Metadata, header: Header) -> None:
+        """The agent sends a request to others, which they may answer."""
+        self.asked.note(metadata, header)
+        if not metadata.node_name:
+            self._verdicts.clear()  # from now on a plain message may be the answer
+
+    def nodes_change(self) -> None:
+        """A robot program is told of another node, or of the end of one: judge anew."""
+        self._verdicts.clear()
+
+    def other_type(self, node: AddNode) -> int | None:
+        """The type that this node's name had until now, if it is another one."""
+        before = self._last_types.get(node.node_name, node.node_type)
+        return None if before == node.node_type else before
 
     def has(self, metadata: Metadata) -> bool:
         """Whether the agent registered the node of this name and type itself."""
@@ -326,7 +382,8 @@ class Connection(asyncio.BufferedProtocol):
     def tell_gone(self, gone: list[GoneAgent]) -> None:
         """Tell a robot program that these have left, if there are any."""
         if gone:
-            self.told.untell(gone)
+            self.robot_nodes.gone(gone)
+            self.nodes_change()
             metadata = Metadata(message_manager=AgentsGone.manager)
             self.send_call(encode_message(metadata.encode(), encode_data(AgentsGone(gone))))
             self.flush()

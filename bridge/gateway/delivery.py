@@ -1,7 +1,7 @@
 """From the mesh to TCP agents: who of ours gets a sample, and that nothing reaches them that would harm them.
 
-Some existing headsets go deaf for good on metadata that is empty or no JSON, or on sizes that do not add up. So every
-sample is checked here again, whoever put it.
+Existing programs go deaf for good on much that is legal (`macs_zenoh.existing`), and on metadata that is none and
+sizes that do not add up. So every sample is checked here again, whoever put it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from macs_zenoh.directory import Directory
 from macs_zenoh.errors import WireError
+from macs_zenoh.existing import CDR, PASS, Data, Verdict, fitting, readable, refuses, topic_data
 from macs_zenoh.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue, type_name
 from macs_zenoh.mesh import Payload, Sample
 from macs_zenoh.messages import ROS, Metadata, NodeType, StreamData, correct_sender, decode_management
@@ -21,6 +22,7 @@ from macs_zenoh.wire import Frame, Layout, is_probe, parse_frame, parse_frames
 
 from .agents import Agents
 from .connection import Connection
+from .stead import Stead
 
 log = logging.getLogger("macs.gateway")
 
@@ -68,12 +70,14 @@ class Delivery:
 
     ``drops`` counts ``bad_frame``, ``nobody_with_this_id``, ``not_registered`` (topic data for an agent that did not
     register it on this robot, or has just taken that back) and ``wrong_sender``, which is put right and delivered.
+    What an agent must not get is counted at its connection.
     """
 
-    def __init__(self, agents: Agents, directory: Directory, layout: Layout) -> None:
+    def __init__(self, agents: Agents, directory: Directory, layout: Layout, stead: Stead) -> None:
         self.drops: Counter[str] = Counter()
         self._agents = agents
         self._directory = directory
+        self._stead = stead
         self._layout = layout
         self.streams: dict[str, Stream] = {}
         """By their keys."""
@@ -97,7 +101,7 @@ class Delivery:
                 continue
             connection, sender = target
             for frame, metadata in self._read(key, payload, sender):
-                self._send(connection, frame, metadata)
+                self._send(connection, frame, metadata, by_id=True)
             if connection.congested:
                 self._hold_sender(sender, [connection])
         self.flush()
@@ -145,10 +149,12 @@ class Delivery:
                     if connection is None:
                         continue
                     if registrant in registered:
-                        connection.send_stream(stream.node, frame.messages)
-                    elif self._may_have(connection, frame, metadata):
-                        # a forged list; or the frame is older than the agent, which has another's id
-                        self.drops["not_registered"] += frame.count
+                        if connection.existing and not frame.carries(CDR):
+                            self._send_fitting(connection, frame, metadata, topic_data(metadata), stream.node)
+                        else:
+                            connection.send_stream(stream.node, frame.messages)
+                    else:
+                        self._unregistered(connection, frame, metadata)
         self.flush()
 
     def stream_at_once(self, key: str, payload: Payload) -> bool:
@@ -187,7 +193,9 @@ class Delivery:
             return None
         if len(self._seen) >= SEEN:
             self._seen.clear()
-        seen = self._seen[key, len(payload)] = Seen(frame.beginning, frame.message_at, registrants)
+        if not frame.carries(CDR):
+            return None
+        seen = self._seen[key, len(payload)] = Seen(frame.beginning + CDR, frame.message_at, registrants)
         return seen
 
     def dirty(self, connection: Connection) -> None:
@@ -204,17 +212,57 @@ class Delivery:
         """Agents came or went: look keys up anew."""
         self._targets.clear()
 
-    def _send(self, connection: Connection, frame: Frame, metadata: Metadata) -> None:
-        if self._may_have(connection, frame, metadata):
+    def _send(self, connection: Connection, frame: Frame, metadata: Metadata, *, by_id: bool = False) -> None:
+        verdict = connection.verdict(metadata)
+        if verdict is PASS:
             connection.send_calls(frame.messages)
+        elif verdict.name:
+            self._refuse(connection, frame, metadata, verdict, by_id=by_id)
+        elif verdict.answers:
+            connection.asked.answered(metadata)
+            if connection.existing and not metadata.request_id and refuses(frame):
+                return  # what is not meant as a question has number 0 as well, and then the next question may have it
+            self._send_fitting(connection, next(iter(frame.each())), metadata, verdict.data)
+        else:
+            self._send_fitting(connection, frame, metadata, verdict.data)
 
-    def _may_have(self, connection: Connection, frame: Frame, metadata: Metadata) -> bool:
-        if not metadata.node_name or connection.takes(metadata):
-            return True
-        name = f"{metadata.node_name[:80]} of type {metadata.node_type}"
-        problem = f"a message for its node {name}, which has another type there"
-        connection.complain("wrong_node_type", problem, frame.count)
-        return False
+    def _refuse(
+        self, connection: Connection, frame: Frame, metadata: Metadata, verdict: Verdict, *, by_id: bool
+    ) -> None:
+        if connection.existing and connection.peer.agent_type == ROS:
+            singles = frame.each() if metadata.message_manager else ()  # each question of a run is answered
+            answered = [self._stead.answered(connection, metadata, verdict.why, by_id=by_id) for _ in singles]
+            if answered and all(answered):
+                return
+        connection.complain(verdict.name, f"{verdict.why} (sent by {_who(metadata)})", frame.count)
+
+    def _send_fitting(
+        self, connection: Connection, frame: Frame, metadata: Metadata, data: Data, stream: str | None = None
+    ) -> None:
+        """Send what has data that the agent survives; with ``stream`` as topic data of that node."""
+        messages, others = fitting(frame, data)
+        if others:
+            about = metadata.node_name[:80] or "a request"
+            problem = f"data for {about} that is not {data.value} (sent by {_who(metadata)})"
+            connection.complain("not_survived", problem, others)
+        if not messages:
+            return
+        if stream is None:
+            connection.send_calls(messages)
+        else:
+            connection.send_stream(stream, messages)
+
+    def _unregistered(self, connection: Connection, frame: Frame, metadata: Metadata) -> None:
+        """Topic data for who did not register it there: a forged list; or it is older than the agent, which has
+        another's id."""
+        verdict = connection.verdict(metadata)
+        if verdict.name == "wrong_node_type":
+            connection.complain(verdict.name, verdict.why, frame.count)
+            return
+        if not self.drops["not_registered"]:
+            problem = "%s lists %s as a receiver of %s, registered nowhere (logged once, counted as not_registered)"
+            log.warning(problem, _who(metadata), connection, metadata.node_name[:80])
+        self.drops["not_registered"] += frame.count
 
     def _find(self, key: str) -> tuple[Connection, AgentKey] | None:
         """Who of ours a frame is for, and who sent it."""
@@ -290,10 +338,12 @@ class Delivery:
             # written as we write it, there is nothing in it that another reader may take for the sender
             if named != sender or metadata.encode() != raw:
                 true = correct_sender(raw, *sender)
+                if true is not raw and named != sender:
+                    self._wrong_sender(key, named, frame.count)
+                if not readable(true):
+                    true = metadata.sent_by(*sender).encode()
                 if true is not raw:
-                    if named != sender:
-                        self._wrong_sender(key, named, frame.count)
-                    return frame.with_metadata(true), Metadata.decode(true)
+                    return frame.with_metadata(true), metadata.sent_by(*sender)
         except WireError as error:
             self._bad(key, error)
             return None
@@ -314,6 +364,10 @@ class Delivery:
         self.drops["bad_frame"] += 1
         if self.drops["bad_frame"] == 1:
             log.warning("a frame on %s cannot be used: %s (logged once, counted as bad_frame)", key, error)
+
+
+def _who(metadata: Metadata) -> str:
+    return f"{type_name(metadata.sender_agent_type or 0)}/{metadata.sender_agent_id}"
 
 
 def _sender(fields: dict[str, FieldValue]) -> AgentKey:

@@ -1,15 +1,18 @@
-"""What is declared on the mesh for one TCP agent alone: the inbox of every agent that is no headset, and for existing
-robot programs the calls that register interface nodes. Headsets share their gateway's block."""
+"""What is declared on the mesh for one TCP agent alone: the inbox of every agent that is no headset, and for robot
+programs the calls. Headsets share their gateway's block.
+
+A registration is passed on as the message that existing robots know, which they never answer, if they survive it;
+other calls are answered in their stead.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
 
 from msgspec import UNSET, structs
 
 from macs_zenoh.directory import Directory
-from macs_zenoh.errors import HeldByAnother, Refused
+from macs_zenoh.errors import Refused
 from macs_zenoh.keyexpr import CALL
 from macs_zenoh.mesh import Mesh, Subscription
 from macs_zenoh.messages import ROS, UNITY, AddNode, GoneAgent, Metadata, RemoveNode, decode_data, encode_data
@@ -20,6 +23,9 @@ from macs_zenoh.wire import Layout, encode_message, parse_frame
 from .agents import Agents
 from .connection import Connection
 from .delivery import Delivery
+from .stead import Stead
+
+REGISTRATIONS: dict[str, type[AddNode | RemoveNode]] = {"add_node": AddNode, "remove_node": RemoveNode}
 
 UNSEEN_S = 3.0
 """How long a registrant may not be seen online: news of a token and a call take the same way."""
@@ -28,12 +34,15 @@ UNSEEN_S = 3.0
 class OwnKeys:
     """By (type, id), from an agent's configuration to its end."""
 
-    def __init__(self, mesh: Mesh, agents: Agents, directory: Directory, delivery: Delivery, layout: Layout) -> None:
+    def __init__(
+        self, mesh: Mesh, agents: Agents, directory: Directory, delivery: Delivery, layout: Layout, stead: Stead
+    ) -> None:
         self._mesh = mesh
         self._agents = agents
         self._directory = directory
         self._delivery = delivery
         self._layout = layout
+        self._stead = stead
         self._declared: dict[AgentKey, list[Subscription]] = {}
 
     def declare(self, connection: Connection) -> None:
@@ -43,9 +52,8 @@ class OwnKeys:
             return
         declared = [self._mesh.subscribe(inbox(kind, agent_id), self._delivery.inbox)]
         if kind == ROS:
-            for verb, message in (("add_node", AddNode), ("remove_node", RemoveNode)):
-                calls = CALL.every(type=ROS, id=agent_id, verb=verb)
-                declared.append(self._mesh.serve(calls, self._pass_on(connection, message)))
+            calls = CALL.every(type=ROS, id=agent_id)
+            declared.append(self._mesh.serve(calls, lambda key, payload: self._called(connection, key, payload)))
         self._declared[connection.key] = declared
 
     def undeclare(self, agent: AgentKey) -> None:
@@ -58,32 +66,37 @@ class OwnKeys:
         for agent in list(self._declared):
             self.undeclare(agent)
 
-    def _pass_on(
-        self, connection: Connection, kind: type[AddNode | RemoveNode]
-    ) -> Callable[[str, bytes], Awaitable[bytes]]:
-        """Registrations for an existing robot program: passed on as the message it knows, which it never answers."""
+    async def _called(self, robot: Connection, key: str, payload: bytes) -> bytes:
+        fields = CALL.parse(key)
+        if fields is None or self._agents.find(*robot.key) is not robot:
+            raise Refused("the robot is not connected")
+        verb, caller = str(fields["verb"]), (int(fields["from_type"]), int(fields["from_id"]))
+        kind = REGISTRATIONS.get(verb)
+        if kind is None:
+            return self._stead.call(robot, verb)
+        node = decode_data(kind, parse_frame(payload, self._layout).body)
+        check_own(node, caller)
+        self._register(robot, node)
+        return b""
 
-        async def deliver(key: str, payload: bytes) -> bytes:
-            fields = CALL.parse(key)
-            if fields is None or self._agents.find(*connection.key) is not connection:
-                raise Refused("the robot is not connected")
-            caller = (int(fields["from_type"]), int(fields["from_id"]))
-            node = decode_data(kind, parse_frame(payload, self._layout).body)
-            check_own(node, caller)
-            if isinstance(node, AddNode):
-                node = structs.replace(node, unity_cdr=UNSET)  # a robot program passes CDR on as it is
-            if isinstance(node, AddNode) and (holder := connection.told.holder(node)) is not None:
-                raise HeldByAnother(f"{node.tos_name[:80]} is already registered by another agent", holder)
-            if not connection.told.tell(node):
-                return b""  # it has that node already
-            self._expect(connection, caller)
-            metadata = Metadata(*caller, message_manager=kind.manager)
-            # written anew: a robot program reads of it what was judged here, however it takes keys named twice
-            connection.send_call(encode_message(metadata.encode(), encode_data(node)))
-            self._delivery.flush()
-            return b""
-
-        return deliver
+    def _register(self, robot: Connection, node: AddNode | RemoveNode) -> None:
+        """Tell a robot of a registration or its end. Raises Refused for what it would not survive."""
+        if isinstance(node, AddNode):
+            node = structs.replace(node, unity_cdr=UNSET)  # a robot program passes CDR on as it is
+        known, offered = robot.robot_nodes, robot.peer.functionality
+        if isinstance(node, AddNode):
+            to_tell = known.add(node, offered, existing=robot.existing)
+        else:
+            to_tell = known.remove(node)
+        if not to_tell:
+            return
+        robot.nodes_change()
+        caller = (node.registrant_agent_type, node.registrant_agent_id)
+        self._expect(robot, caller)
+        metadata = Metadata(*caller, message_manager=node.manager)
+        # written anew: a robot program reads of it what was judged here, however it takes keys named twice
+        robot.send_call(encode_message(metadata.encode(), encode_data(node)))
+        self._delivery.flush()
 
     def _expect(self, robot: Connection, registrant: AgentKey) -> None:
         """Whoever registers on a robot program is online now or soon. One who left while that was on its way never

@@ -119,6 +119,15 @@ class RobotCalls:
         """What an agent registered on a node."""
         return self._registrations.find(agent, node_type, node_name)
 
+    def registered(self, agent: AgentKey, metadata: Metadata, robot_id: int) -> bool:
+        """Whether an agent registered a message's node on this robot."""
+        return self._registrations.registered(agent, metadata.node_type, metadata.node_name, robot_id)
+
+    def take_back_all(self, agent: AgentKey, node_type: int, node_name: str) -> None:
+        """An agent has a node of another type under this name now: take its registrations of the former back."""
+        where = self._registrations.where(agent, node_type, node_name)
+        self.register(RemoveNode(*agent, node_type, node_name), *where)
+
     def presence(self, change: Change) -> None:
         """A robot that comes, comes back or changes its group is told everything that is registered for it, and what
         it has to take back of a group that it has left. Where a headset has left, another may have its place."""

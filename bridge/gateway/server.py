@@ -23,6 +23,7 @@ from macs_zenoh.config import GatewaySettings
 from macs_zenoh.credit import Credits
 from macs_zenoh.directory import Change
 from macs_zenoh.errors import Refused, Unreachable
+from macs_zenoh.existing import asks
 from macs_zenoh.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
 from macs_zenoh.limits import NODES_EACH, NODES_IN_ALL, NODES_PER_ADDRESS
 from macs_zenoh.managers import Asker, Managers
@@ -66,6 +67,7 @@ from .own_keys import OwnKeys
 from .renumbering import Renumbering
 from .robots import RobotCalls, StreamChanges
 from .routes import Route, Routes
+from .stead import Stead
 from .waiting import NAMED_S, WaitingRoom
 
 log = logging.getLogger("macs.gateway")
@@ -134,8 +136,9 @@ class Gateway:
         mesh.on_room(self._brake.release)
         self.directory = self._presence.directory
         """Who is online."""
-        self._delivery = Delivery(self.agents, self.directory, self._layout)
-        self._own_keys = OwnKeys(mesh, self.agents, self.directory, self._delivery, self._layout)
+        stead = Stead(mesh, self._layout)
+        self._delivery = Delivery(self.agents, self.directory, self._layout, stead)
+        self._own_keys = OwnKeys(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
         self._leases = Leases(
             mesh,
             settings.block,
@@ -237,7 +240,13 @@ class Gateway:
     # -- connections ---------------------------------------------------------------------------------------------
 
     def _connection(self) -> Connection:
-        return Connection(self, outbox_bytes=self.settings.outbox_bytes, stall_s=self.settings.stall_s)
+        settings = self.settings
+        return Connection(
+            self,
+            outbox_bytes=settings.outbox_bytes,
+            stall_s=settings.stall_s,
+            robot_packages=settings.robot_packages,
+        )
 
     def opened(self, connection: Connection) -> bool:
         """Let a connection in, or not. It is greeted at once, or as soon as there is an id for it."""
@@ -334,6 +343,11 @@ class Gateway:
         registered = self._robots.find(connection.key, NodeType.SUBSCRIBER, node)
         return (registered.buffer_size, registered.drop_new) if registered else (10, False)
 
+    def registered_there(self, connection: Connection, metadata: Metadata) -> bool:
+        """Whether an agent registered a message's node on the robot that sends it."""
+        sender = metadata.sender_agent_type, metadata.sender_agent_id
+        return sender[0] == ROS and self._robots.registered(connection.key, metadata, int(sender[1] or 0))
+
     def dirty(self, connection: Connection) -> None:
         """A connection has messages to flush."""
         self._delivery.dirty(connection)
@@ -360,7 +374,10 @@ class Gateway:
             if agent not in self.directory:
                 problem = f"a message goes to {type_name(agent[0])}/{agent[1]}, not online"
                 connection.complain("unknown_agent", problem, frame.count)
-        traffic = COMMAND if sent.metadata.node_type == PUBLISHER else CALL
+        metadata = sent.metadata
+        traffic = COMMAND if metadata.node_type == PUBLISHER else CALL
+        if traffic is CALL and (metadata.node_type or metadata.message_manager) and asks(metadata):
+            connection.asks(metadata, frame.header)
         if route.limited:
             self._put_run()
             for single in frame.each():
@@ -423,6 +440,9 @@ class Gateway:
                 connection.complain("too_many_nodes", why)
                 self._robots.refuse(node, next(iter(event.robot_ids), 0), why)
                 return
+            if connection.existing and (other := connection.other_type(node)) is not None:
+                self._robots.take_back_all(connection.key, other, node.node_name)
+                connection.unregistered(node.node_name, other)
             connection.registered(node.node_name, node.node_type)
             if not connection.peer.extensions:  # an existing program, which cannot say it itself
                 node = structs.replace(node, unity_cdr=True)
@@ -538,7 +558,8 @@ class Gateway:
             metadata = Metadata(message_manager=AgentsGone.manager)
             message = encode_message(metadata.encode(), encode_data(AgentsGone(gone)))
             for connection in self.agents.online():
-                connection.told.untell(gone)
+                connection.robot_nodes.gone(gone)
+                connection.nodes_change()
                 connection.send_call(message)
             self._delivery.flush()
         for change in changes:

@@ -30,7 +30,7 @@ from types import TracebackType
 import msgspec
 
 from macs_zenoh.addresses import joined
-from macs_zenoh.errors import CallTimeout, Unreachable, UsageError, WireError
+from macs_zenoh.errors import CallTimeout, Refused, Unreachable, UsageError, WireError
 from macs_zenoh.limits import ANSWER_BYTES
 from macs_zenoh.messages import (
     BROADCAST,
@@ -41,6 +41,7 @@ from macs_zenoh.messages import (
     NodeRefused,
     NodeType,
     OnlineReply,
+    Refusal,
     Welcome,
     decode_data,
     node_name,
@@ -356,8 +357,8 @@ class Headset:
     async def ask(self, robot: int, manager: str, data: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
         """Ask a robot something that is no interface node, and return its answer's data (see docs/robot.md).
 
-        ``manager`` says what: ``FunctionalityGetter``, ``RobotStatus``, ``RobotControl``. Raises CallTimeout, also
-        when the robot is an existing program, or Unreachable.
+        ``manager`` says what: ``FunctionalityGetter``, ``RobotStatus``, ``RobotControl``. Raises CallTimeout,
+        Unreachable, or Refused, as when an existing robot program does not know what it is asked.
         """
         request_id = self._next_request
         self._next_request = (request_id + 1) % REQUEST_IDS
@@ -365,7 +366,10 @@ class Headset:
         self._asked[robot, request_id] = answer
         try:
             await self.send(data, to=ROS, ids=(robot,), manager=manager, request_id=request_id)
-            return await asyncio.wait_for(answer, timeout_s)
+            answered: bytes = await asyncio.wait_for(answer, timeout_s)
+            if answered.startswith(b'{"refused"'):
+                raise Refused(decode_data(Refusal, answered).refused)
+            return answered
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"{manager} of robot {robot}", timeout_s) from error
         finally:

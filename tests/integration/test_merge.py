@@ -23,6 +23,7 @@ from bridge.headset.nodes import Incoming, Subscription
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import GatewaySettings, MeshSettings, TrafficRule, changed
 from macs_zenoh.directory import Directory
+from macs_zenoh.existing import CDR
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.messages import (
     ROS,
@@ -549,8 +550,11 @@ async def test_a_robot_program_keeps_its_id_unless_another_has_it(sites: Sites) 
         assert decode_data(AgentsGone, gone.data).agents == [GoneAgent(UNITY, 3)]
         first.send(b"hello", [257])
         assert (await next_with(headset, b"hello")).sender_id == 256
-        await headset.send(b"to it", to=ROS, ids=[256])
-        assert (await first.until(b"to it")).metadata.sender_agent_id == 257
+        await headset.advertise("/talk", "std_msgs/String", agents=[256])
+        while (await first.next()).metadata.message_manager != AddNode.manager:
+            pass
+        await headset.publish("/talk", "std_msgs/String", CDR + b"to it", agents=[256])
+        assert (await first.until(CDR + b"to it")).metadata.sender_agent_id == 257
 
 
 async def test_parting_again_while_ids_change(sites: Sites) -> None:

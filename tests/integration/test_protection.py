@@ -11,6 +11,7 @@ import pytest
 import macs_zenoh
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import NotServed, Refused
+from macs_zenoh.existing import CDR
 from macs_zenoh.keyexpr import BROADCAST, GROUP
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.messages import (
@@ -202,9 +203,9 @@ async def test_topic_data_stops_when_the_registration_does(
         await left.online()
         metadata = Metadata(ROS, 7, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__chatter", "std_msgs/String")
         management = encode_management(StreamData({"2": [left.id, stays.id]}))
-        message = encode_message(metadata.encode(), b"text")
+        message = encode_message(metadata.encode(), CDR + b"text")
         robot.publish_stream("nd__chatter", encode_frame(ROS, management=management, message=message))
-        assert (await stays.message())[1] == b"text"
+        assert (await stays.message())[1] == CDR + b"text"
         robot.broadcast(b"next")
         assert (await left.message())[1] == b"next"
         assert gateway.drops == {"not_registered": 1}

@@ -18,6 +18,7 @@ from bridge.gateway.connection import Connection
 from bridge.headset import frames
 from bridge.headset.frames import NodeSpec
 from macs_zenoh import Agent, join
+from macs_zenoh.existing import CDR
 from macs_zenoh.messages import Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.peer import Peer
 from macs_zenoh.queues import Chunk, Outbox
@@ -38,14 +39,14 @@ def event_loop_policy(request: pytest.FixtureRequest) -> asyncio.AbstractEventLo
 
 
 def number(data: bytes) -> int:
-    """What numbered data begins with."""
-    return int.from_bytes(data[:4], "big")
+    """What numbered data begins with, behind the header of ROS data."""
+    return int.from_bytes(data[4:8], "big")
 
 
 def image(registrants: list[int], i: int, size: int) -> bytes:
     """A frame of a robot's topic with a numbered message."""
     metadata = Metadata(1, 7, 0, StreamData.manager, NodeType.SUBSCRIBER, TOPIC.name, "sensor_msgs/Image")
-    data = i.to_bytes(4, "big") * (size // 4)
+    data = CDR + i.to_bytes(4, "big") * (size // 4 - 1)
     management = encode_management(StreamData({"2": registrants}))
     return encode_frame(1, management=management, message=encode_message(metadata.encode(), data))
 
@@ -139,7 +140,7 @@ async def test_a_headset_that_reads_late_gets_whole_messages(
     got: list[bytes] = []
     while not got or number(got[-1]) < count - 1:
         got += [data for metadata, data in await asyncio.to_thread(slow.read) if IMAGE in metadata]
-    assert all(data == data[:4] * (len(data) // 4) for data in got)
+    assert all(data == CDR + data[4:8] * (len(data) // 4 - 1) for data in got)
     numbers = [number(data) for data in got]
     assert numbers == sorted(set(numbers))
     assert len(numbers) + sum(gateway.drops.values()) + sum(_drops(gateway).values()) == count
@@ -186,7 +187,7 @@ async def test_both_ways_into_one_socket_keep_messages_apart(
     await tasks
     topic = [data for metadata, data in seen if IMAGE in metadata]
     answers = [data for metadata, data in seen if IMAGE not in metadata]
-    assert all(data == data[:4] * (len(data) // 4) for data in topic)
+    assert all(data == CDR + data[4:8] * (len(data) // 4 - 1) for data in topic)
     assert [number(data) for data in topic] == sorted({number(data) for data in topic})
     assert len(answers) > 20
     assert all(answer.startswith(b"{") for answer in answers)
