@@ -7,9 +7,12 @@ import logging
 import time
 from collections.abc import Callable
 
+from bridge.doctor.below import tls_settings
+from bridge.doctor.look import at, endpoints_of
+from macs_zenoh.addresses import is_local, of_endpoint
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
-from macs_zenoh.mesh import Mesh
+from macs_zenoh.mesh import Mesh, configuration
 
 log = logging.getLogger("macs.router")
 
@@ -19,6 +22,22 @@ ANSWER_S = 2.0
 FORGOTTEN_S = 0.3
 """How long a router is away that starts again: other routers have to notice."""
 AGAIN_S = 1.0
+
+
+def open_to_anybody(settings: MeshSettings) -> list[str]:
+    """The endpoints that others than this machine reach, and where nobody has to show who he is."""
+    zenoh = configuration(settings)
+    passwords = at(zenoh, "transport/auth/usrpwd/dictionary_file")
+    if passwords or at(zenoh, "access_control/enabled"):
+        return []
+    found = []
+    for endpoint in endpoints_of(zenoh, "listen"):
+        protocol, where = endpoint.partition("/")[0], of_endpoint(endpoint)
+        mutual = tls_settings(endpoint, at(zenoh, "transport/link/tls") or {}).get("enable_mtls") in (True, "true")
+        proven = protocol in ("tls", "quic") and mutual
+        if where is not None and not is_local(where.host) and not proven:
+            found.append(endpoint)
+    return found
 
 
 async def serve(settings: MeshSettings, *, on_ready: Callable[[], None]) -> None:

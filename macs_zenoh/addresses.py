@@ -78,6 +78,14 @@ def of_peer(host: str) -> str:
     return mapped if mapped != host.lower() and "." in mapped else host
 
 
+def is_local(host: str) -> bool:
+    """Whether only programs of this machine reach what listens on a host."""
+    try:
+        return ipaddress.ip_address(host.partition("%")[0]).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 def reachable(host: str) -> str:
     """Where a program of this machine reaches what listens on ``host``."""
     return "127.0.0.1" if host in EVERYWHERE else host

@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 from msgspec import Struct, structs
 
+from . import greetings
 from .credit import Credit
 from .errors import BadField, BadJson, NotAllowed, TooFast, UnknownManager, WireError
 from .limits import (
@@ -217,6 +218,11 @@ class Peer:
         later one as its new id, and answers again."""
         metadata = Metadata(request_id=self.connection_number, message_manager=Welcome.manager)
         return encode_message(metadata.encode(), encode_data(Welcome(agent_id=self.agent_id)))
+
+    @property
+    def dials_a_router(self) -> bool:
+        """Whether this is a Zenoh program that has come to the wrong port."""
+        return greetings.begins_as_client(self._decoder.begun_header)
 
     @property
     def partial_bytes(self) -> int:

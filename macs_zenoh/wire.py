@@ -421,6 +421,11 @@ class FrameDecoder:
         return self._filled or len(self._partial)
 
     @property
+    def begun_header(self) -> bytes:
+        """What has come of a header that is not whole."""
+        return b"" if self._wanted else bytes(self._partial)
+
+    @property
     def partial_bytes(self) -> int:
         """How much memory a frame that has begun has."""
         return len(self._partial)

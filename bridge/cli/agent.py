@@ -36,7 +36,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 async def _serve(settings: Settings, ros_args: list[str]) -> int:
+    from bridge.doctor.first import told_while_waiting
     from bridge.ros import agent
 
-    await agent.run(settings, ros_args=ros_args, on_ready=lambda robot: running.say_ready(f"robot {robot.id}"))
+    await agent.run(
+        settings,
+        ros_args=ros_args,
+        on_waiting=told_while_waiting(settings.mesh),
+        on_ready=lambda robot: running.say_ready(f"robot {robot.id}"),
+    )
     return 0

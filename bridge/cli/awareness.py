@@ -51,6 +51,13 @@ def run(args: argparse.Namespace) -> int:
 
 async def _serve(settings: Settings, ros_args: list[str], *, autostart: bool) -> int:
     from bridge.awareness import gateway
+    from bridge.doctor.first import told_while_waiting
 
-    await gateway.run(settings, ros_args=ros_args, autostart=autostart, on_ready=running.say_ready)
+    await gateway.run(
+        settings,
+        ros_args=ros_args,
+        autostart=autostart,
+        on_waiting=told_while_waiting(settings.mesh),
+        on_ready=running.say_ready,
+    )
     return 0

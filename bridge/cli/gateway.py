@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import logging
 import resource
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -19,9 +20,11 @@ from contextlib import contextmanager, suppress
 from bridge.cli import options, running
 from bridge.cli.children import Child, stop_in_order
 from bridge.listening import bound
-from macs_zenoh.addresses import joined
+from macs_zenoh.addresses import is_local, joined
 from macs_zenoh.config import GatewaySettings, Settings, changed
 from macs_zenoh.errors import UsageError
+
+log = logging.getLogger("macs.gateway")
 
 SUMMARY = "where headsets connect over TCP"
 
@@ -109,16 +112,22 @@ def _raise_descriptor_limit() -> None:
 
 
 async def _serve(settings: Settings) -> int:
+    from bridge.doctor.first import told_while_waiting
     from bridge.gateway import Gateway
     from macs_zenoh import managers
     from macs_zenoh.mesh import Mesh
 
     _raise_descriptor_limit()
     own = managers.load(settings.gateway.managers)
-    async with await Mesh.open(settings.mesh, traffic=settings.traffic) as mesh:
+    waiting = told_while_waiting(settings.mesh)
+    async with await Mesh.open(settings.mesh, traffic=settings.traffic, on_waiting=waiting) as mesh:
         gateway = Gateway(mesh, settings.gateway, own)
         try:
             await gateway.start()
+            if not settings.gateway.allow and not is_local(settings.gateway.host):
+                log.warning(
+                    "%s is open: whoever reaches it is a headset; --allow says which networks", gateway.address
+                )
             running.say_ready(f"gateway on {gateway.address}")
             await asyncio.Event().wait()
         finally:

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
+USUALLY_S = 0.4
+"""Within so long a router has let us in, if one does."""
+
 WITHOUT_A_ROUTER = "(start one with `macs router`, or name it with -e; `macs doctor` looks closer)"
 
 
@@ -198,13 +201,40 @@ async def operator(settings: MeshSettings, caller: Caller, *, timeout_s: float) 
     from macs_zenoh.mesh import Mesh
 
     patience_s = timeout_s + max(0, len(settings.routers) - 1) * settings.open_limit_ms / 1000
+    opening = asyncio.create_task(Mesh.open(settings, on_waiting=lambda target: None, quiet=True))
     try:
-        mesh = await asyncio.wait_for(Mesh.open(settings, on_waiting=lambda target: None), patience_s)
-    except asyncio.TimeoutError:
-        target = ", ".join(settings.routers) or "a router"
-        raise Unreachable(target, f"no Zenoh router answered within {patience_s:g} s {WITHOUT_A_ROUTER}") from None
+        mesh = await _opened(opening, settings, patience_s)
+    finally:
+        opening.cancel()
     async with mesh:
         yield Operator(mesh, caller, timeout_s)
+
+
+async def _opened(opening: asyncio.Task[Mesh], settings: MeshSettings, patience_s: float) -> Mesh:
+    """The session, when a router lets us in; meanwhile it is found out why none does. Raises Unreachable."""
+    from bridge.doctor import first
+
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + patience_s
+    target = ", ".join(settings.routers) or "a router"
+    await asyncio.wait([opening], timeout=min(USUALLY_S, patience_s))
+    if opening.done():
+        return opening.result()
+    looking = loop.create_task(first.why(settings, timeout_s=min(first.STEP_S, patience_s)))
+    await asyncio.wait([opening, looking], timeout=deadline - loop.time(), return_when=asyncio.FIRST_COMPLETED)
+    if looking.done() and first.certain(looking.result(), len(settings.routers)):
+        opening.cancel()
+        raise Unreachable(target, first.sentence(looking.result()))
+    await asyncio.wait([opening], timeout=max(0.0, deadline - loop.time()))
+    if opening.done():
+        looking.cancel()
+        return opening.result()
+    await asyncio.wait([looking], timeout=first.STEP_S)
+    findings = looking.result() if looking.done() else []
+    looking.cancel()
+    if reasons := first.sentence(findings):
+        raise Unreachable(target, f"no Zenoh router answered within {patience_s:g} s: {reasons} {WITHOUT_A_ROUTER}")
+    raise Unreachable(target, f"no Zenoh router answered within {patience_s:g} s {WITHOUT_A_ROUTER}")
 
 
 def read(answer: bytes, kind: type[_T]) -> tuple[dict[str, Any], _T]:

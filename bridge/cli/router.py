@@ -3,6 +3,9 @@
 It is the same router as zenohd, without plugins. Any Zenoh program can connect to it, and a
 zenohd that runs already does as well: then no `macs router` is needed.
 
+Without -l it listens on every interface, as zenohd does, and without TLS and access rules anybody
+who reaches it sees all and drives robots: for networks that you trust (docs/security.md).
+
 examples:
   macs router
   macs router -l tcp/10.0.0.1:7447 -l tls/0.0.0.0:7448 -c tls.json5
@@ -11,11 +14,16 @@ examples:
 from __future__ import annotations
 
 import argparse
+import logging
 
 import msgspec
 
 from bridge.cli import options, running
 from macs_zenoh.config import EVERY_INTERFACE, MeshSettings, changed
+
+log = logging.getLogger("macs.router")
+
+KEPT_IN = "-l tcp/127.0.0.1:7447 keeps it to this machine, `macs security generate` says who may what"
 
 SUMMARY = "a Zenoh router, where robots and gateways meet"
 
@@ -32,8 +40,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 async def _serve(settings: MeshSettings) -> int:
-    from bridge.router import serve
+    from bridge.router import open_to_anybody, serve
 
-    of_file = f"the endpoints of {settings.config_file}" if settings.config_file else EVERY_INTERFACE
-    await serve(settings, on_ready=lambda: running.say_ready("router on " + (", ".join(settings.listen) or of_file)))
+    def ready() -> None:
+        for endpoint in open_to_anybody(settings):
+            log.warning("%s is open: whoever reaches it sees all and drives robots; %s", endpoint, KEPT_IN)
+        of_file = f"the endpoints of {settings.config_file}" if settings.config_file else EVERY_INTERFACE
+        running.say_ready("router on " + (", ".join(settings.listen) or of_file))
+
+    await serve(settings, on_ready=ready)
     return 0

@@ -11,9 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from macs_zenoh.addresses import of_endpoint
+from macs_zenoh import greetings
+from macs_zenoh.addresses import joined, of_endpoint
 
-from .facts import Certificate, Reach, Tls, TlsProblem
+from .facts import Certificate, Reach, Speaker, Tls, TlsProblem
 
 ALERT_S = 0.3
 """With TLS 1.3 a server refuses the client's certificate after the handshake: how much longer than that to listen."""
@@ -67,6 +68,28 @@ def speaks_tls(host: str, port: int, timeout_s: float) -> bool:
         return "ALERT" in (error.reason or "")
     except OSError:
         return False
+
+
+def answers(host: str, port: int, timeout_s: float) -> Speaker:
+    """Who is there, by what it answers to what a Zenoh program says first; a gateway does not wait for that."""
+    first = b""
+    try:
+        with socket.create_connection((host, port), timeout_s) as there:
+            there.sendall(greetings.INIT_SYN)
+            while len(first) < greetings.ENOUGH_BYTES and (more := there.recv(greetings.ENOUGH_BYTES)):
+                first += more
+                if greetings.is_gateway(first):
+                    return "gateway"
+                if greetings.is_zenoh(first):
+                    return "zenoh"
+    except OSError:
+        pass
+    return "other" if first else "silent"
+
+
+def router_beside(host: str, timeout_s: float) -> str:
+    """The endpoint of a router on this host at the usual port; empty without one."""
+    return f"tcp/{joined(host, 7447)}" if answers(host, 7447, timeout_s) == "zenoh" else ""
 
 
 def tls(host: str, port: int, settings: Mapping[str, Any], timeout_s: float) -> Tls:

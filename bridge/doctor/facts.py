@@ -11,6 +11,9 @@ from macs_zenoh.ping import Pong
 Reach = Literal["ok", "refused", "silent", "unknown_host", "unreachable", "untried"]
 """How an endpoint's host and port answer, below Zenoh; ``untried`` where there is no TCP to try (quic, udp)."""
 
+Speaker = Literal["", "zenoh", "gateway", "other", "silent"]
+"""Who is at a port, by its first bytes; empty: not tried."""
+
 TlsProblem = Literal[
     "",
     "expired",
@@ -110,6 +113,10 @@ class Endpoint(msgspec.Struct, kw_only=True):
     """None where the endpoint is not tls."""
     speaks_tls: bool = False
     """A tcp endpoint without a Zenoh session that answers a TLS handshake."""
+    speaker: Speaker = ""
+    """Who answered at a tcp endpoint without a Zenoh session."""
+    router_beside: str = ""
+    """A router on the same host at the usual port, where the endpoint is a gateway's."""
     problem: str = ""
     """Why no Zenoh session opened, in Zenoh's words; empty when one did."""
     router: str = ""

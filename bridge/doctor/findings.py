@@ -29,6 +29,8 @@ BATCH_BYTES = 65_535
 CLOSE_US = 5_000_000
 """Zenoh's own, which slow links need."""
 SLOW_MS = 150.0
+DEFAULT_PORT = 7447
+"""Of routers."""
 
 
 class Finding(NamedTuple):
@@ -75,6 +77,11 @@ def judge(facts: Facts) -> list[Finding]:
     return sorted(unique, key=lambda finding: (GROUPS.index(finding.group), -finding.severity))
 
 
+def of_endpoints(facts: Facts) -> list[Finding]:
+    """What is wrong with endpoints that let nobody in, where only the way to them was looked at."""
+    return [finding for finding in [*_routers(facts), *_tls(facts)] if finding.where and finding.severity > NOTE]
+
+
 def worst(findings: Iterable[Finding]) -> Severity:
     """The severity of the whole."""
     return max((finding.severity for finding in findings), default=OK)
@@ -108,8 +115,15 @@ def _routers(facts: Facts) -> Iterator[Finding]:
             yield found(endpoint.reach, where, severity=severity, detail=endpoint.reach_detail)
         elif endpoint.speaks_tls:
             yield found("speaks_tls", where)
+        elif endpoint.speaker == "gateway":
+            yield found("is_gateway", where, router=_router_beside(endpoint))
         elif endpoint.tls is None or not endpoint.tls.problem:
             yield found("session_refused", where, detail=_plain(endpoint.problem))
+
+
+def _router_beside(endpoint: Endpoint) -> str:
+    beside = endpoint.router_beside
+    return f"it is at {beside}" if beside else f"by default it is at port {DEFAULT_PORT}, a gateway at 7000"
 
 
 def _version_of(endpoint: Endpoint) -> str:

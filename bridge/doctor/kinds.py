@@ -97,6 +97,12 @@ KINDS: dict[str, Kind] = {
         "at about {throughput}, a stream message above {size} is dropped on the way",
         "raise fragment_wait_ms in [mesh] of the sender, or send smaller images",
     ),
+    "is_gateway": Kind(
+        "routers",
+        ERROR,
+        "that is a gateway, where headsets connect",
+        "name the router instead: {router}",
+    ),
     "large_lost": Kind(
         "routers",
         WARNING,

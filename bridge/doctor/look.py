@@ -154,8 +154,8 @@ class Examination:
         self._stack = AsyncExitStack()
         self._bytes = 0
         zenoh = configuration(settings.mesh)
-        self._tls: dict[str, Any] = _at(zenoh, "transport/link/tls") or {}
-        self._endpoints = list(dict.fromkeys(_endpoints(zenoh)))
+        self._tls: dict[str, Any] = at(zenoh, "transport/link/tls") or {}
+        self._endpoints = list(dict.fromkeys(endpoints_of(zenoh)))
         self._own = Own(
             macs=versions[0],
             zenoh=versions[1],
@@ -164,7 +164,7 @@ class Examination:
             namespace=zenoh.get("namespace") or "",
             id_slots=settings.mesh.id_slots,
             group_slots=settings.mesh.group_slots,
-            zenoh_settings={path: _at(zenoh, path) for path in JUDGED},
+            zenoh_settings={path: at(zenoh, path) for path in JUDGED},
             certificates=below.certificates(self._tls),
         )
 
@@ -218,6 +218,9 @@ class Examination:
         except (Unreachable, ConfigError) as error:  # the second: a file of ours, see `below`
             facts.problem = error.why if isinstance(error, Unreachable) else str(error)
             if where is not None and protocol == "tcp":
+                facts.speaker = await asyncio.to_thread(below.answers, *where, min(1.0, self._timeout_s))
+                if facts.speaker == "gateway":
+                    facts.router_beside = await asyncio.to_thread(below.router_beside, where.host, self._timeout_s)
                 facts.speaks_tls = await asyncio.to_thread(below.speaks_tls, *where, min(1.0, self._timeout_s))
             return None
         facts.router = (first.routers or [""])[0]
@@ -466,16 +469,17 @@ class Examination:
         return False
 
 
-def _endpoints(zenoh: dict[str, Any]) -> Iterable[str]:
-    """The endpoints to connect to: Zenoh allows one list, or one per mode."""
-    wanted = _at(zenoh, "connect/endpoints") or []
+def endpoints_of(zenoh: dict[str, Any], way: str = "connect") -> Iterable[str]:
+    """The endpoints to connect to, or to listen on: Zenoh allows one list, or one per mode."""
+    wanted = at(zenoh, f"{way}/endpoints") or []
     if isinstance(wanted, dict):
         wanted = wanted.get(zenoh.get("mode") or "client") or []
     for endpoint in wanted:
         yield from (endpoint if isinstance(endpoint, list) else [endpoint])
 
 
-def _at(zenoh: dict[str, Any], path: str) -> Any:
+def at(zenoh: dict[str, Any], path: str) -> Any:
+    """A value of Zenoh's configuration, None where there is none."""
     value: Any = zenoh
     for name in path.split("/"):
         value = value.get(name) if isinstance(value, dict) else None

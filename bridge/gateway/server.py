@@ -316,6 +316,11 @@ class Gateway:
         if not connection.greeted:
             self._waiting.leave(connection)
             return
+        if connection.peer.dials_a_router:
+            self._drops["zenoh_program"] += 1
+            if self._drops["zenoh_program"] == 1:
+                what = "%s is a Zenoh program: it wants a router, and this is a gateway (logged once, counted as %s)"
+                log.warning(what, connection.address, "zenoh_program")
         self._routes.pop(connection, None)
         self._online_reply = b""
         self._drops += connection.all_drops()

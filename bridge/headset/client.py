@@ -466,13 +466,10 @@ class Headset:
             self.host, self.port, timeout_s=self._handshake_s, max_message_bytes=self._max_message_bytes
         )
         try:
-            first = await asyncio.wait_for(connection.receive(), self._handshake_s)
+            first = await connection.receive_first(self._handshake_s)
             metadata, data = split_message(first)
             self._take_id(Metadata.decode(metadata), bytes(data))
             await connection.send(self._configuration(self.id))
-        except asyncio.TimeoutError as error:
-            connection.abort()
-            raise Unreachable(self.target, f"it sent no id within {self._handshake_s:g} s") from error
         except WireError as error:
             connection.abort()
             raise Unreachable(self.target, f"its first message gives no id: {error}") from error

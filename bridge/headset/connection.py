@@ -7,6 +7,7 @@ import contextlib
 import socket
 from collections import deque
 
+from macs_zenoh import greetings
 from macs_zenoh.addresses import joined
 from macs_zenoh.errors import Unreachable
 from macs_zenoh.wire import MessageDecoder
@@ -14,15 +15,22 @@ from macs_zenoh.wire import MessageDecoder
 _READ_BYTES = 256 << 10
 _DRAIN_ABOVE_BYTES = 256 << 10
 _GOODBYE_S = 1.0
+_SILENT_S = 0.5
+"""A gateway speaks at once, unless it waits for an id to give; who is silent for so long may be a Zenoh router."""
 
 
 class Connection:
     """An open connection; it ends with Unreachable wherever it is used."""
 
     def __init__(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, target: str, max_message_bytes: int
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        place: tuple[str, int],
+        max_message_bytes: int,
     ) -> None:
-        self.target = target
+        self.target = joined(*place)
+        self._place = place
         self.last_output = 0.0
         self._reader = reader
         self._writer = writer
@@ -43,7 +51,40 @@ class Connection:
         raw = writer.get_extra_info("socket")
         if raw is not None:
             raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return cls(reader, writer, target, max_message_bytes)
+        return cls(reader, writer, (host, port), max_message_bytes)
+
+    async def receive_first(self, timeout_s: float) -> bytes:
+        """The router's first message. Raises Unreachable when none comes within ``timeout_s``: a Zenoh router, which
+        waits for us, is recognised sooner."""
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout_s
+        receiving = loop.create_task(self.receive())
+        looking = loop.create_task(self._waits_for_zenoh(min(_SILENT_S, timeout_s)))
+        try:
+            await asyncio.wait([receiving, looking], timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
+            if not receiving.done() and looking.done() and looking.result():
+                raise Unreachable(self.target, "that is a Zenoh router; headsets connect to a gateway")
+            await asyncio.wait([receiving], timeout=max(0.0, deadline - loop.time()))
+            if not receiving.done():
+                raise Unreachable(self.target, f"it sent no id within {timeout_s:g} s")
+            return receiving.result()
+        finally:
+            receiving.cancel()
+            looking.cancel()
+
+    async def _waits_for_zenoh(self, silent_s: float) -> bool:
+        """Whether a Zenoh router is there, asked on a connection of its own after so long without a word."""
+        await asyncio.sleep(silent_s)
+        writer: asyncio.StreamWriter | None = None
+        try:
+            reader, writer = await asyncio.open_connection(*self._place)
+            writer.write(greetings.INIT_SYN)
+            return greetings.is_zenoh(await asyncio.wait_for(reader.read(greetings.ENOUGH_BYTES), _SILENT_S))
+        except (OSError, asyncio.TimeoutError):
+            return False
+        finally:
+            if writer is not None:
+                writer.transport.abort()
 
     async def receive(self) -> bytes:
         """The next whole message. Raises Unreachable at the end of the connection, FrameTooLarge."""

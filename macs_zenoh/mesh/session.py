@@ -45,6 +45,9 @@ log = logging.getLogger("macs.mesh")
 BEAT_S = 5.0
 """How often it is tried whether Zenoh still works in this process."""
 
+LOGGED = "error,zenoh_transport::unicast::establishment=off"
+"""What Zenoh logs by itself. Not each attempt to open a session that fails: who waits says so, and why."""
+
 HOLDER = re.compile(r"([0-9]{1,3})/([0-9]{1,5})")
 """Who has what was refused: agent type and id."""
 
@@ -115,14 +118,15 @@ class Mesh:
         *,
         traffic: Sequence[TrafficRule] = (),
         on_waiting: Callable[[str], None] | None = None,
+        quiet: bool = False,
     ) -> Mesh:
         """Join the mesh. A client waits for its first router as long as it takes; ``on_waiting`` hears of it once.
-        The ``traffic`` rules hold for what is put and asked here.
+        The ``traffic`` rules hold for what is put and asked here. ``quiet``: without Zenoh's own log of errors.
 
         Raises ConfigError when Zenoh does not accept the configuration or a file of it is missing, Unreachable when a
         router cannot listen.
         """
-        zenoh.init_log_from_env_or("error")  # RUST_LOG, as with Zenoh's own tools
+        zenoh.init_log_from_env_or("off" if quiet else LOGGED)  # RUST_LOG, as with Zenoh's own tools
         check_files(zenoh_config(settings))  # once: a file that is being replaced ends nobody who waits
         waiting = False
         while True:

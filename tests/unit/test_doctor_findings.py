@@ -101,6 +101,11 @@ def _(facts: Facts) -> None:
     _down(facts, reach="ok", problem="Unable to connect to any of [Single(tcp/127.0.0.1:7447)]. Timeout!")
 
 
+@makes("is_gateway", ERROR)
+def _(facts: Facts) -> None:
+    _down(facts, reach="ok", problem="Unable to connect", speaker="gateway")
+
+
 @makes("speaks_tls", ERROR)
 def _(facts: Facts) -> None:
     _down(facts, reach="ok", problem="Unable to connect", speaks_tls=True)
