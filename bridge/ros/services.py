@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from rclpy.node import NodeNameNonExistentError
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -292,6 +293,9 @@ class ServiceNode(InterfaceNode):
     LINGER_S = 0.25
     """How long a service stays after its last response: destroyed at once, it takes unread responses with it."""
 
+    WATCH_S = 1.0
+    """Pause between looks for another server."""
+
     def __init__(self, robot: Robot, request: AddNode) -> None:
         super().__init__(robot, request)
         self._service: Any = None
@@ -305,6 +309,7 @@ class ServiceNode(InterfaceNode):
         self._failed: deque[tuple[Any, str]] = deque()
         self._answered_at = -math.inf
         self._closing = self._ending = False
+        self._watching: asyncio.TimerHandle | None = None
         self._loop = asyncio.get_running_loop()
 
     def check_same(self, request: AddNode) -> None:
@@ -318,10 +323,9 @@ class ServiceNode(InterfaceNode):
         self._response_cdr = UnityCdr.of(self._types.Response)
         fields.failure(self._types.Response, "", self.rule.error_response, "error_response")
         node = self.robot.session.node
-        lingers = any(service.service_name == self.topic for service in node.services)
-        if check_service_type(node, self.topic, self.interface) and not lingers:
-            # not refused: after a crash of ours ROS knows our own old service for a while
-            log.warning("%s: another ROS node serves it too; a call goes to both", self.topic)
+        check_service_type(node, self.topic, self.interface)
+        if others := servers_elsewhere(node, self.topic):
+            raise Refused(f"{self.topic} is served by {' and '.join(others)} on this robot")
         with ros_errors(self.request.tos_name):
             self._service = node.create_service(
                 self._types, self.request.tos_name, lambda request, response: request, qos_profile=DEPTH
@@ -329,7 +333,34 @@ class ServiceNode(InterfaceNode):
         self._respond = self._service.send_response
         self._service.send_response = self._take
 
+    async def settle(self) -> None:
+        self._watch()
+
+    def _watch(self) -> None:
+        """ROS tells nobody when a service appears. A node of the robot that begins to serve this one wins: a call goes
+        to both, and the headset's answer may be the first."""
+        self._watching = self._loop.call_later(self.WATCH_S, self.robot.session.submit, self._look_for_others)
+
+    def _look_for_others(self) -> None:
+        """In the ROS thread."""
+        node = self.robot.session.node
+        if self._service is None or self._closing:
+            return
+        others = servers_elsewhere(node, self.topic) if node.count_services(self.topic) > 1 else []
+        self._loop.call_soon_threadsafe(self._looked, others)
+
+    def _looked(self, others: list[str]) -> None:
+        if not others:
+            self._watch()
+            return
+        who = " and ".join(map(str, self.registrants)) or "the headset"
+        text = f"{' and '.join(others)} serves it now; the service of {who} is withdrawn"
+        self.robot.drops.note("withdrawn", self.topic, text)
+        self.unused()
+
     def retire(self) -> None:
+        if self._watching is not None:
+            self._watching.cancel()
         for request_id in list(self._open_calls):
             self._fail(request_id, f"the headset that serves {self.topic} has left")
 
@@ -480,6 +511,24 @@ def check_service_type(node: Any, service: str, interface: InterfaceName) -> boo
     types = dict(node.get_service_names_and_types()).get(service, [])
     interface.check(service, types)
     return bool(types) and node.count_services(service) > 0
+
+
+def servers_elsewhere(node: Any, service: str) -> list[str]:
+    """Full names of the other ROS nodes that have this service. In the ROS thread.
+
+    What has our own name is not among them: after a crash of ours ROS knows our old service for a while.
+    """
+    found = set()
+    for name, namespace in node.get_node_names_and_namespaces():
+        full = f"{namespace.rstrip('/')}/{name}"
+        if full != node.get_fully_qualified_name():
+            try:
+                services = node.get_service_names_and_types_by_node(name, namespace)
+            except NodeNameNonExistentError:  # it has left meanwhile
+                continue
+            if any(served == service for served, _ in services):
+                found.add(full)
+    return sorted(found)
 
 
 def first_line(error: Exception) -> str:

@@ -20,6 +20,7 @@ from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.requests import ControlRequest, control
 from bridge.ros.rules import Rules
+from bridge.ros.services import servers_elsewhere
 from bridge.ros.session import RosSession
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule
 from macs_zenoh.directory import AgentInfo
@@ -256,6 +257,44 @@ async def test_a_right_ends_when_it_is_taken_away(session: RosSession) -> None:
         assert nodes.drops == {"not_allowed": 1}
     finally:
         nodes.close()
+
+
+# -- who serves ------------------------------------------------------------------------------------------------------
+
+
+async def test_what_a_node_of_the_robot_serves_no_headset_serves(session: RosSession, peer: Peer) -> None:
+    """A service that a ROS node has is refused to headsets, so that no answer of theirs can be the first."""
+    sent = Sent()
+    async with robot_nodes(session, sent) as nodes:
+        service = await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/lights", _serve))
+        await until(lambda: "/peer" in servers_elsewhere(session.node, "/lights"))
+        asked = adding("/lights", "std_srvs/SetBool", node_type=NodeType.SERVICE)
+        with pytest.raises(Refused, match="/lights is served by /peer on this robot"):
+            await nodes.add(asked)
+        await peer.session.run(lambda: peer.session.node.destroy_service(service))
+        await until(lambda: not servers_elsewhere(session.node, "/lights"))
+        await nodes.add(asked)
+        assert len(nodes) == 1
+
+
+async def test_a_headset_serves_until_a_node_of_the_robot_does(
+    session: RosSession, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When a ROS node begins to serve what a headset serves, the headset's service is withdrawn, and counted."""
+    monkeypatch.setattr("bridge.ros.services.ServiceNode.WATCH_S", 0.05)
+    async with robot_nodes(session) as nodes:
+        await nodes.add(adding("/lights", "std_srvs/SetBool", node_type=NodeType.SERVICE))
+        await asyncio.sleep(0.3)
+        assert len(nodes) == 1
+        await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/lights", _serve))
+        await until(lambda: len(nodes) == 0)
+        assert nodes.drops == {"withdrawn": 1}
+        await until(lambda: session.node.count_services("/lights") == 1)
+
+
+def _serve(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    response.success = True
+    return response
 
 
 # -- an id is who has it now -----------------------------------------------------------------------------------------
