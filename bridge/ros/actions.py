@@ -24,7 +24,7 @@ from bridge.ros.stream import cdr_problem
 from bridge.ros.types import resolve
 from bridge.ros.unity_cdr import UnityCdr, to_ros
 from macs_zenoh.errors import Refused
-from macs_zenoh.messages import ActionVerb, AddNode, NodeType
+from macs_zenoh.messages import ROS, ActionVerb, AddNode, NodeType
 from macs_zenoh.reading import Message
 
 log = logging.getLogger("macs.ros")
@@ -376,6 +376,16 @@ class ActionNode(InterfaceNode):
             self._loop.call_soon_threadsafe(self._tell, goal, ActionVerb.CANCEL, int(done), reason)
 
         goal.handle.cancel_goal_async().add_done_callback(cancelling)
+
+
+def tell_no_goal(robot: Robot, message: Message, reason: str) -> None:
+    """A goal came for which there is no node: tell its sender that it is not accepted."""
+    metadata, goal_id = message.metadata, message.data[:ID_BYTES]
+    if metadata.node_type != NodeType.ACTION or metadata.message_manager != ActionVerb.GOAL or len(goal_id) < ID_BYTES:
+        return
+    answer = metadata.sent_by(ROS, robot.agent_id)
+    answer = msgspec.structs.replace(answer, message_manager=ActionVerb.ACCEPTED.value)
+    robot.send(Registrant.of(message), answer, goal_id + b"\0" + reason.encode())
 
 
 def _shown(goal: Goal) -> dict[str, Any]:

@@ -7,7 +7,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from macs_zenoh.keyexpr import type_number
+from macs_zenoh.messages import NodeType
 from macs_zenoh.reading import Message
+
+ASKING = (NodeType.CLIENT, NodeType.ACTION)
+"""Node types whose messages wait for an answer."""
 
 
 class NodeKey(NamedTuple):
@@ -29,6 +33,8 @@ class EarlyMessages:
 
     HOLD_S = 1.0
     PER_NODE = 16
+    CALLS_PER_NODE = 256
+    """Of calls and goals, which wait for an answer each."""
     NODES = 64
     BYTES = 8 << 20
 
@@ -36,18 +42,19 @@ class EarlyMessages:
         self._waiting: dict[NodeKey, deque[EarlyMessage]] = {}
         self._bytes = 0
 
-    def hold(self, key: NodeKey, message: Message, now: float) -> bool:
-        """Keep a message. True when one was lost for want of room: the node's oldest, or else this one."""
+    def hold(self, key: NodeKey, message: Message, now: float) -> list[Message]:
+        """Keep a message. Those that were lost for want of room: the node's oldest, or else this one."""
         waiting = self._waiting.get(key)
         if (waiting is None and len(self._waiting) >= self.NODES) or self._bytes + len(message.data) > self.BYTES:
-            return True
+            return [message]
         waiting = self._waiting.setdefault(key, deque())
         waiting.append(EarlyMessage(now + self.HOLD_S, message))
         self._bytes += len(message.data)
-        if len(waiting) > self.PER_NODE:
-            self._bytes -= len(waiting.popleft().message.data)
-            return True
-        return False
+        if len(waiting) <= (self.CALLS_PER_NODE if key.node_type in ASKING else self.PER_NODE):
+            return []
+        lost = waiting.popleft().message
+        self._bytes -= len(lost.data)
+        return [lost]
 
     def take(self, key: NodeKey, belongs: Callable[[Message], bool] = lambda message: True) -> list[Message]:
         """The messages that wait for a node and belong to it, oldest first; others go on waiting."""

@@ -9,8 +9,8 @@ import asyncio
 import logging
 from collections.abc import Iterator
 
-from bridge.ros.actions import ActionNode
-from bridge.ros.early import EarlyMessages, NodeKey
+from bridge.ros.actions import ActionNode, tell_no_goal
+from bridge.ros.early import ASKING, EarlyMessages, NodeKey
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, full_name, key_of
 from bridge.ros.places import Places
 from bridge.ros.rights import Rights
@@ -171,9 +171,10 @@ class InterfaceNodes:
         if node is not None and node.is_open:
             node.receive(message)
             return
-        dropped = self._early.hold(key, message, asyncio.get_running_loop().time())
-        if dropped:
-            self.drops.note("held_full", key.node_name[:80], "more data before the registration than can be kept")
+        for lost in self._early.hold(key, message, asyncio.get_running_loop().time()):
+            reason = "more data before the registration than can be kept"
+            self.drops.note("held_full", key.node_name[:80], reason)
+            self._tell_unanswered(lost, reason)
         self._schedule_expiry()
 
     def deliver_at_once(self, message: Message) -> bool:
@@ -300,14 +301,29 @@ class InterfaceNodes:
 
     def _expire(self) -> None:
         self._expiry = None
-        for key, messages in self._early.expire(asyncio.get_running_loop().time()).items():
+        now = asyncio.get_running_loop().time()
+        for key, messages in self._early.expire(now).items():
+            if key.node_type in ASKING and self._is_opening(key):
+                for message in messages:  # its node comes late, but it comes; its sender knows how long to wait
+                    self._early.hold(key, message, now)
+                continue
             reason = f"nobody registered this node with type {key.node_type}"
             if self._places.first(key) is not None:
                 reason = f"several topics have this node name, and the sender registered none of type {key.node_type}"
             self.drops.note("no_node", key.node_name[:80], reason, len(messages))
             for message in messages:
-                tell_failure(self.robot, message, "refused", reason)
+                self._tell_unanswered(message, reason)
         self._schedule_expiry()
+
+    def _is_opening(self, key: NodeKey) -> bool:
+        """Whether there will be a node of this name, most likely."""
+        node = self._places.first(key)
+        return node is not None and node.opening is not None and not node.opening.done()
+
+    def _tell_unanswered(self, message: Message, reason: str) -> None:
+        """What nobody will answer: tell who waits for it."""
+        tell_failure(self.robot, message, "refused", reason)
+        tell_no_goal(self.robot, message, reason)
 
 
 def _work(node: InterfaceNode) -> Work:

@@ -30,14 +30,9 @@ for _ in range((os.getpid() + worker_number() * DOMAINS // 8) % DOMAINS):
     next(_domains)
 
 
-@pytest.fixture(scope="session")
-def test_msgs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interface package `macs_test_msgs`, built from its definitions; the processes of a test find it as well.
-
-    Its prefix. No action comes from PyPI, and no type that has every kind of field.
-    """
-    into = tmp_path_factory.mktemp("interfaces")
-    with zipfile.ZipFile(build(Path(__file__).parent / "macs_test_msgs", into).wheel) as wheel:
+def _installed(package: str, into: Path) -> Path:
+    """An interface package, built from its definitions; the processes of a test find it as well. Its prefix."""
+    with zipfile.ZipFile(build(Path(__file__).parent / package, into).wheel) as wheel:
         wheel.extractall(into)
     prefix = next(into.glob("*.data")) / "data"
     sys.path.insert(0, str(into))
@@ -47,15 +42,17 @@ def test_msgs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def count_action(test_msgs: Path) -> Any:
-    """An action."""
+def count_action(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """An action. None comes from PyPI."""
+    _installed("macs_test_msgs", tmp_path_factory.mktemp("actions"))
     return importlib.import_module("macs_test_msgs.action").Count
 
 
 @pytest.fixture(scope="session")
-def kinds(test_msgs: Path) -> Any:
-    """A message with every kind of field."""
-    return importlib.import_module("macs_test_msgs.msg").Kinds
+def kinds(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Messages with every kind of field: the module that has them."""
+    _installed("macs_kinds_msgs", tmp_path_factory.mktemp("kinds"))
+    return importlib.import_module("macs_kinds_msgs.msg")
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from bridge.ros.early import EarlyMessages
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
-from bridge.ros.services import ServiceNode
+from bridge.ros.services import ClientNode, ServiceNode
 from bridge.ros.session import RosSession
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
@@ -185,6 +185,53 @@ async def test_a_call_that_nobody_registered_is_refused(
     monkeypatch.setattr(EarlyMessages, "HOLD_S", 0.02)
     nodes.deliver(request("/none", SetBool.Request(), manager=CallFailure.manager))
     assert decode_data(CallFailure, (await get(headsets.sent))[2]).kind == "refused"
+
+
+async def test_every_call_before_its_registration_is_answered(
+    nodes: InterfaceNodes, headsets: Headsets, peer: Peer
+) -> None:
+    """Twenty first calls at once, which overtake the registration, have twenty answers."""
+    await serve(peer, "/slow", said)
+    for number in range(20):
+        nodes.deliver(request("/slow", SetBool.Request(data=True), number=number, manager=CallFailure.manager))
+    await nodes.add(adding("/slow", SET, node_type=3))
+    answers = [await get(headsets.sent) for _ in range(20)]
+    assert {metadata.request_id for _, metadata, _ in answers} == set(range(20))
+    assert all(deserialize_message(data, SetBool.Response).success for _, _, data in answers)
+
+
+async def test_calls_wait_for_a_node_that_opens_slowly(
+    nodes: InterfaceNodes, headsets: Headsets, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A call is not given up while its node is being made, however long that takes."""
+    monkeypatch.setattr(EarlyMessages, "HOLD_S", 0.02)
+    await serve(peer, "/slow", said)
+    settle = ClientNode.settle
+
+    async def slowly(node: ClientNode) -> None:
+        await settle(node)
+        await asyncio.sleep(0.3)
+
+    monkeypatch.setattr(ClientNode, "settle", slowly)
+    adding_it = asyncio.create_task(nodes.add(adding("/slow", SET, node_type=3)))
+    await asyncio.sleep(0)
+    nodes.deliver(request("/slow", SetBool.Request(data=True), manager=CallFailure.manager))
+    await adding_it
+    assert deserialize_message((await get(headsets.sent))[2], SetBool.Response).success
+
+
+async def test_no_call_is_lost_without_a_word(
+    nodes: InterfaceNodes, headsets: Headsets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that are more than can wait for a registration are told, whatever room they lacked."""
+    monkeypatch.setattr(EarlyMessages, "CALLS_PER_NODE", 3)
+    for number in range(5):
+        nodes.deliver(request("/none", SetBool.Request(), number=number, manager=CallFailure.manager))
+    monkeypatch.setattr(EarlyMessages, "BYTES", 0)
+    nodes.deliver(request("/none", SetBool.Request(), number=5, manager=CallFailure.manager))
+    told = [await get(headsets.sent) for _ in range(6)]
+    assert [metadata.request_id for _, metadata, _ in told] == [0, 1, 5, 2, 3, 4]
+    assert {decode_data(CallFailure, data).kind for _, _, data in told} == {"refused"}
 
 
 async def test_a_service_of_another_type_is_refused(nodes: InterfaceNodes, peer: Peer) -> None:

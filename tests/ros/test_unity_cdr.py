@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import importlib
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -33,8 +32,7 @@ POINT = JointTrajectoryPoint(positions=[1.0, 2.0, 3.0])
 POINT.time_from_start.sec = 5
 
 
-def _kinds() -> list[Any]:
-    module = importlib.import_module("macs_test_msgs.msg")
+def _kinds(module: Any) -> list[Any]:
     nothing = module.Nothing()
     full = module.Kinds(
         before=1, truth=True, octet=b"\xff", letter=200, i8=-128, u8=255, i16=-(1 << 15), u16=(1 << 16) - 1,
@@ -77,9 +75,9 @@ MESSAGES = [
 
 
 @pytest.fixture(scope="session")
-def messages(test_msgs: Path) -> list[Any]:
+def messages(kinds: Any) -> list[Any]:
     """One of each kind, and what robots really send."""
-    return [*MESSAGES, *_kinds()]
+    return [*MESSAGES, *_kinds(kinds)]
 
 
 def test_what_a_headset_writes_is_what_ros_reads(messages: list[Any]) -> None:
@@ -143,7 +141,7 @@ def test_types_on_which_both_agree_cost_nothing() -> None:
 )
 def test_what_is_no_message_stays_what_it_is(cdr: bytes, kinds: Any) -> None:
     """Bytes that fit neither form are left to whoever judges them, soon."""
-    for kind in (JointState, kinds):
+    for kind in (JointState, kinds.Kinds):
         both = UnityCdr.of(kind)
         assert both is not None
         assert both.to_ros(cdr) == cdr
