@@ -283,7 +283,8 @@ class DataRefused(Struct, frozen=True, rename="camel"):
     """Robot → agent: what it sent for an interface node was not taken, and why. For agents that know our extensions.
 
     ``kind`` is the name under which the robot counts it, as ``stopped``, ``not_in_control``, ``not_allowed``,
-    ``bad_cdr`` or ``no_node``; ``reason`` is for a person. Told at once, and again while more of it comes.
+    ``bad_cdr`` or ``no_node``; ``reason`` is for a person. Told at once, and again while more of it comes. With
+    ``other_type`` nothing was sent: the topic or service has another type now, and the node is of no use.
     """
 
     manager: ClassVar[str] = "InterfaceDataRefused"
@@ -293,6 +294,9 @@ class DataRefused(Struct, frozen=True, rename="camel"):
     tos_name: str
     kind: str
     reason: str
+
+
+OTHER_TYPE = "other_type"
 
 
 class CallFailure(Struct, frozen=True, rename="camel"):

@@ -35,6 +35,7 @@ from macs_zenoh.limits import ANSWER_BYTES
 from macs_zenoh.messages import (
     BROADCAST,
     EXTENSIONS,
+    OTHER_TYPE,
     ROS,
     DataRefused,
     Metadata,
@@ -572,7 +573,7 @@ class Headset:
             return
         node = self._nodes.get((refused.node_type, refused.node_name))
         if node is not None:
-            node.refused(refused.robot_id, refused.reason, final=isinstance(refused, NodeRefused))
+            node.refused(refused.robot_id, refused.reason, final=_is_final(refused))
         else:
             log.warning("robot %d refused %s: %s", refused.robot_id, refused.tos_name, refused.reason)
 
@@ -651,3 +652,8 @@ class Headset:
             self._on_link(link)
         except Exception:  # our caller's code must not end our tasks
             log.exception("on_link failed")
+
+
+def _is_final(refused: NodeRefused | DataRefused) -> bool:
+    """Whether it is the node that is refused, not only something that was sent for it."""
+    return isinstance(refused, NodeRefused) or refused.kind == OTHER_TYPE

@@ -16,7 +16,7 @@ from typing import TypeVar
 import macs_zenoh
 from bridge.ros import parameters
 from bridge.ros.checked import CheckedSettings
-from bridge.ros.graph import Offers
+from bridge.ros.graph import NamesAndTypes, Offers
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.requests import STATUS, ControlReply, ControlRequest, control, status
@@ -73,10 +73,15 @@ class RobotAgent:
         )
         self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
         self.checked = CheckedSettings(robot.rules, robot.drops)
-        self.offers = Offers(robot, agent.publish_stream, self.checked.look)
+        self.offers = Offers(robot, agent.publish_stream, self._graph_changed)
         self._answering: dict[asyncio.Task[None], Registrant] = {}
         self._sessions: dict[Registrant, tuple[str, int]] = {}
         """Who has an id, or had it last."""
+
+    def _graph_changed(self, topics: NamesAndTypes, services: NamesAndTypes) -> None:
+        """In the ROS thread."""
+        self.checked.look(topics, services)
+        self.nodes.look_at_types(topics, services)
 
     async def start(self) -> None:
         """Serve from now on."""
@@ -221,7 +226,7 @@ class RobotAgent:
         self.nodes.forget_all()
         self.offers.close()
         self.nodes.robot.agent_id = new
-        self.offers = Offers(self.nodes.robot, self.agent.publish_stream, self.checked.look)
+        self.offers = Offers(self.nodes.robot, self.agent.publish_stream, self._graph_changed)
 
     def _link(self, up: bool) -> None:
         """Without a router nobody is seen to leave, and no command comes: after a lease all commanders count as gone.

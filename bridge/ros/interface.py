@@ -137,6 +137,8 @@ class InterfaceNode(ABC):
         """Those of them that write and read CDR as Unity's serializer does (`unity_cdr`)."""
         self.linger_s = 0.0
         """How long an agent stays registered that is not seen on the mesh any more."""
+        self.told_types: set[str] = set()
+        """What its registrants were told last of the types that others use under this name."""
         self.is_open = False
         self.alike = False
         """Whether the robot knows another topic with the same node name."""
@@ -185,6 +187,10 @@ class InterfaceNode(ABC):
     def collision(self, topic: str, node_name: str) -> Refused:
         """The refusal of another topic whose messages could not be told from those of this node."""
         return Refused(f"{topic} and {self.topic} have the same node name {node_name}; use one of them")
+
+    def other_types(self) -> set[str]:
+        """The types that others on the robot use under this name, when none of them uses ours. In the ROS thread."""
+        return set()
 
     def register(self, registrant: Registrant, *, unity: bool = False) -> None:
         """Add a registrant; twice changes nothing. Raises Refused when the node takes no more."""

@@ -7,19 +7,33 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Iterator
+from functools import partial
 
 from bridge.ros.actions import ActionNode, tell_no_goal
 from bridge.ros.early import ASKING, EarlyMessages, NodeKey
+from bridge.ros.graph import NamesAndTypes
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, full_name, key_of
 from bridge.ros.places import Places
 from bridge.ros.rights import Rights
-from bridge.ros.services import ClientNode, ServiceNode, tell_failure
+from bridge.ros.services import ClientNode, ServiceNode, first_line, tell_failure
 from bridge.ros.stop import StopNode
 from bridge.ros.topics import PublisherNode, SubscriberNode
+from bridge.ros.types import InterfaceName
 from macs_zenoh.budget import may_have_one_more
-from macs_zenoh.errors import Refused
-from macs_zenoh.messages import AddNode, NodeType, RemoveNode, node_name
+from macs_zenoh.errors import MacsError, Refused
+from macs_zenoh.messages import (
+    OTHER_TYPE,
+    ROS,
+    AddNode,
+    DataRefused,
+    Metadata,
+    NodeType,
+    RemoveNode,
+    encode_data,
+    node_name,
+)
 from macs_zenoh.reading import Message
 
 log = logging.getLogger("macs.ros")
@@ -29,6 +43,10 @@ KINDS: dict[int, type[InterfaceNode]] = {
 }
 """Interface nodes by their number on the wire."""
 
+
+GONE_S = 2.0
+"""After so long nothing of a removed node is left in ROS."""
+LOOK_S = 0.05
 
 Work = tuple[int, str]
 """What a node is the only one for: its type, and the full name of its topic, service or action. Topics of the robot
@@ -49,6 +67,9 @@ class InterfaceNodes:
         self.rights = Rights(robot.rules.settings, lambda agent: robot.group_of(agent))
         self._nodes: dict[Work, InterfaceNode] = {}
         self._places: Places[InterfaceNode] = Places()
+        self._loop = asyncio.get_running_loop()
+        self._removed: dict[str, float] = {}
+        """When a node on this topic was removed last."""
         self._early = EarlyMessages()
         self._expiry: asyncio.TimerHandle | None = None
         self._lingering: dict[tuple[NodeKey, Registrant], asyncio.TimerHandle] = {}
@@ -80,8 +101,10 @@ class InterfaceNodes:
         registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
         if request.node_type != NodeType.SUBSCRIBER:
             self.rights.check(registrant)
-        node = self._find_or_create(request)
         key = key_of(request)
+        self._take_back_other(key, registrant, request)
+        await self._make_room(request)
+        node = self._find_or_create(request)
         meant = self._places.of(key, registrant)
         if meant is not None and meant is not node:  # its messages say no more than the node name
             raise meant.collision(node.topic, key.node_name)
@@ -95,6 +118,54 @@ class InterfaceNodes:
         await asyncio.shield(node.opening)
         if node.is_open:
             self._pass_early(node, key)
+
+    def _take_back_other(self, key: NodeKey, registrant: Registrant, request: AddNode) -> None:
+        """Who registers a node with another type does not want the one before, whatever became of its removal."""
+        node = self._places.of(key, registrant)
+        kind = KINDS.get(request.node_type)
+        if node is None or kind is None or node is self.stop or registrant not in node.registrants:
+            return
+        same_topic = node.topic == full_name(self.robot, kind, request.tos_name)
+        if same_topic and node.interface != InterfaceName.parse(request.data_exchange_type, kind.INTERFACE):
+            self.remove(RemoveNode(*registrant, key.node_type, key.node_name))
+
+    async def _make_room(self, request: AddNode) -> None:
+        """A node whose type nobody else on the robot uses gives way to one of the type that they use."""
+        for node in self._places.all_of(key_of(request)):
+            if node is self.stop or node.request.data_exchange_type == request.data_exchange_type or not node.is_open:
+                continue
+            others = await self.robot.session.run(node.other_types)
+            kind = KINDS[request.node_type]
+            if str(InterfaceName.parse(request.data_exchange_type, kind.INTERFACE)) in others and node in self:
+                self._tell_type(node, others)
+                self._remove(node)
+
+    def look_at_types(self, topics: NamesAndTypes, services: NamesAndTypes) -> None:
+        """The graph has changed: registrants of what has another type now get nothing, so they are told. In the ROS
+        thread."""
+        known = {**dict(topics), **dict(services)}
+        for node in self:
+            types = known.get(node.topic, ())
+            others = node.other_types() if set(types) - {str(node.interface)} else set()
+            if others != node.told_types:
+                node.told_types = others
+                if others:
+                    self._loop.call_soon_threadsafe(self._tell_type, node, others)
+
+    def _tell_type(self, node: InterfaceNode, types: set[str]) -> None:
+        reason = f"{node.topic} has type {' and '.join(sorted(types))} on this robot now, not {node.interface}"
+        self.drops.note("other_type", node.topic, reason)
+        for registrant in node.registrants:
+            told = DataRefused(
+                robot_id=self.robot.agent_id,
+                node_type=node.key.node_type,
+                node_name=node.key.node_name,
+                tos_name=node.topic,
+                kind=OTHER_TYPE,
+                reason=reason,
+            )
+            metadata = Metadata(ROS, self.robot.agent_id, message_manager=told.manager)
+            self.robot.send(registrant, metadata, encode_data(told))
 
     def _find_or_create(self, request: AddNode) -> InterfaceNode:
         kind = KINDS.get(request.node_type)
@@ -243,13 +314,22 @@ class InterfaceNodes:
 
     def _open_entity(self, node: InterfaceNode) -> None:
         """In the ROS thread."""
-        node.open()
+        try:
+            node.open()
+        except MacsError:
+            raise
+        except Exception as error:
+            log.exception("%s: %s %s cannot be made", node.topic, node.ROLE, node.interface)
+            problem = f"{type(error).__name__}: {first_line(error)}"
+            raise Refused(
+                f"{node.topic} with type {node.interface} cannot be used on this robot: {problem}"
+            ) from error
         known = [rule.match for rule in self.robot.rules.settings.rules] + node.known_names()
         node.alike = any(node_name(other) == node.key.node_name and other != node.topic for other in known)
 
     async def _open(self, node: InterfaceNode, opened: asyncio.Future[None]) -> None:
         try:
-            await opened
+            await self._until_open(node, opened)
             await node.settle()
         except BaseException:
             if self._nodes.get(_work(node)) is node:
@@ -266,6 +346,26 @@ class InterfaceNodes:
             node.is_open = True  # not sooner: no message may overtake these
             for registrant in node.registrants:
                 node.welcome(registrant)
+
+    async def _until_open(self, node: InterfaceNode, opened: asyncio.Future[None]) -> None:
+        """ROS shows what we closed for a moment, and our last messages keep it for another: no reason to refuse what
+        comes in its place."""
+        while True:
+            try:
+                return await opened
+            except Refused:
+                since_s = self._loop.time() - self._removed.get(node.topic, -math.inf)
+                if since_s > GONE_S or self._nodes.get(_work(node)) is not node:
+                    raise
+            await asyncio.sleep(LOOK_S)
+            if self._nodes.get(_work(node)) is not node:
+                return None
+            opened = asyncio.wrap_future(self.robot.session.submit(partial(self._open_entity, node)))
+
+    def _note_removed(self, topic: str) -> None:
+        now = self._loop.time()
+        self._removed = {gone: at for gone, at in self._removed.items() if at > now - GONE_S}
+        self._removed[topic] = now
 
     def _linger(self, node: InterfaceNode, registrant: Registrant) -> None:
         """Its gateway may only have lost the way to us: what it will ask for then has to be there."""
@@ -291,6 +391,7 @@ class InterfaceNodes:
         del self._nodes[_work(node)]
         self._places.remove(node)
         node.is_open = False
+        self._note_removed(node.topic)
         node.retire()
         self.robot.session.submit(node.close)
         log.info("%s: %s removed", node.topic, node.ROLE)

@@ -61,6 +61,11 @@ class Places(Generic[NodeT]):
         name = self._names.get(key)
         return name.nodes[0] if name is not None else None
 
+    def all_of(self, key: NodeKey) -> list[NodeT]:
+        """All nodes of a name."""
+        name = self._names.get(key)
+        return list(name.nodes) if name is not None else []
+
     def names_of(self, node: NodeT, registrant: Registrant) -> Iterator[NodeKey]:
         """The names under which an agent registered a node."""
         return (key for key, name in self._names.items() if name.of.get(registrant) is node)

@@ -132,6 +132,12 @@ class ClientNode(InterfaceNode):
         with ros_errors(self.request.tos_name):
             self._client = node.create_client(self._service, self.request.tos_name, qos_profile=DEPTH)
 
+    def other_types(self) -> set[str]:
+        if self._client is None or self._client.service_is_ready():
+            return set()
+        known = dict(self.robot.session.node.get_service_names_and_types()).get(self.topic, [])
+        return set(known) - {str(self.interface)}
+
     async def settle(self) -> None:
         if self._exists:
             await self._search.found(self.MATCH_S)

@@ -36,7 +36,19 @@ from macs_zenoh.recovery import SILENT_S
 log = logging.getLogger("macs.ros")
 
 
-class SubscriberNode(InterfaceNode):
+class TopicNode(InterfaceNode):
+    """What both kinds of topic nodes have in common."""
+
+    def _others(self, *, publishers_first: bool) -> set[str]:
+        """The types at the other end of the topic, or without one at ours; none when ours is among them."""
+        node, topic = self.robot.session.node, self.topic
+        publishers = types_of_others(node, node.get_publishers_info_by_topic(topic))
+        subscriptions = types_of_others(node, node.get_subscriptions_info_by_topic(topic))
+        found = (publishers or subscriptions) if publishers_first else (subscriptions or publishers)
+        return set() if str(self.interface) in found else found
+
+
+class SubscriberNode(TopicNode):
     """Type 1: a robot's topic to its registrants, one frame per message whoever receives it."""
 
     NODE_TYPE = NodeType.SUBSCRIBER
@@ -90,6 +102,9 @@ class SubscriberNode(InterfaceNode):
         if self.robot.keep_stream(self.key.node_name, self.rule.keep_for_recovery):
             self.linger_s = SILENT_S
         self._subscribe(self._profile_of(self._publishers()))
+
+    def other_types(self) -> set[str]:
+        return self._others(publishers_first=True)
 
     def close(self) -> None:
         self._newcomers.close()
@@ -311,7 +326,7 @@ class RateLimit:
         self._next = (self._next if late_s < self._period_s else now) + self._period_s
 
 
-class PublisherNode(InterfaceNode):
+class PublisherNode(TopicNode):
     """Type 2: what agents send to a robot's topic, as far as safety lets it pass."""
 
     NODE_TYPE = NodeType.PUBLISHER
@@ -367,6 +382,9 @@ class PublisherNode(InterfaceNode):
         except Refused as refusal:  # the headset cannot mend it
             self._loop.call_soon_threadsafe(self.robot.drops.note, "wrong_settings", self.topic, refusal.reason)
             raise
+
+    def other_types(self) -> set[str]:
+        return self._others(publishers_first=False)
 
     async def settle(self) -> None:
         """Let the subscriptions that exist find the new publisher: what is published before that, ROS loses."""
@@ -501,6 +519,12 @@ class PublisherNode(InterfaceNode):
                 "last": self.deadman.why,
             }
         return status
+
+
+def types_of_others(node: Any, endpoints: Iterable[Any]) -> set[str]:
+    """The types of these endpoints as far as they are other nodes'."""
+    own = (node.get_name(), node.get_namespace())
+    return {endpoint.topic_type for endpoint in endpoints if (endpoint.node_name, endpoint.node_namespace) != own}
 
 
 def check_topic_type(node: Any, topic: str, interface: InterfaceName) -> None:

@@ -87,11 +87,27 @@ def _load(name: InterfaceName) -> type[Any]:
         raise Refused(f"type {name} is not installed on this robot: {name.package} is, but has no such type")
     try:
         found = getattr(importlib.import_module(f"{name.package}.{name.kind}"), name.name)
-    except (ImportError, AttributeError) as error:
-        raise Refused(f"type {name} is registered on this robot, but cannot be imported: {error}") from error
-    if not isinstance(found, type):
-        raise Refused(f"type {name} is registered on this robot, but its class is something else")
+        if not isinstance(found, type):
+            raise Refused(f"type {name} is registered on this robot, but its class is something else")
+        _load_type_support(found)
+    except Refused:
+        raise
+    except Exception as error:  # its module is somebody else's code: a field named `from` is a SyntaxError
+        problem = f"{type(error).__name__}: {error}"
+        raise Refused(f"type {name} is registered on this robot, but cannot be imported: {problem}") from error
     return found
+
+
+def _load_type_support(found: type[Any]) -> None:
+    """Load the C code of a message, or of a service's or an action's messages. Raises what it raises."""
+    parts = [
+        getattr(found, part) for part in ("Request", "Response", "Goal", "Result", "Feedback") if hasattr(found, part)
+    ]
+    for part in [found, *parts]:
+        meta: Any = type(part)
+        meta.__import_type_support__()
+        if meta._TYPE_SUPPORT is None:
+            raise ImportError(f"its type support for {part.__name__} is missing")
 
 
 def _registered(package: str) -> frozenset[str] | None:

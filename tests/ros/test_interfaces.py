@@ -225,3 +225,11 @@ async def test_without_the_interfaces_awareness_says_what_to_do() -> None:
     assert process.returncode == 1
     assert "macs interfaces build as2_ca_msgs --install" in log.decode()
     assert "Traceback" not in log.decode()
+
+
+@pytest.mark.parametrize("files", [{"msg_Ask": "int32 from"}, {"srv_Ask": "string name\n---\nbool class"}])
+def test_a_package_that_python_cannot_import_is_refused(tmp_path: Path, files: dict[str, str]) -> None:
+    """A field named like a word of Python's is told with its definition, and no wheel is written."""
+    with pytest.raises(ConfigError, match=r"ask is of no use in Python: .*a field may not be named (from|class)"):
+        build(package(tmp_path / "own_msgs", **files), tmp_path / "wheels")
+    assert not list(tmp_path.rglob("*.whl"))

@@ -18,7 +18,7 @@ from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.session import RosSession
 from macs_zenoh.errors import Refused
-from macs_zenoh.messages import Metadata, NodeType, StreamData, decode_management
+from macs_zenoh.messages import DataRefused, Metadata, NodeType, StreamData, decode_data, decode_management
 from macs_zenoh.wire import parse_frame
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -365,6 +365,92 @@ async def test_the_other_node_on_a_topic_must_have_its_type(nodes: InterfaceNode
     with pytest.raises(Refused, match="/t has type std_msgs/msg/String on this robot"):
         await nodes.add(adding("/t", "geometry_msgs/Twist", node_type=NodeType.PUBLISHER))
     await nodes.add(adding("/t", node_type=NodeType.PUBLISHER))
+
+
+@pytest.mark.parametrize("node_type", [1, 2])
+async def test_another_type_in_one_burst_is_what_counts(
+    nodes: InterfaceNodes, streams: Streams, node_type: int
+) -> None:
+    """Who drops a topic and registers it with another type has that one, even when the removal was lost on its way."""
+    for removal in (True, False):
+        await nodes.add(adding("/burst", "std_msgs/String", node_type=node_type))
+        if removal:
+            nodes.remove(removing("/burst", node_type=node_type))
+        await nodes.add(adding("/burst", "std_msgs/Int32", node_type=node_type))
+        node = nodes.get(node_type, "nd__burst")
+        assert node is not None
+        assert str(node.interface) == "std_msgs/msg/Int32"
+        assert node.registrants == {Registrant(2, 5)}
+        nodes.remove(removing("/burst", node_type=node_type))
+    assert len(nodes) == 0
+
+
+async def test_a_wrong_first_type_gives_way_to_the_right_one(nodes: InterfaceNodes, told: Told, peer: Peer) -> None:
+    """When the topic appears, who registered it with another type is told, and does not keep it from others."""
+    await nodes.add(adding("/late", "std_msgs/Int32", registrant=5))
+    with pytest.raises(Refused, match="/late is registered with type std_msgs/msg/Int32, not std_msgs/msg/String"):
+        await nodes.add(adding("/late", registrant=6))
+    publisher = await peer.publisher(String, "/late")
+    await until(lambda: nodes.robot.session.node.count_publishers("/late") == 1)
+    await _look(nodes)
+    to, refused = await told.next()
+    assert to == Registrant(2, 5)
+    assert (refused.node_name, refused.kind) == ("nd__late", "other_type")
+    assert refused.reason == "/late has type std_msgs/msg/String on this robot now, not std_msgs/msg/Int32"
+    await nodes.add(adding("/late", registrant=6))
+    assert (await told.next())[0] == Registrant(2, 5)  # it has the node no more
+    await until(lambda: publisher.get_subscription_count() == 1)
+
+
+async def test_a_topic_that_returns_with_another_type_is_told_once(
+    nodes: InterfaceNodes, told: Told, peer: Peer
+) -> None:
+    """Every registrant hears that its topic has another type now; when the old one is back all goes on."""
+    publisher = await peer.publisher(String, "/changed")
+    await _knows(nodes, "/changed", publishers=1)
+    for registrant in (5, 6):
+        await nodes.add(adding("/changed", registrant=registrant))
+    await _look(nodes)
+    assert told.queue.empty()
+    await peer.session.run(lambda: peer.session.node.destroy_publisher(publisher))
+    other = Peer(nodes.robot.session.context.get_domain_id(), "other")
+    try:
+        await other.publisher(UInt8MultiArray, "/changed")
+        await until(lambda: len(dict(nodes.robot.session.node.get_topic_names_and_types())["/changed"]) == 2)
+        for _ in range(3):
+            await _look(nodes)
+        assert {(await told.next())[0].agent_id for _ in range(2)} == {5, 6}
+        assert told.queue.empty()
+    finally:
+        other.session.close()
+
+
+class Told:
+    """What the robot tells single agents."""
+
+    def __init__(self) -> None:
+        self.queue: asyncio.Queue[tuple[Registrant, Metadata, bytes]] = asyncio.Queue()
+
+    async def next(self) -> tuple[Registrant, DataRefused]:
+        to, metadata, data = await get(self.queue)
+        assert metadata.message_manager == DataRefused.manager
+        return to, decode_data(DataRefused, data)
+
+
+@pytest.fixture
+async def told(nodes: InterfaceNodes) -> Told:
+    told = Told()
+    nodes.robot.send = lambda *message: told.queue.put_nowait(message)
+    return told
+
+
+async def _look(nodes: InterfaceNodes) -> None:
+    """As the robot agent does when the graph changes."""
+    node = nodes.robot.session.node
+    await nodes.robot.session.run(
+        lambda: nodes.look_at_types(node.get_topic_names_and_types(), node.get_service_names_and_types())
+    )
+    await asyncio.sleep(0)
 
 
 async def test_a_refused_name_can_be_registered_properly_after(nodes: InterfaceNodes) -> None:

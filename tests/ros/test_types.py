@@ -78,6 +78,46 @@ def test_a_registered_package_without_its_module_is_refused(monkeypatch: Any, tm
         resolve("broken_msgs/Thing")
 
 
+UNUSABLE = """
+class Meta(type):
+    {}
+    @classmethod
+    def __import_type_support__(cls):
+        {}
+
+class Thing(metaclass=Meta):
+    pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("class Thing:\n    def __init__(self, from): pass\n", "SyntaxError"),
+        ("raise OSError('libother.so: cannot open shared object file')\n", "libother.so"),
+        (UNUSABLE.format("_TYPE_SUPPORT = None", "pass"), "type support for Thing is missing"),
+        (UNUSABLE.format("", "raise RuntimeError('no C')"), "no C"),
+    ],
+)
+def test_a_type_that_cannot_be_used_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, text: str, problem: str
+) -> None:
+    """Whatever is wrong with an installed type's code, who registers it hears it once, as a reason."""
+    index = tmp_path / types._INDEX
+    index.mkdir(parents=True)
+    (index / "odd_msgs").write_text("msg/Thing.msg\n")
+    (tmp_path / "odd_msgs" / "msg").mkdir(parents=True)
+    (tmp_path / "odd_msgs" / "msg" / "__init__.py").write_text(text)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in ("odd_msgs", "odd_msgs.msg"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    with pytest.raises(Refused, match=f"odd_msgs/msg/Thing is registered on this robot, but cannot be .*{problem}"):
+        resolve("odd_msgs/Thing")
+    for name in ("odd_msgs", "odd_msgs.msg"):
+        sys.modules.pop(name, None)
+
+
 def test_a_name_is_written_in_both_ways() -> None:
     """ROS shows the long name, headsets get the short one."""
     name = InterfaceName.parse("geometry_msgs/Twist", "msg")
