@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable
+from typing import Generic, TypeVar
 
 FEW = 16
 """Who has less than this part of what each may have has little."""
@@ -75,3 +76,37 @@ class Toll:
         """A piece of work is done for it: for how many seconds nothing more should be taken from it."""
         self._paid_until = max(now - 1.0, self._paid_until) + self._each_s
         return min(self.LONGEST_S, max(0.0, self._paid_until - now))
+
+
+Holder = TypeVar("Holder", bound=Hashable)
+
+
+class Unfinished(Generic[Holder]):
+    """Bytes of frames that have begun, by who sends them. Beyond ``total`` the one that began first has to go: frames
+    of those who mean well end soon. Up to ``free`` of each are not counted."""
+
+    def __init__(self, free: int, total: int) -> None:
+        self._free = free
+        self._total = total
+        self._of: dict[Holder, int] = {}
+        self.used = 0
+
+    def __contains__(self, holder: object) -> bool:
+        return holder in self._of
+
+    def note(self, holder: Holder, amount: int) -> list[Holder]:
+        """So much of a frame is there; 0 when it has ended. Returns whose connections have to be closed."""
+        before = self._of.get(holder, 0)
+        if amount < before or amount <= self._free:  # it has ended, and maybe the next one has begun
+            self._of.pop(holder, None)
+            self.used -= before
+            before = 0
+        if amount > self._free:
+            self._of[holder] = amount
+            self.used += amount - before
+        gone = []
+        while self.used > self._total:
+            oldest = next(iter(self._of))
+            self.used -= self._of.pop(oldest)
+            gone.append(oldest)
+        return gone

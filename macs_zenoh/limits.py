@@ -37,6 +37,16 @@ ANSWER_BYTES = 1 << 20
 REASON_CHARACTERS = 500
 """Of a reason that is passed on to a person."""
 
+WAITING_IN_ALL_BYTES = 256 << 20
+"""What waits for all agents of a gateway that read too slowly. Of each it is ``outbox_bytes``, or one larger message,
+behind what is being written to it: two messages of 32 MiB for one that does not read."""
+
+UNFINISHED_IN_ALL_BYTES = 256 << 20
+"""Frames of all agents of a gateway that have begun and not ended."""
+
+UNFINISHED_FREE_BYTES = 64 << 10
+"""So much of a frame that has begun is not counted."""
+
 REQUESTS_PER_S = 1000
 """Management messages of one TCP agent, a second's worth at once; one that sends more is read from more slowly."""
 

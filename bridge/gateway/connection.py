@@ -19,7 +19,7 @@ from typing import Protocol, cast
 from macs_zenoh.addresses import joined, of_peer
 from macs_zenoh.budget import Toll
 from macs_zenoh.existing import Asked, Verdict, to_headset, to_newer, to_robot
-from macs_zenoh.limits import REQUESTS_PER_S
+from macs_zenoh.limits import REQUESTS_PER_S, UNFINISHED_FREE_BYTES
 from macs_zenoh.messages import ROS, AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
 from macs_zenoh.peer import Event, Joined, Left, Peer, Rejected, Sent, State
 from macs_zenoh.queues import Chunk, Outbox
@@ -27,6 +27,7 @@ from macs_zenoh.robot_nodes import RobotNodes
 from macs_zenoh.wire import FrameDecoder, Header, encode_message
 
 from .brake import Brake
+from .memory import Memory
 from .shortcut import Shortcut
 
 log = logging.getLogger("macs.gateway")
@@ -85,7 +86,13 @@ class Connection(asyncio.BufferedProtocol):
     """A TCP agent's socket. Everything it means is decided in `Peer` and by its gateway."""
 
     def __init__(
-        self, owner: Owner, *, outbox_bytes: int, stall_s: float, robot_packages: Collection[str] = ()
+        self,
+        owner: Owner,
+        *,
+        memory: Memory,
+        outbox_bytes: int,
+        stall_s: float,
+        robot_packages: Collection[str] = (),
     ) -> None:
         self.owner = owner
         self.peer: Peer
@@ -93,6 +100,7 @@ class Connection(asyncio.BufferedProtocol):
         self.host = self.address = "?"
         self.drops: Counter[str] = Counter()
         self._outbox = Outbox(outbox_bytes)
+        self._memory = memory
         self._stall_s = stall_s
         self._transport: asyncio.Transport
         self._ready: list[Chunk] = []
@@ -186,6 +194,9 @@ class Connection(asyncio.BufferedProtocol):
         began = time.monotonic()
         self._unread -= nbytes
         self._events(self.peer.advance(nbytes, began))
+        if (unfinished := self.peer.partial_bytes) > UNFINISHED_FREE_BYTES or self in self._memory.unfinished:
+            for connection in self._memory.unfinished.note(self, unfinished):
+                connection.cut_unfinished()
         took_s = time.monotonic() - began
         self._spent_s += took_s
         if took_s > TURN_S:
@@ -199,6 +210,7 @@ class Connection(asyncio.BufferedProtocol):
 
     def pause_writing(self) -> None:
         self._paused_at = time.monotonic()
+        self._account()
         self._schedule()
 
     def resume_writing(self) -> None:
@@ -206,6 +218,7 @@ class Connection(asyncio.BufferedProtocol):
             self._paused_at = None
             while self._outbox and self._paused_at is None:  # writing may pause us again
                 self._write(self._outbox.take(WRITE_BUFFER_BYTES))
+        self._account()
         if self.congested and not self._outbox:
             self.congested = False
             self.brake.release()
@@ -223,6 +236,8 @@ class Connection(asyncio.BufferedProtocol):
         if self.greeted:
             self.peer.lost()
         self.brake.release()
+        self._memory.unfinished.note(self, 0)
+        self._memory.waiting.set(self, self.host, 0)
         self.owner.closed(self)
 
     # -- in ------------------------------------------------------------------------------------------------------
@@ -271,8 +286,9 @@ class Connection(asyncio.BufferedProtocol):
             self._gather(messages)
             return
         for message in messages:
-            if not self._outbox.put_call(message):
+            if self._has_room(len(message)) and not self._outbox.put_call(message):
                 self._warn_once("outbox_full", f"it reads too slowly: {self._outbox.bytes} bytes are waiting")
+            self._account()
         self.congested = self._outbox.bytes > self._outbox.limit_bytes // 4
 
     def send_stream(self, node: str, messages: Sequence[Chunk]) -> None:
@@ -282,7 +298,23 @@ class Connection(asyncio.BufferedProtocol):
             return
         depth, drop_new = self.owner.stream_depth(self, node)
         for message in messages:
-            self._outbox.put_stream(node, message, depth=depth, drop_new=drop_new)
+            if self._has_room(len(message)):
+                self._outbox.put_stream(node, message, depth=depth, drop_new=drop_new)
+                self._account()
+
+    def _has_room(self, size: int) -> bool:
+        """Whether so much more may wait, as far as others are concerned."""
+        why = self._memory.waiting.judge(self, self.host, size)
+        if why is not None:
+            self.complain("outbox_full", f"it reads too slowly, and {why}")
+        return why is None
+
+    def _account(self) -> None:
+        """Note what waits for this agent, here and in its transport."""
+        waiting = self._outbox.bytes + self._transport.get_write_buffer_size()
+        if self._paused_at is None and not self._outbox:
+            waiting = 0
+        self._memory.waiting.set(self, self.host, waiting)
 
     @property
     def free(self) -> bool:
@@ -306,10 +338,13 @@ class Connection(asyncio.BufferedProtocol):
 
     def _gather(self, messages: Sequence[Chunk]) -> None:
         """Keep for the flush at the end of the batch, but no more than the transport may hold."""
+        size = len(messages) * len(messages[0])
+        if size > WRITE_BUFFER_BYTES and not self._has_room(size):
+            return
         if not self._ready:
             self.owner.dirty(self)
         self._ready += messages
-        self._ready_bytes += len(messages) * len(messages[0])
+        self._ready_bytes += size
         if self._ready_bytes > WRITE_BUFFER_BYTES:
             self.flush()
 
@@ -425,6 +460,11 @@ class Connection(asyncio.BufferedProtocol):
     def _go_on(self) -> None:
         self._tolled = None
         self.resume()
+
+    def cut_unfinished(self) -> None:
+        """Its frame has begun before all others that have not ended, and there is too much of those."""
+        self.drops["unfinished_frame"] += 1
+        self.close("its frame does not end, and others need the room")
 
     # -- life ----------------------------------------------------------------------------------------------------
 

@@ -63,6 +63,7 @@ from .delivery import Delivery, Stream
 from .door import Door
 from .leases import Leases
 from .listener import Listener, descriptors
+from .memory import Memory
 from .own_keys import OwnKeys
 from .renumbering import Renumbering
 from .robots import RobotCalls, StreamChanges
@@ -126,6 +127,7 @@ class Gateway:
         self._credits: Credits[str] = Credits(settings.max_frames_per_s)
         self._online_reply = b""
         """Who is online, as the answer to whoever asks; empty when that has changed."""
+        self._memory = Memory(settings.outbox_bytes, settings.max_frame_bytes)
         self._numbers = 0
         self._waiting = WaitingRoom(settings.handshake_s, self._no_id)
         self._routes: dict[Connection, Routes] = {}
@@ -243,6 +245,7 @@ class Gateway:
         settings = self.settings
         return Connection(
             self,
+            memory=self._memory,
             outbox_bytes=settings.outbox_bytes,
             stall_s=settings.stall_s,
             robot_packages=settings.robot_packages,

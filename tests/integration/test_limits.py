@@ -16,7 +16,15 @@ import macs_zenoh
 from bridge.headset.client import Headset
 from bridge.headset.frames import NodeSpec, registration
 from macs_zenoh.errors import Refused, Unreachable
-from macs_zenoh.messages import Metadata, NodeRefused, NodeType, StreamData, decode_data, encode_management
+from macs_zenoh.messages import (
+    Configuration,
+    Metadata,
+    NodeRefused,
+    NodeType,
+    StreamData,
+    decode_data,
+    encode_management,
+)
 from macs_zenoh.wire import encode_frame, encode_message
 from tests.integration.conftest import Connect, StartGateway, until
 from tests.programs import Program, free_port
@@ -262,3 +270,59 @@ async def test_a_thousand_headsets() -> None:
             assert (memory_bytes(gateway.pid) - before) / 1000 < 100 * 1024
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+async def test_those_that_do_not_read_have_a_limit_together() -> None:
+    """Ten headsets that do not read, and are sent two frames of 31 MiB each, cost a gateway what all may have
+    together, not what each may; a neighbour is served, and all is as before when they have left."""
+    async with AsyncExitStack() as stack:
+        endpoint, gateway = await stack.enter_async_context(site())
+        neighbour = await stack.enter_async_context(await Headset.connect("127.0.0.1", gateway.port))
+        stalled = [stack.enter_context(socket.create_connection(("127.0.0.1", gateway.port))) for _ in range(10)]
+        for number, sock in enumerate(stalled):
+            management = encode_management(Configuration(agent_type=2, agent_id=number + 2, group_id=0))
+            sock.sendall(encode_frame(management=management))
+        while len((await neighbour.online()).unity_agent_ids) < 11:
+            await asyncio.sleep(0.05)
+        sender = await stack.enter_async_context(macs_zenoh.join("ros", id=1, connect=[endpoint]))
+        before = memory_bytes(gateway.pid)
+        for _ in range(2):
+            for number in range(10):
+                sender.send(bytes(31 << 20), to="unity", ids=[number + 2], metadata=Metadata(message_manager="Big"))
+                await asyncio.sleep(0.1)
+        await answers(neighbour)
+        assert memory_bytes(gateway.pid) - before < (256 + 96) << 20
+        for sock in stalled:
+            sock.close()
+        while len((await neighbour.online()).unity_agent_ids) > 1:
+            await asyncio.sleep(0.05)
+        assert any("outbox_full" in line for line in gateway.log)
+
+
+async def test_frames_that_do_not_end_have_a_limit_together() -> None:
+    """Of fourteen frames that have come to 31 MiB and do not end, those that began first are cut when all together
+    take too much; a neighbour, and whoever ends what it begins, are served."""
+    async with AsyncExitStack() as stack:
+        _, gateway = await stack.enter_async_context(site())
+        neighbour = await stack.enter_async_context(await Headset.connect("127.0.0.1", gateway.port))
+        good = await stack.enter_async_context(await Headset.connect("127.0.0.1", gateway.port))
+        before = memory_bytes(gateway.pid)
+        begun = struct.pack("<B30xII", 2, 0, 31 << 20) + bytes(30 << 20)
+        halves = []
+        for _ in range(14):
+            reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port)
+            stack.callback(writer.close)
+            configuration = encode_management(Configuration(agent_type=2, agent_id=1, group_id=0))
+            writer.write(encode_frame(management=configuration) + begun)
+            with suppress(ConnectionError):
+                await writer.drain()
+            halves.append(reader)
+        await good.send(bytes(4 << 20), to=2, ids=[neighbour.id])
+        while len((await asyncio.wait_for(neighbour.__anext__(), 10)).data) < 4 << 20:
+            pass
+        await answers(neighbour)
+        assert memory_bytes(gateway.pid) - before < (256 + 96) << 20
+        ended = asyncio.wait_for(halves[0].read(), 10)
+        with suppress(ConnectionError):
+            await ended
+        assert any("its frame does not end" in line for line in gateway.log)

@@ -15,6 +15,7 @@ import uvloop
 
 from bridge.gateway import Gateway
 from bridge.gateway.connection import Connection
+from bridge.gateway.memory import Memory
 from bridge.headset import frames
 from bridge.headset.frames import NodeSpec
 from macs_zenoh import Agent, join
@@ -253,7 +254,7 @@ async def connection() -> AsyncIterator[tuple[Connection, socket.socket]]:
     made: list[Connection] = []
 
     def make() -> Connection:
-        made.append(Connection(Nobody(), outbox_bytes=64 << 20, stall_s=30))  # type: ignore[arg-type]
+        made.append(Connection(Nobody(), memory=Memory(64 << 20, 32 << 20), outbox_bytes=64 << 20, stall_s=30))  # type: ignore[arg-type]
         return made[0]
 
     server = await asyncio.get_running_loop().create_server(make, "127.0.0.1", 0)

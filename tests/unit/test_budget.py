@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from macs_zenoh.budget import Budget, Toll
+from macs_zenoh.budget import Budget, Toll, Unfinished
 
 
 def test_each_address_and_all_have_bounds() -> None:
@@ -59,3 +59,22 @@ def test_work_beyond_a_seconds_worth_is_paid_with_time() -> None:
         done += 1
     assert 950 <= done <= 1050
     assert toll.pay(70.0) == 0.0
+
+
+def test_of_unfinished_frames_the_oldest_goes() -> None:
+    """When frames that have begun take too much together, the one that began first is the one that has to go; those
+    that end, and small ones, are no trouble."""
+    unfinished: Unfinished[str] = Unfinished(free=10, total=100)
+    assert unfinished.note("slow", 50) == []
+    for _ in range(100):
+        assert unfinished.note("quick", 40) == []
+        assert unfinished.note("quick", 0) == []
+        assert unfinished.note("small", 10) == []
+    assert unfinished.used == 50
+    assert unfinished.note("quick", 30) == []
+    assert unfinished.note("quick", 60) == ["slow"]
+    assert unfinished.note("other", 50) == ["quick"]
+    assert unfinished.note("other", 30) == []
+    assert unfinished.note("other", 101) == ["other"]
+    assert unfinished.used == 0
+    assert "other" not in unfinished
