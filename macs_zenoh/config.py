@@ -291,8 +291,10 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     """Frames of every kind from one connection; the rest is dropped and counted. 0: no limit."""
     handshake_s: Seconds = 10.0
     """A connection that has not configured itself by then is closed."""
-    silence_s: Seconds = 10.0
-    """A connection silent for so long is dead: agents send a heartbeat after 5 s without other output."""
+    silence_s: Seconds = 60.0
+    """A connection silent for so long is closed. Agents send a heartbeat after 5 s without other output; but a headset
+    that is taken off for a moment sends none, and existing ones never connect again. Hosts that died are noticed by
+    TCP, within 20 s."""
     outbox_bytes: Annotated[int, Meta(ge=64 * 1024, le=4 * 1024**3)] = 8 * 1024 * 1024
     """Waiting for one connection, at most. One message may always wait, however large."""
     stall_s: Seconds = 30.0

@@ -74,7 +74,7 @@ class Limits(NamedTuple):
 
     max_frame_bytes: int = MAX_FRAME_BYTES
     handshake_s: float = 10.0
-    silence_s: float = 10.0
+    silence_s: float = 60.0
     held_frames: int = 256
     held_bytes: int = 1 << 20
     frames_per_s: float = 0.0
@@ -304,6 +304,11 @@ class Peer:
             view = view[size:]
         return events
 
+    @property
+    def heard_at(self) -> float:
+        """When anything was last heard of the agent."""
+        return self._heard_at
+
     def next_deadline(self) -> float:
         """When `tick` is due at the latest."""
         if self.state is GREETED:
@@ -422,9 +427,10 @@ class Peer:
             raise NotAllowed("operators come over Zenoh, where a router can check who they are")
         if self.state is ONLINE and kind != self.agent_type:
             raise NotAllowed(f"a configured agent of type {self.agent_type} cannot become type {kind}")
+        same = configuration.extensions == self.extensions
         self.extensions = configuration.extensions
         self.functionality = configuration.functionality or self.functionality
-        if self.state is ONLINE and group == self.group:
+        if self.state is ONLINE and group == self.group and same:
             return
         self.state = ONLINE
         self._decoder.runs = not self._limits.frames_per_s  # a rate limit is for each frame

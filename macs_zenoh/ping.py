@@ -9,6 +9,9 @@ from .errors import BadJson
 from .limits import REQUEST_BYTES
 from .wire import Buffer, encode_message, split_message
 
+MOST_AWAY = 1000
+"""So many agents that are away are named: an answer has a size."""
+
 
 class Pong(msgspec.Struct, frozen=True, kw_only=True):
     """One program, as it says itself. Fields that it does not know, or that we do not, are left out."""
@@ -29,10 +32,19 @@ class Pong(msgspec.Struct, frozen=True, kw_only=True):
     """What its session lost since it started, by name."""
     now: dict[str, int] = {}
     """What is so at this moment and should not be, by name: ``waiting_for_id`` connections of a gateway."""
+    away: list[tuple[int, int]] = []
+    """(type, id) of agents of a gateway that it has not heard of for a while, though they are connected."""
 
 
 def pong(
-    settings: MeshSettings, *, now_s: float, macs: str, zenoh: str, drops: dict[str, int], now: dict[str, int]
+    settings: MeshSettings,
+    *,
+    now_s: float,
+    macs: str,
+    zenoh: str,
+    drops: dict[str, int],
+    now: dict[str, int],
+    away: list[tuple[int, int]],
 ) -> Pong:
     """What a program with these settings says of itself."""
     return Pong(
@@ -46,6 +58,7 @@ def pong(
         group_slots=settings.group_slots,
         drops=drops,
         now=now,
+        away=away[:MOST_AWAY],
     )
 
 

@@ -2,7 +2,8 @@
 
 A headset's session is its gateway's, so headsets with one session share a gateway. Robots are asked for their state:
 STATE says which are stopped, who has control of which topic, and ? for a robot that should answer and does not: it
-hangs, or access rules do not let you ask it ([operator] in the settings, or --as, say who you are).
+hangs, or access rules do not let you ask it ([operator] in the settings, or --as, say who you are). A headset that
+nothing was heard of for 10 s is away: taken off, or out of reach; its gateway lets it go later (silence_s).
 -v adds, for each robot: the emergency stop, who has registered what, control and dead-man of each topic, what was
 lost, and what it offers. Exit code 1 when no router answers, 130 after Ctrl-C.
 
@@ -26,7 +27,7 @@ from typing import Any
 from bridge.cli import options, robots, running
 from bridge.cli.robots import Node, Offers, Operator, Status
 from macs_zenoh.directory import AgentInfo
-from macs_zenoh.errors import MacsError, NotServed, Unreachable
+from macs_zenoh.errors import MacsError, NotServed, Refused, Unreachable
 from macs_zenoh.messages import ROS
 from macs_zenoh.named import Named
 
@@ -55,7 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--json",
         action="store_true",
-        help="for programs: a list of {type, id, group, zid, name}; robots also {status, problem}, with -v {offers}",
+        help="for programs: a list of {type, id, group, zid, name}, away ones also {away}; robots {status, problem}, "
+        "with -v {offers}",
     )
     parser.add_argument(
         "--timeout",
@@ -77,10 +79,12 @@ def run(args: argparse.Namespace) -> int:
         async with robots.operator(settings.mesh, caller, timeout_s=args.timeout) as operator:
             agents, names = await operator.online(), await operator.names()
             gateways = await operator.gateways()
+            looking = asyncio.ensure_future(operator.away(gateways, timeout_s=answer_s))
             online = [agent for agent in agents if agent.type == ROS]
             asked = (_ask(operator, robot, gateways, answer_s, offers=args.verbose) for robot in online)
             told = dict(zip((robot.id for robot in online), await asyncio.gather(*asked), strict=True))
-        sys.stdout.write((_json if args.json else _text)(agents, names, told, args.verbose) + "\n")
+            away = await looking
+        sys.stdout.write((_json if args.json else _text)(agents, names, told, away, args.verbose) + "\n")
         return 0
 
     return running.until_stopped(show, interrupted=running.INTERRUPTED)
@@ -98,6 +102,8 @@ async def _ask(
             told = replace(told, offers=offered, raw_offers=raw)
     except NotServed:
         told = replace(told, problem=await operator.why_silent(robot, gateways, timeout_s=timeout_s))
+    except Refused as refusal:  # of an existing program, its gateway refuses
+        told = replace(told, problem="" if robot.zid in gateways else refusal.reason)
     except MacsError as error:
         told = replace(told, problem=error.why if isinstance(error, Unreachable) else str(error))
     return told
@@ -106,12 +112,17 @@ async def _ask(
 # -- for programs ----------------------------------------------------------------------------------------------------
 
 
-def _rows(agents: list[AgentInfo], names: list[Named]) -> list[dict[str, Any]]:
+Away = Collection[tuple[int, int]]
+"""(type, id) of agents behind gateways of which nothing was heard for a while."""
+
+
+def _rows(agents: list[AgentInfo], names: list[Named], away: Away) -> list[dict[str, Any]]:
     """One row per agent with its name if it has one; a name whose agent is not online has a row of its own."""
     online = {agent.key for agent in agents}
     name_of = {(named.type, named.id): named.name for named in names}
     rows = [
         {"type": a.type_name, "id": a.id, "group": a.group, "zid": a.zid, "name": name_of.get(a.key, "")}
+        | ({"away": True} if a.key in away else {})
         for a in agents
     ]
     return rows + [
@@ -121,8 +132,8 @@ def _rows(agents: list[AgentInfo], names: list[Named]) -> list[dict[str, Any]]:
     ]
 
 
-def _json(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], verbose: bool) -> str:
-    rows = _rows(agents, names)
+def _json(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], away: Away, verbose: bool) -> str:
+    rows = _rows(agents, names, away)
     for row in rows:
         if row["type"] == "ros" and (robot := told.get(row["id"])) is not None:
             row["status"], row["problem"] = robot.raw_status, robot.problem
@@ -134,11 +145,12 @@ def _json(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], ve
 # -- for people ------------------------------------------------------------------------------------------------------
 
 
-def _text(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], verbose: bool) -> str:
-    rows = _rows(agents, names)
+def _text(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], away: Away, verbose: bool) -> str:
+    rows = _rows(agents, names, away)
     if not rows:
         return "nobody is online"
     states = [_state(told.get(row["id"])) if row["type"] == "ros" else "" for row in rows]
+    states = ["away" if row.get("away") else state for row, state in zip(rows, states, strict=True)]
     if any(states):
         states = [state or "-" for state in states]
     lines = [("TYPE", "ID", "GROUP", "SESSION", "NAME", "STATE" if any(states) else "")]

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import msgspec
 from msgspec import Struct
 
+from macs_zenoh import ping
 from macs_zenoh.config import MeshSettings, OperatorSettings
 from macs_zenoh.directory import AgentInfo, Directory
 from macs_zenoh.errors import MacsError, Refused, Unreachable, UsageError
-from macs_zenoh.keyexpr import LEASE, NAME, PRESENCE, type_name, type_number
+from macs_zenoh.keyexpr import LEASE, NAME, PING, PRESENCE, type_name, type_number
 from macs_zenoh.messages import OPERATOR, ROS, Metadata
 from macs_zenoh.named import Named, Names
 from macs_zenoh.routing import call
@@ -165,6 +166,18 @@ class Operator:
         """The sessions of gateways: who is behind one answers no calls."""
         leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every(), timeout_s=self._timeout_s)]
         return {str(lease["zid"]) for lease in leases if lease is not None}
+
+    async def away(self, gateways: Collection[str], *, timeout_s: float) -> set[tuple[int, int]]:
+        """(type, id) of the agents of these gateways that are silent; of gateways that do not answer, none."""
+        asked = (self._away(zid, timeout_s) for zid in gateways)
+        return {agent for agents in await asyncio.gather(*asked) for agent in agents}
+
+    async def _away(self, zid: str, timeout_s: float) -> Collection[tuple[int, int]]:
+        try:
+            answer = await self._mesh.query(PING.of(zid=zid), b"", timeout_s=timeout_s)
+            return ping.decode(answer)[0].away
+        except MacsError:
+            return ()
 
     async def why_silent(self, robot: AgentInfo, gateways: Collection[str], *, timeout_s: float) -> str:
         """Why a robot that is online does not serve a verb; empty when it need not: it is behind a gateway, or it

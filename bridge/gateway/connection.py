@@ -7,6 +7,7 @@ import fcntl
 import logging
 import math
 import socket
+import struct
 import sys
 import termios
 import threading
@@ -31,6 +32,16 @@ from .memory import Memory
 from .shortcut import Shortcut
 
 log = logging.getLogger("macs.gateway")
+
+AWAY_S = 10.0
+"""An agent that nothing was heard of for so long, two heartbeats, is away."""
+
+DEAD_MS = 18_000
+"""A host that has acknowledged nothing for so long, while something is on its way to it, is gone. One whose program
+stands still acknowledges all the same."""
+
+LOOK_S = 1.0
+"""How often it is looked whether the host of an agent that is away is gone."""
 
 LAST_TYPES = 4096
 """Of how many names of nodes it is remembered which type the agent last had."""
@@ -519,7 +530,9 @@ class Connection(asyncio.BufferedProtocol):
         due = self.peer.next_deadline()
         if self._paused_at is not None:
             due = min(due, self._paused_at + self._stall_s)
-        delay_s = max(0.0, due - time.monotonic()) + 0.001
+        now = time.monotonic()
+        due = min(due, max(self.peer.heard_at + AWAY_S, now + LOOK_S))
+        delay_s = max(0.0, due - now) + 0.001
         if self._unread > 0:
             delay_s = max(delay_s, READ_S)
         self._timer = asyncio.get_running_loop().call_later(delay_s, self._tick)
@@ -530,8 +543,14 @@ class Connection(asyncio.BufferedProtocol):
             self._events(self.peer.tick(now))
         if self._paused_at is not None and now >= self._paused_at + self._stall_s:
             self.close(f"it has not read for {self._stall_s:g} s")
+        elif self.is_away(now) and _is_gone(self._transport.get_extra_info("socket")):
+            self.close("its host does not answer")
         if self.peer.state is not State.GONE:
             self._schedule()
+
+    def is_away(self, now: float) -> bool:
+        """Whether nothing was heard of the agent for a while, though it is connected."""
+        return now >= self.peer.heard_at + AWAY_S
 
     def _must_be_read(self) -> bool:
         """Whether the agent's time has run out, but not all of what it had sent by then was looked at: the loop may
@@ -551,6 +570,16 @@ def _waiting_bytes(sock: socket.socket) -> int:
         return int.from_bytes(fcntl.ioctl(sock.fileno(), termios.FIONREAD, bytes(4)), sys.byteorder)
     except OSError:  # it is closed
         return 0
+
+
+def _is_gone(sock: socket.socket) -> bool:
+    """Whether data is on its way to a host that acknowledges nothing; while none is, keep-alive probes find out."""
+    try:
+        info = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 60)
+    except (OSError, AttributeError):  # it is closed; not Linux
+        return False
+    (unacknowledged,), (since_ms,) = (struct.unpack_from("=I", info, at) for at in (24, 56))  # struct tcp_info
+    return bool(unacknowledged) and since_ms >= DEAD_MS
 
 
 def _tune(sock: socket.socket) -> None:

@@ -181,7 +181,7 @@ class Gateway:
         Raises ConfigError when the block is somebody else's, Unreachable when the port cannot be had.
         """
         self.mesh.keep_awake()
-        self.mesh.tells = self._now
+        self.mesh.tells, self.mesh.away = self._now, self._away
         await self._presence.start()
         self.mesh.on_link(lambda up: self._robots.repeat_all() if up else None)
         await self._leases.take()
@@ -211,6 +211,11 @@ class Gateway:
     def address(self) -> str:
         """Where it listens, as headsets are told it."""
         return joined(self.settings.host, self.port)
+
+    def _away(self) -> list[AgentKey]:
+        """Agents of which nothing was heard for a while."""
+        now = time.monotonic()
+        return sorted(connection.key for connection in self.agents.online() if connection.is_away(now))
 
     def _now(self) -> dict[str, int]:
         """What `macs doctor` is told besides losses."""

@@ -100,6 +100,8 @@ class Mesh:
         self.on_room = outgoing.on_room
         self.tells: Callable[[], dict[str, int]] = dict
         """What this program tells `macs doctor` of itself, by name: what is so now and should not be."""
+        self.away: Callable[[], list[tuple[int, int]]] = list
+        """(type, id) of a gateway's agents that are silent."""
         self._linked_with: set[str] = set()
         self._on_link: list[Callable[[bool], None]] = []
         self._on_router: list[Callable[[str], None]] = []
@@ -425,7 +427,9 @@ class Mesh:
 
         async def answer(key: str, payload: bytes) -> bytes:
             drops, now = dict(self.drops), self.tells()
-            said = ping.pong(self.settings, now_s=time.time(), macs=macs, zenoh=wheel, drops=drops, now=now)
+            said = ping.pong(
+                self.settings, now_s=time.time(), macs=macs, zenoh=wheel, drops=drops, now=now, away=self.away()
+            )
             return ping.encode(said, payload)
 
         return self.serve(PING.of(zid=self.zid), answer)

@@ -9,10 +9,11 @@ import time
 import pytest
 
 import macs_zenoh
+from macs_zenoh import ping
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import NotServed, Refused
 from macs_zenoh.existing import CDR
-from macs_zenoh.keyexpr import BROADCAST, GROUP
+from macs_zenoh.keyexpr import BROADCAST, GROUP, PING
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.messages import (
     ROS,
@@ -283,3 +284,27 @@ async def test_an_agent_is_told_the_true_sender(router: str) -> None:
         key, frame = call((ROS, 9), "look", (ROS, 7), b"", forged)
         await robot.query(key, frame, timeout_s=5)
         assert message.metadata == asked[0] == Metadata(ROS, 7, 5, "Greeting")
+
+
+async def test_a_silent_agent_is_away_and_stays(
+    router: str, start_gateway: StartGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An agent that nothing is heard of stays connected for a minute, and its gateway says that it is away."""
+    monkeypatch.setattr("bridge.gateway.connection.AWAY_S", 0.3)
+    gateway = await start_gateway()
+    assert gateway.settings.silence_s == 60
+    lively = await connect(gateway, heartbeat_s=0.05)
+    async with socket(gateway) as taken_off, await Mesh.open(MeshSettings(connect=[router])) as mesh:
+        taken_off.configure()
+        away = [(UNITY, taken_off.id)]
+
+        async def told() -> list[tuple[int, int]]:
+            return ping.decode(await mesh.query(PING.of(zid=gateway.mesh.zid), b"", timeout_s=5))[0].away
+
+        await until(lambda: gateway.agents.find(UNITY, taken_off.id))
+        deadline = time.monotonic() + 5
+        while await told() != away:
+            assert time.monotonic() < deadline
+        assert lively.connected
+        await taken_off.online()
+        assert await told() == []
