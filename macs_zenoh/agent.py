@@ -16,14 +16,16 @@ import time
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import NamedTuple
 
 from .config import MeshSettings, Priority, TrafficRule, changed
 from .directory import AgentInfo, Change, Directory
 from .errors import CallTimeout, OutOfRange, Unreachable, UsageError, WireError
+from .guard import Guard
 from .identity import Identity
 from .keyexpr import BROADCAST, CALL, GROUP, STREAM, type_name, type_number
-from .mesh import Handler, Mesh, Payload, Sample, Subscription, Traffic
+from .mesh import Mesh, Sample, Subscription, Traffic
 from .messages import BROADCAST as EVERYBODY
 from .messages import Metadata, NodeType
 from .presence import Presence
@@ -49,7 +51,7 @@ class Call(NamedTuple):
 
 CallHandler = Callable[[Call], Awaitable[bytes]]
 OnMessage = Callable[[Message], None]
-MessageAtOnce = Callable[[Message], bool]
+CallFirst = Callable[[Call], None]
 OnPresence = Callable[[AgentInfo, bool], None]
 OnId = Callable[[int, int], None]
 
@@ -63,8 +65,9 @@ class Agent:
 
     INBOX = 4096
 
-    def __init__(self, mesh: Mesh, agent_type: int, group: int) -> None:
+    def __init__(self, mesh: Mesh, agent_type: int, group: int, guard: Guard | None = None) -> None:
         self.mesh = mesh
+        self._guard = guard
         self.type_number = agent_type
         self.group = group
         self.id = 0
@@ -77,12 +80,11 @@ class Agent:
         self._inbox: deque[Message] = deque()
         self._arrived = asyncio.Event()
         self._on_message: OnMessage = self._keep_message
-        self._at_once: MessageAtOnce | None = None
         self._closed = False
         self._declared: list[Subscription] = []
         self._on_presence: list[OnPresence] = []
         self._on_id: list[OnId] = []
-        self._served: list[tuple[str, Handler, Subscription]] = []
+        self._served: list[tuple[Callable[[], Subscription], Subscription]] = []
         self._warned: set[tuple[int, int]] = set()
 
     @property
@@ -188,18 +190,11 @@ class Agent:
             except Unreachable:
                 return
 
-    def on_message(self, handler: OnMessage, *, at_once: MessageAtOnce | None = None) -> None:
-        """Pass messages to ``handler``, on the loop, instead of keeping them for `receive`; it should not raise.
-
-        A message to this agent's id that comes while no other waits is offered to ``at_once`` first, in a thread of
-        Zenoh's, which saves it the way to the loop. That must be quick and not wait for the loop; False: it has done
-        nothing, and the message goes to ``handler``.
-        """
-        self._at_once = None
+    def on_message(self, handler: OnMessage) -> None:
+        """Pass messages to ``handler``, on the loop, instead of keeping them for `receive`; it should not raise."""
         self._on_message = handler
         while self._inbox:
             handler(self._inbox.popleft())
-        self._at_once = at_once
 
     def _keep_message(self, message: Message) -> None:
         if len(self._inbox) >= self.INBOX:
@@ -213,14 +208,6 @@ class Agent:
         for key, payload in batch:
             for message in self._reader.read(key, payload, me, by_group=by_group):
                 self._on_message(message)
-
-    def _receive_at_once(self, key: str, payload: Payload) -> bool:
-        """A sample in a thread of Zenoh's."""
-        at_once = self._at_once
-        if at_once is None:
-            return False
-        message = self._reader.reread(key, payload)
-        return message is not None and at_once(message)
 
     def _bad_frame(self, key: str, error: WireError) -> None:
         self.drops["bad_frame"] += 1
@@ -259,13 +246,14 @@ class Agent:
                     raise Unreachable(f"{to}/{id} {verb}", error.why) from None
             await asyncio.sleep(RETRY_S)
 
-    def serve(self, verb: str, handler: CallHandler) -> Subscription:
+    def serve(self, verb: str, handler: CallHandler, *, first: CallFirst | None = None) -> Subscription:
         """Answer calls of ``verb`` with ``await handler(call)``; raise Refused in it to refuse with a reason.
 
+        ``first(call)`` is called before that, in a thread of Zenoh's, whatever the loop is busy with; it may refuse.
         It takes a moment until the whole mesh knows; callers who see this agent online ask again meanwhile.
         """
 
-        async def answer(key: str, payload: bytes) -> bytes:
+        def read(key: str, payload: bytes) -> Call:
             fields = CALL.parse(key)
             if fields is None:
                 raise UsageError(f"{key} is not a call")
@@ -273,10 +261,17 @@ class Agent:
             metadata = Metadata.decode(frame.metadata) if frame.metadata else Metadata()
             kind, agent_id = int(fields["from_type"]), int(fields["from_id"])
             metadata = metadata.sent_by(kind, agent_id)
-            return await handler(Call(verb, type_name(kind), agent_id, metadata, bytes(frame.body)))
+            return Call(verb, type_name(kind), agent_id, metadata, bytes(frame.body))
 
-        serving = self.mesh.serve(self._calls_of(verb), answer)
-        self._served.append((verb, answer, serving))
+        async def answer(key: str, payload: bytes) -> bytes:
+            return await handler(read(key, payload))
+
+        def serve() -> Subscription:
+            at_once = None if first is None else lambda key, payload: first(read(key, payload))
+            return self.mesh.serve(self._calls_of(verb), answer, first=at_once, gate=self._guard)
+
+        serving = serve()
+        self._served.append((serve, serving))
         return self._keep(serving)
 
     def _calls_of(self, verb: str) -> str:
@@ -313,9 +308,9 @@ class Agent:
     def _id_changed(self, old: int, new: int) -> None:
         self.id = new
         self._stream_keys = {}
-        for verb, answer, serving in self._served:
+        for serve, serving in self._served:
             if serving.is_open:
-                serving.become(self.mesh.serve(self._calls_of(verb), answer))
+                serving.become(serve())
         for callback in self._on_id:
             callback(old, new)
 
@@ -324,15 +319,18 @@ class Agent:
     async def _join(self, wanted_id: int | None) -> None:
         self._keep(self.mesh.answer_pings())
         await self._presence.start()
-        self._keep(self.mesh.subscribe(BROADCAST.every(), self._receive))
+        self._keep(self.mesh.subscribe(BROADCAST.every(), self._receive, gate=self._guard))
         if self.group:
             members = GROUP.every(group=self.group, type=self.type_number)
-            self._keep(self.mesh.subscribe(members, lambda batch: self._receive(batch, by_group=True)))
+            by_group = partial(self._receive, by_group=True)
+            self._keep(self.mesh.subscribe(members, by_group, gate=self._guard))
         self.id = await self._identity.take(wanted_id)
         self.serve("ping", _echo)
 
     def _listen(self, agent_id: int) -> Subscription:
-        return self.mesh.subscribe(inbox(self.type_number, agent_id), self._receive, at_once=self._receive_at_once)
+        if self._guard is not None:
+            self._guard.me = (self.type_number, agent_id)
+        return self.mesh.subscribe(inbox(self.type_number, agent_id), self._receive, gate=self._guard)
 
     def _keep(self, declared: Subscription) -> Subscription:
         self._declared.append(declared)
@@ -363,6 +361,7 @@ async def join(
     connect: Sequence[str] = (),
     settings: MeshSettings | None = None,
     traffic: Sequence[TrafficRule] = (),
+    guard: Guard | None = None,
     on_waiting: Callable[[str], None] | None = None,
 ) -> AsyncIterator[Agent]:
     """Join the mesh as an agent and leave it at the end of the block.
@@ -374,6 +373,7 @@ async def join(
         connect: router endpoints, e.g. ``["tcp/127.0.0.1:7447"]``; several give fail-over.
         settings: everything else about the connection; ``connect``, if given, replaces its endpoints.
         traffic: rules for what this agent sends, by key.
+        guard: judges all that comes, before it can wait.
         on_waiting: called once with the endpoints while no router answers; it waits as long as it takes.
 
     Raises:
@@ -388,7 +388,7 @@ async def join(
         settings = changed(settings, connect=list(connect))
     async with await Mesh.open(settings, traffic=traffic, on_waiting=on_waiting) as mesh:
         mesh.keep_awake()
-        agent = Agent(mesh, kind, group)
+        agent = Agent(mesh, kind, group, guard)
         try:
             await agent._join(id)
             log.info("joined as %s/%d%s", agent.type, agent.id, f" in group {group}" if group else "")

@@ -421,6 +421,14 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Who may release a stop, whoever pressed it; ``who_stopped`` takes back its own, as long as it is online."""
     register_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
     """Who may register to publish, to call, to serve and to give goals. Others may register for topics only."""
+    max_commands_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
+    """Of each agent, to all topics together; the rest is dropped and counted. 0: no limit, and a flood of one can hold
+    up the commands of others."""
+    max_requests_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 500.0
+    """The same of all else that an agent sends to this robot or asks it."""
+    max_command_age_s: Annotated[float, Meta(ge=0, le=3600)] = 0.5
+    """A command that has waited longer than this on its way is not carried out, nor are those that waited with it. 0:
+    all are."""
     rules: list[TopicRule] = []
 
     def _check(self) -> None:

@@ -24,7 +24,7 @@ class Credit:
         self._left, self._at = min(self._most, self._left + earned), now
         return self._left
 
-    def take(self, frames: int, now: float) -> bool:
+    def take(self, frames: float, now: float) -> bool:
         """Take so many frames, if they are covered."""
         if not self.frames_per_s:
             return True

@@ -18,6 +18,8 @@ class Link:
         self.down_bytes = 0
         self._moves = asyncio.Event()
         self._moves.set()
+        self._comes = asyncio.Event()
+        self._comes.set()
         self.is_cut = False
         self.ends: set[asyncio.StreamWriter] = set()
 
@@ -35,13 +37,18 @@ class Link:
         """From now on nothing goes towards the router, as on a link that is full: what is sent waits."""
         self._moves.clear()
 
+    def hold_down(self) -> None:
+        """The same for what comes from the router."""
+        self._comes.clear()
+
     def release(self) -> None:
         """What waits goes on."""
         self._moves.set()
+        self._comes.set()
 
-    async def moves(self) -> None:
+    async def moves(self, *, up: bool) -> None:
         """Wait while the link is held."""
-        await self._moves.wait()
+        await (self._moves if up else self._comes).wait()
 
 
 @asynccontextmanager
@@ -57,8 +64,7 @@ async def counted(router: str, *, buffer_bytes: int | None = None) -> AsyncItera
     async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, up: bool) -> None:
         with suppress(ConnectionError):
             while data := await reader.read(65536):
-                if up:
-                    await link.moves()
+                await link.moves(up=up)
                 link.up_bytes += len(data) if up else 0
                 link.down_bytes += 0 if up else len(data)
                 writer.write(data)

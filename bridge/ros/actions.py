@@ -138,6 +138,9 @@ class ActionNode(InterfaceNode):
                 goal.owner, goal.former = agent, None
 
     def emergency_stop(self, by: str) -> None:
+        self._loop.call_soon_threadsafe(self._cancel_all)
+
+    def _cancel_all(self) -> None:
         if self.held:
             for goal in self._goals.values():
                 self._cancel(goal)

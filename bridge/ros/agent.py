@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import TypeVar
@@ -27,6 +28,7 @@ from macs_zenoh.agent import Agent, Call
 from macs_zenoh.config import RobotSettings, Settings
 from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import MacsError, Refused, WireError
+from macs_zenoh.guard import Guard, Limits
 from macs_zenoh.keyexpr import type_name, type_number
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.messages import AddNode, FunctionalityRequest, Metadata, RemoveNode, decode_data, encode_data
@@ -55,9 +57,17 @@ class RobotAgent:
     """Connects an agent on the mesh with a ROS session. Made by `open_robot`."""
 
     def __init__(
-        self, agent: Agent, session: RosSession, settings: RobotSettings, managers: Managers | None = None
+        self,
+        agent: Agent,
+        session: RosSession,
+        settings: RobotSettings,
+        managers: Managers | None = None,
+        guard: Guard | None = None,
     ) -> None:
         self._managers = managers or {}
+        self._guard = guard
+        self._loop = asyncio.get_running_loop()
+        self._loop_thread = threading.get_ident()
         self.agent = agent
         self.session = session
         robot = Robot(
@@ -102,10 +112,14 @@ class RobotAgent:
             ("offers", self._offers),
             ("status", self._status),
             ("control", self._control),
-            ("stop", self._stop),
         ):
             self.agent.serve(verb, handler)
-        self.agent.on_message(self._receive, at_once=self.nodes.deliver_at_once)
+        self.agent.serve("stop", self._stopped, first=self._stop)
+        self.agent.on_message(self._receive)
+        if self._guard is not None:
+            self._guard.on_dropped = self.nodes.drops.note
+            self._guard.stop_name = self.nodes.stop.key.node_name if self.nodes.stop is not None else ""
+            self._guard.on_command = self.nodes.deliver
 
     def _receive(self, message: Message) -> None:
         try:
@@ -123,6 +137,8 @@ class RobotAgent:
 
     def close(self) -> None:
         """End everything that is open."""
+        if self._guard is not None:
+            self._guard.on_command = _ignore
         self.agent.on_message(_ignore)
         self.offers.close()
         for answer in self._answering:
@@ -201,16 +217,22 @@ class RobotAgent:
     async def _control(self, call: Call) -> bytes:
         return encode_data(self._controlled(Registrant(type_number(call.sender_type), call.sender_id), call.data))
 
-    async def _stop(self, call: Call) -> bytes:
-        """The emergency stop with an answer: data ``true`` or ``false``, as on its topic."""
+    def _stop(self, call: Call) -> None:
+        """The emergency stop with an answer: data ``true`` or ``false``, as on its topic. In a thread of Zenoh's."""
         if self.nodes.stop is None:
             raise Refused("this robot has no emergency stop")
         self.nodes.stop.set(Registrant(type_number(call.sender_type), call.sender_id), call.data != b"false")
+
+    async def _stopped(self, _call: Call) -> bytes:
         return self._state()
 
     # -- the mesh ------------------------------------------------------------------------------------------------
 
     def _send(self, to: Registrant, metadata: Metadata, data: bytes) -> None:
+        """From any thread; those of Zenoh and of the ROS graph must not wait for a full link."""
+        if threading.get_ident() != self._loop_thread:
+            self._loop.call_soon_threadsafe(self._send, to, metadata, data)
+            return
         try:
             self.agent.send(data, to=type_name(to.agent_type), ids=[to.agent_id], metadata=metadata)
         except MacsError as error:
@@ -300,15 +322,20 @@ async def open_robot(
     try:
         settings = await session.run(lambda: parameters.apply(session.node, settings))
         robot = settings.robot
+        guard = Guard(
+            Limits(robot.max_commands_per_s, robot.max_requests_per_s, robot.max_command_age_s),
+            Layout(settings.mesh.id_slots, settings.mesh.group_slots),
+        )
         async with macs_zenoh.join(
             "ros",
             id=robot.id,
             group=robot.group,
             settings=settings.mesh,
             traffic=settings.traffic,
+            guard=guard,
             on_waiting=on_waiting,
         ) as agent:
-            ros_agent = RobotAgent(agent, session, robot, own)
+            ros_agent = RobotAgent(agent, session, robot, own, guard)
             await ros_agent.start()
             log.info("robot %d serves %s", agent.id, session.full_name)
             try:

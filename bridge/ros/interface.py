@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 from rclpy.exceptions import NameValidationException
 from rclpy.type_support import NoTypeSupportImportedException
 
+from bridge.ros.alarms import Alarms
 from bridge.ros.early import NodeKey
 from bridge.ros.refusals import Refusals
 from bridge.ros.rules import Rules
@@ -58,7 +59,8 @@ class Drops(Counter[str]):
     ``failed`` messages that ROS or the mesh did not take; ``late_answer`` answers after their deadline, or to nothing;
     ``refused_by_manager`` management messages that an own manager did not take; ``not_in_control`` and ``stopped``
     commands that safety did not let pass; ``bad_request`` what asks for nothing that there is; ``bad_stop_state`` what
-    another agent of the ROS graph says of the emergency stop, and cannot be read.
+    another agent of the ROS graph says of the emergency stop, and cannot be read; ``flooded`` what one agent sends
+    above its allowance; ``too_old`` commands that have waited on their way.
     """
 
     LOGGED = 1000
@@ -92,6 +94,7 @@ class Robot:
         rules: what the settings say by name.
         group_of: an agent's group now, 0 for none.
         stop: the emergency stop.
+        alarms: calls back at a time, whatever the loop is busy with.
         refusals: who was told lately why what he sent was not taken.
     """
 
@@ -106,6 +109,7 @@ class Robot:
     stop: EmergencyStop = field(default_factory=EmergencyStop)
     prioritise_stream: Callable[[str, Priority | None], None] = lambda node, priority: None
     keep_stream: Callable[[str, int | None], bool] = lambda node, frames: False
+    alarms: Alarms = field(default_factory=Alarms)
     refusals: Refusals = field(default_factory=Refusals)
 
     def tell_refused(self, message: Message, topic: str, kind: str, reason: str) -> None:
@@ -230,14 +234,10 @@ class InterfaceNode(ABC):
 
     @abstractmethod
     def receive(self, message: Message) -> None:
-        """Take a message that names this node. On the loop."""
+        """Take a message that names this node. On the loop; commands (type 2) from any thread."""
 
     def refused(self, message: Message, reason: str) -> None:  # noqa: B027 - only some senders wait for an answer
         """A message of somebody who may not send it came; tell its sender, where that is possible. On the loop."""
-
-    def receive_at_once(self, message: Message) -> bool:
-        """The same in a thread of Zenoh's, for a message that is as usual; False: it is for `receive`."""
-        return False
 
     def left(self, agent: Registrant) -> None:  # noqa: B027 - only some nodes care
         """An agent left the mesh, registered here or not. On the loop."""
@@ -249,7 +249,7 @@ class InterfaceNode(ABC):
         """The robot has lost the mesh. On the loop."""
 
     def emergency_stop(self, by: str) -> None:  # noqa: B027 - only some nodes move the robot
-        """Somebody stopped the robot. On the loop."""
+        """Somebody stopped the robot. In any thread, and soon."""
 
     def retire(self) -> None:  # noqa: B027 - only some nodes have something open
         """The node will be closed: end what is open. On the loop, before `close`."""

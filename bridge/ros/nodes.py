@@ -1,6 +1,7 @@
 """The interface nodes of a robot: what headsets have registered, by node type and topic.
 
-`InterfaceNodes` belongs to the event loop; rclpy's entities are made and destroyed in the ROS thread.
+`InterfaceNodes` belongs to the event loop; rclpy's entities are made and destroyed in the ROS thread. Commands come in
+Zenoh's threads (`macs_zenoh.guard`), so that nothing that the loop is busy with can hold them up, nor a stop.
 """
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import threading
+import time
 from collections.abc import Iterator
 from functools import partial
 
@@ -71,6 +74,9 @@ class InterfaceNodes:
         self._removed: dict[str, float] = {}
         """When a node on this topic was removed last."""
         self._early = EarlyMessages()
+        self._early_lock = threading.RLock()
+        """Held while it is settled whether a message waits for its node, and while a node takes those that did."""
+        self._expiring = False
         self._expiry: asyncio.TimerHandle | None = None
         self._lingering: dict[tuple[NodeKey, Registrant], asyncio.TimerHandle] = {}
 
@@ -208,7 +214,8 @@ class InterfaceNodes:
     def forget(self, registrant: Registrant, *, for_good: bool = False) -> None:
         """Take an agent that left off every node. Its commands count as stopped, registered or not. ``for_good``: it
         will not come back, its id is another one's."""
-        self._early.drop(registrant)
+        with self._early_lock:
+            self._early.drop(registrant)
         for node in self:
             node.left(registrant)
             if registrant in node.registrants:
@@ -229,7 +236,8 @@ class InterfaceNodes:
                 self._remove(node)
 
     def deliver(self, message: Message) -> None:
-        """Pass a message that names an interface node to it. Never raises for what a peer sent.
+        """Pass a message that names an interface node to it. Never raises for what a peer sent. On the loop; commands
+        (type 2) from any thread.
 
         A registration is a call of its own, which the first message can overtake: a few wait for a moment.
         """
@@ -239,25 +247,22 @@ class InterfaceNodes:
         if not stops and not self.rights.may_act(message.sender_type, message.sender_id):
             self._refuse(node, key, message)
             return
-        if node is not None and node.is_open:
-            node.receive(message)
-            return
-        for lost in self._early.hold(key, message, asyncio.get_running_loop().time()):
+        if node is None or not node.is_open:
+            with self._early_lock:
+                node = self._meant(key, message)  # it may have been opened in this moment
+                if node is None or not node.is_open:
+                    self._keep_early(key, message)
+                    return
+        node.receive(message)
+
+    def _keep_early(self, key: NodeKey, message: Message) -> None:
+        for lost in self._early.hold(key, message, time.monotonic()):
             reason = "more data before the registration than can be kept"
             self.drops.note("held_full", key.node_name[:80], reason)
             self._tell_unanswered(lost, reason)
-        self._schedule_expiry()
-
-    def deliver_at_once(self, message: Message) -> bool:
-        """The same in a thread of Zenoh's, for nodes that can; False: it is for `deliver`."""
-        metadata = message.metadata
-        node = self._places.sole(NodeKey(metadata.node_type, metadata.node_name))
-        return (
-            node is not None
-            and node.is_open
-            and (node is self.stop or self.rights.may_act(message.sender_type, message.sender_id))
-            and node.receive_at_once(message)
-        )
+        if not self._expiring:
+            self._expiring = True
+            self._loop.call_soon_threadsafe(self._schedule_expiry)
 
     def _meant(self, key: NodeKey, message: Message) -> InterfaceNode | None:
         """The node that a message is for; None as well while it depends on a registration that may be under way."""
@@ -275,7 +280,9 @@ class InterfaceNodes:
 
     def _pass_early(self, node: InterfaceNode, key: NodeKey) -> None:
         """Give a node what came before the registration that it belongs to."""
-        for message in self._early.take(key, lambda message: self._meant(key, message) is node):
+        with self._early_lock:
+            early = self._early.take(key, lambda message: self._meant(key, message) is node)
+        for message in early:
             node.receive(message)
 
     def last_words(self) -> None:
@@ -290,6 +297,7 @@ class InterfaceNodes:
             self._remove(node)
         if self._expiry is not None:
             self._expiry.cancel()
+        self.robot.alarms.close()
 
     def _create(self, kind: type[InterfaceNode], request: AddNode) -> InterfaceNode:
         if len(self) >= self._max_nodes:
@@ -340,10 +348,13 @@ class InterfaceNodes:
             return
         log.info("%s: %s %s", node.topic, node.ROLE, node.interface)
         try:
-            self._places.look(node)
-            self._pass_early(node, node.key)
+            with self._early_lock:
+                try:
+                    self._places.look(node)
+                    self._pass_early(node, node.key)
+                finally:
+                    node.is_open = True  # not sooner: no message may overtake these
         finally:
-            node.is_open = True  # not sooner: no message may overtake these
             for registrant in node.registrants:
                 node.welcome(registrant)
 
@@ -397,16 +408,22 @@ class InterfaceNodes:
         log.info("%s: %s removed", node.topic, node.ROLE)
 
     def _schedule_expiry(self) -> None:
-        if self._expiry is None and (deadline := self._early.next_deadline()) is not None:
-            self._expiry = asyncio.get_running_loop().call_at(deadline, self._expire)
+        with self._early_lock:
+            deadline = self._early.next_deadline()
+            self._expiring = deadline is not None
+        if self._expiry is None and deadline is not None:
+            self._expiry = self._loop.call_later(max(0.0, deadline - time.monotonic()), self._expire)
 
     def _expire(self) -> None:
         self._expiry = None
-        now = asyncio.get_running_loop().time()
-        for key, messages in self._early.expire(now).items():
+        now = time.monotonic()
+        with self._early_lock:
+            expired = self._early.expire(now)
+        for key, messages in expired.items():
             if key.node_type in ASKING and self._is_opening(key):
-                for message in messages:  # its node comes late, but it comes; its sender knows how long to wait
-                    self._early.hold(key, message, now)
+                with self._early_lock:
+                    for message in messages:  # its node comes late, but it comes; its sender knows how long to wait
+                        self._early.hold(key, message, now)
                 continue
             reason = f"nobody registered this node with type {key.node_type}"
             if self._places.first(key) is not None:

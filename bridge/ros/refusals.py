@@ -6,6 +6,7 @@ programs their gateway does not pass it on.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
@@ -20,10 +21,11 @@ REMEMBERED = 1024
 
 
 class Refusals:
-    """When to tell whom what."""
+    """When to tell whom what. From any thread."""
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         self._now = now
+        self._lock = threading.Lock()
         self._told: OrderedDict[tuple[object, ...], float] = OrderedDict()
 
     def due(self, message: Message, robot_id: int, topic: str, kind: str, reason: str) -> DataRefused | None:
@@ -31,12 +33,13 @@ class Refusals:
         node_type, node_name = message.metadata.node_type, message.metadata.node_name
         key = (message.sender_type, message.sender_id, node_type, node_name, kind)
         now = self._now()
-        if self._told.get(key, -AGAIN_S) + AGAIN_S > now:
-            return None
-        self._told[key] = now
-        self._told.move_to_end(key)
-        if len(self._told) > REMEMBERED:
-            self._told.popitem(last=False)
+        with self._lock:
+            if self._told.get(key, -AGAIN_S) + AGAIN_S > now:
+                return None
+            self._told[key] = now
+            self._told.move_to_end(key)
+            if len(self._told) > REMEMBERED:
+                self._told.popitem(last=False)
         return DataRefused(
             robot_id=robot_id, node_type=node_type, node_name=node_name, tos_name=topic, kind=kind, reason=reason
         )

@@ -20,6 +20,7 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.serialization import serialize_message
 
 from bridge.ros import fields, qos
+from bridge.ros.alarms import Alarm
 from bridge.ros.intake import OnRaw
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.latched import Newcomers, Receivers, Told, message_of
@@ -345,7 +346,8 @@ class PublisherNode(TopicNode):
         self.deadman = DeadMan(self.rule.deadman_s) if self.rule.deadman_message is not None else None
         self._stop_cdr = b""
         self._stopped_at = -math.inf
-        self._watch: asyncio.TimerHandle | None = None
+        self._watch: Alarm | None = None
+        self._retired = False
         self._publisher: Any = None
         self._least_bytes = 4
         self._cdr: UnityCdr | None = None
@@ -398,6 +400,7 @@ class PublisherNode(TopicNode):
 
     def retire(self) -> None:
         with self.lock:
+            self._retired = True
             if self._watch is not None:
                 self._watch.cancel()
             if self.deadman is not None and self.deadman.disarm("the node was removed"):
@@ -421,23 +424,18 @@ class PublisherNode(TopicNode):
                 self.robot.drops.note(name, f"{self.topic} from {Registrant.of(message)}", why)
                 self.robot.tell_refused(message, self.topic, name, why)
                 return
-            self._command(message)
-            if self._watch is None:
-                self._watch_silence()
+            if self._publish(to_ros(self._cdr, message.data)) and self.deadman is not None:
+                self.deadman.command(Registrant.of(message), time.monotonic())
+                if self._watch is None:
+                    self._watch_silence()
 
     def refused(self, message: Message, reason: str) -> None:
         self.robot.tell_refused(message, self.topic, "not_allowed", reason)
 
-    def receive_at_once(self, message: Message) -> bool:
-        with self.lock:
-            unwatched = self._watch is None and self.deadman is not None and self.deadman.silence_s is not None
-            if not self.is_open or unwatched or self._refusal(message) is not None:
-                return False
-            self._command(message)
-            return True
-
     def _refusal(self, message: Message) -> tuple[str, str] | None:
         """The name of the drop and why, when a message may not pass now."""
+        if self._retired:
+            return "no_node", "it was removed in this moment"
         problem = cdr_problem(message.data, self._least_bytes)
         if problem is not None:
             return "bad_cdr", f"refused {len(message.data)} bytes for {self.interface}: {problem}"
@@ -447,10 +445,6 @@ class PublisherNode(TopicNode):
             return "not_in_control", f"{self.control.holder(time.monotonic())} has control"
         return None
 
-    def _command(self, message: Message) -> None:
-        if self._publish(to_ros(self._cdr, message.data)) and self.deadman is not None:
-            self.deadman.command(Registrant.of(message), time.monotonic())
-
     def _publish(self, cdr: bytes) -> bool:
         try:
             self._publisher.publish(cdr)
@@ -459,7 +453,7 @@ class PublisherNode(TopicNode):
             return False
         return True
 
-    # -- safety, on the loop -------------------------------------------------------------------------------------
+    # -- safety, from any thread ---------------------------------------------------------------------------------
 
     def left(self, agent: Registrant) -> None:
         with self.lock:
@@ -493,7 +487,7 @@ class PublisherNode(TopicNode):
             if self.deadman.tick(time.monotonic()):
                 self._publish_stop(self.deadman.why)
             elif (deadline := self.deadman.deadline()) is not None:
-                self._watch = self._loop.call_at(deadline, self._watch_silence)
+                self._watch = self.robot.alarms.at(deadline, self._watch_silence)
 
     def _publish_stop(self, why: str) -> None:
         if self._publisher is not None and self._publish(self._stop_cdr):

@@ -14,11 +14,22 @@ from typing import Any
 
 import zenoh
 
+from macs_zenoh.guard import Ages, Gate
+
 from .panics import end_if_panic
 from .samples import AtOnce, OnBatch, OnNumbered, Outlet, Payload
 from .threads import keep_attached
 
 log = logging.getLogger("macs.mesh")
+
+URGENT = zenoh.Priority.REAL_TIME
+_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
+"""It goes on while the machine is suspended: what waited meanwhile is as old as it is."""
+
+
+def now_s() -> float:
+    """The time on that clock."""
+    return time.clock_gettime(_CLOCK)
 
 
 class Arrivals:
@@ -61,6 +72,7 @@ class Arrivals:
         self.asked: deque[zenoh.Query] = deque()
         """Queries on their way to the loop: an emergency stop can be among them, so no sample overtakes them."""
         self._own = threading.local()
+        self._ages = Ages()
         self.stirred = False
         """Whether a message or a question has come or gone since somebody took this back."""
 
@@ -130,6 +142,48 @@ class Arrivals:
 
         return receive
 
+    def guarded(self, on_batch: OnBatch, gate: Gate) -> Callable[[zenoh.Sample], None]:
+        """The same for what is judged before it may wait, and where Zenoh's thread must never wait: what the gate does
+        not admit is not even copied, what it takes is done, and for the rest there is room or there is not."""
+        queue, own, ages = self._queue, self._own, self._ages
+
+        def receive(sample: zenoh.Sample) -> None:
+            self.stirred = True
+            try:
+                payload = own.payload
+            except AttributeError:  # the first in this thread
+                payload = own.payload = None
+                keep_attached()
+            key = str(sample.key_expr)
+            if payload is None:
+                now, encoded = now_s(), sample.payload
+                size = len(encoded)
+                if not gate.admits(key, size, sample.priority == URGENT, now):
+                    if size <= self.AT_ONCE_BYTES:
+                        self._try(gate.rescue, key, encoded.to_bytes(), now)
+                    return
+                payload = encoded.to_bytes()
+                if size <= self.AT_ONCE_BYTES:
+                    stamp = sample.timestamp
+                    age_s = ages.age(stamp.get_id(), stamp.get_time_as_ntp64().as_secs_f64(), now) if stamp else 0.0
+                    if self._try(gate.first, key, payload, age_s, now):
+                        return
+            if len(queue) >= self.LIMIT or not self._takes_room_for(len(payload)):
+                self._drops["loop_behind"] += 1
+                return
+            queue.append((on_batch, (key, payload)))
+            if not self._waiting:
+                self._wake_loop()
+
+        return receive
+
+    def _try(self, take: Callable[..., bool | None], *args: Any) -> bool:
+        try:
+            return bool(take(*args))
+        except Exception:
+            log.exception("handling a sample failed")  # it may have been half done: not once more
+            return True
+
     def mark(self, on_mark: OnBatch) -> None:
         """Call ``on_mark`` on the loop after all that has arrived so far. From any thread."""
         self._queue.append((on_mark, ("", b"")))
@@ -186,6 +240,16 @@ class Arrivals:
         if not self._patiently(lambda: self._large_bytes == 0 or self._large_bytes + size <= self.LIMIT_BYTES):
             return False
         with self._large_lock:
+            self._large_bytes += size
+        return True
+
+    def _takes_room_for(self, size: int) -> bool:
+        """The same without waiting, for any payload."""
+        if size <= self.LARGE_BYTES:
+            return True
+        with self._large_lock:
+            if self._large_bytes and self._large_bytes + size > self.LIMIT_BYTES:
+                return False
             self._large_bytes += size
         return True
 

@@ -27,18 +27,19 @@ from macs_zenoh.errors import (
     Refused,
     Unreachable,
 )
+from macs_zenoh.guard import Gate
 from macs_zenoh.keyexpr import PING
 from macs_zenoh.shaping import Shaper
 from macs_zenoh.versions import installed
 
-from .arrivals import Arrivals
+from .arrivals import Arrivals, now_s
 from .awake import Awake
 from .opening import check_files, first_line, insert, zenoh_config
 from .outgoing import Outgoing
 from .panics import call, end_if_panic, end_on_panics, last_words, watched
 from .recovered import Recovered
 from .samples import AtOnce, Handler, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
-from .threads import shared_threads
+from .threads import keep_attached, shared_threads
 
 log = logging.getLogger("macs.mesh")
 
@@ -264,6 +265,7 @@ class Mesh:
         on_batch: OnBatch,
         *,
         at_once: AtOnce | None = None,
+        gate: Gate | None = None,
         reliable: bool = False,
         on_miss: OnMiss | None = None,
     ) -> Subscription:
@@ -271,7 +273,8 @@ class Mesh:
         mesh, as long as it was put with one kind of traffic.
 
         ``at_once`` is offered a sample that comes from elsewhere while nothing else waits, in a thread of Zenoh's,
-        which saves it the way to the loop; what it does not take goes to ``on_batch``.
+        which saves it the way to the loop; what it does not take goes to ``on_batch``. A ``gate`` judges every sample
+        in that thread, whatever waits.
 
         ``reliable``: what a source keeps (`keep`) is received in order and once, also through outages. Samples that
         it has no more are counted as ``missed``, and ``on_miss(key, count)`` hears of them. What sources do not keep
@@ -290,6 +293,9 @@ class Mesh:
             )
             self._recovered.add(recovered)
             return recovered.declare()
+        if gate is not None:
+            guarded = zenoh.handlers.Callback(self._arrivals.guarded(on_batch, gate), indirect=False)
+            return Subscription(self._session.declare_subscriber(key, guarded))
         receive = self._arrivals.receiver(on_batch, at_once=at_once)
         return Subscription(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
@@ -378,18 +384,30 @@ class Mesh:
         await ended.wait()
         return answers
 
-    def serve(self, key: str, handler: Handler, *, stand_in: bool = False) -> Subscription:
+    def serve(
+        self,
+        key: str,
+        handler: Handler,
+        *,
+        stand_in: bool = False,
+        first: Callable[[str, bytes], None] | None = None,
+        gate: Gate | None = None,
+    ) -> Subscription:
         """Answer queries on ``key`` with ``await handler(key, payload)``; raise Refused in it to refuse.
 
-        With ``stand_in`` it is asked only where nobody else serves the key.
+        With ``stand_in`` it is asked only where nobody else serves the key. ``first`` is called at once with every
+        query, in a thread of Zenoh's; unless it raises Refused, the answer is the handler's, on the loop. What the
+        ``gate`` does not admit has no answer.
         """
 
-        async def answer(query: zenoh.Query) -> None:
+        async def answer(query: zenoh.Query, problem: Refused | None) -> None:
             self._arrivals.asked.popleft()
             with query:
                 name = str(query.key_expr)
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
+                    if problem is not None:
+                        raise problem
                     reply = await handler(name, payload)
                     if reply is not None:
                         query.reply(query.key_expr, reply)
@@ -407,15 +425,22 @@ class Mesh:
                     end_if_panic(error)
                     raise
 
-        def spawn(query: zenoh.Query) -> None:
-            task = self._loop.create_task(answer(query))
+        def spawn(query: zenoh.Query, problem: Refused | None) -> None:
+            task = self._loop.create_task(answer(query, problem))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
         def on_query(query: zenoh.Query) -> None:
             self._arrivals.stirred = True
+            keep_attached()
+            problem = _tried(first, query) if first is not None else None
+            if gate is not None:
+                size = len(query.payload) if query.payload is not None else 0
+                if not gate.admits(str(query.key_expr), size, False, now_s()):
+                    query.drop()  # type: ignore[no-untyped-call]
+                    return
             self._arrivals.asked.append(query)
-            self._from_thread(spawn, query)
+            self._from_thread(spawn, query, problem)
 
         answering = zenoh.handlers.Callback(on_query, indirect=False)
         # Zenoh asks one that is complete if there is any, else all
@@ -477,6 +502,20 @@ class Mesh:
             self._loop.call_soon_threadsafe(callback, *args)
         except RuntimeError:  # the loop is closed: the program is ending and nobody waits for this
             log.debug("the event loop has ended")
+
+
+def _tried(first: Callable[[str, bytes], None], query: zenoh.Query) -> Refused | None:
+    """Why what had to be done at once was not."""
+    try:
+        first(str(query.key_expr), query.payload.to_bytes() if query.payload is not None else b"")
+    except Refused as refusal:
+        return refusal
+    except MacsError as error:
+        return Refused(str(error))
+    except Exception:
+        log.exception("call %s failed", query.key_expr)
+        return Refused("internal error, see the log there")
+    return None
 
 
 def _problem(key: str, payload: bytes, timeout_s: float) -> MacsError:

@@ -100,9 +100,9 @@ class Site:
     settings: Path
     domain: int
 
-    def robot(self, number: int = 1, *argv: str) -> Program:
+    def robot(self, number: int = 1, *argv: str, router: str = "") -> Program:
         """A robot agent, not started yet."""
-        common = ("-e", self.router.endpoint, "--settings", str(self.settings))
+        common = ("-e", router or self.router.endpoint, "--settings", str(self.settings))
         return Program("agent", "--id", str(number), *common, *argv, env={"ROS_DOMAIN_ID": str(self.domain)})
 
     def headset(self, number: int = 300) -> Any:

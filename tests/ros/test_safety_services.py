@@ -116,6 +116,8 @@ async def test_calls_that_wait_for_their_turn_are_refused(site: SimpleNamespace)
 async def test_a_topic_may_be_allowed_as_well(site: SimpleNamespace) -> None:
     """A lamp that shall go on working does, a drive does not."""
     lamp, wheels = await hear(site.peer, "/lamp"), await hear(site.peer, "/cmd_vel")
+    node = site.nodes.robot.session.node
+    await until(lambda: node.count_subscribers("/lamp") and node.count_subscribers("/cmd_vel"))
     for topic in ("/lamp", "/cmd_vel"):
         await site.nodes.add(adding(topic, "geometry_msgs/Twist", node_type=NodeType.PUBLISHER))
     site.nodes.stop.press("unity/6")

@@ -1,0 +1,65 @@
+"""Commands that have waited on their way are not carried out: what is old is not what somebody wants now."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from pathlib import Path
+
+from driven import STOPPED, driving, hear, may_command, send, send_bool, site
+from ros_peer import Peer, until
+from test_safety_shared import told
+
+from tests.links import counted
+
+
+async def test_a_suspended_agent_does_not_make_up_for_lost_time(domain: int, peer: Peer, tmp_path: Path) -> None:
+    """SIGSTOP for 1.6 s while commands come: what waited is counted and not carried out, but for the newest at most,
+    and what comes afterwards is."""
+    heard = await hear(peer)
+    async with site(domain, tmp_path) as place, place.robot() as robot, place.headset() as driver:
+        await may_command(driver, 1)
+        async with driving(driver, 1, hz=20):
+            await until(lambda: heard.last == 0.5)
+            robot.send_signal(signal.SIGSTOP)
+            try:
+                await asyncio.sleep(0.2)
+                before = len(heard.values)
+                for number in range(14):
+                    send(driver, 1, 100.0 + number)
+                    await asyncio.sleep(0.1)
+            finally:
+                robot.send_signal(signal.SIGCONT)
+            await until(lambda: len([v for _, v in heard.values[before:] if v == 0.5]) > 5)
+        old = [value for _, value in heard.values[before:] if value >= 100]
+        assert len(old) <= 1, old
+        assert (await told(driver, 1))["drops"]["too_old"] >= 13
+
+
+async def test_a_link_that_stood_still_brings_no_old_commands(domain: int, peer: Peer, tmp_path: Path) -> None:
+    """The same where the network between router and robot stood still, and a stop that waited there still stops."""
+    heard = await hear(peer)
+    async with (
+        site(domain, tmp_path) as place,
+        counted(place.router.endpoint) as link,
+        place.robot(router=link.endpoint),
+        place.headset() as driver,
+    ):
+        await may_command(driver, 1)
+        async with driving(driver, 1, hz=20):
+            await until(lambda: heard.last == 0.5)
+            link.hold_down()
+            await asyncio.sleep(0.1)
+            before = len(heard.values)
+            for number in range(10):
+                send(driver, 1, 100.0 + number)
+                await asyncio.sleep(0.1)
+            link.release()
+            await until(lambda: len([v for _, v in heard.values[before:] if v == 0.5]) > 5)
+            assert len([v for _, v in heard.values[before:] if v >= 100]) <= 1
+            link.hold_down()
+            send_bool(driver, 1, True)
+            await asyncio.sleep(1.0)
+            link.release()
+            await until(lambda: heard.last == STOPPED)
+            assert (await told(driver, 1))["stopped"]

@@ -1,0 +1,177 @@
+"""What comes to a robot is judged before it can wait, by what each sender may cost and how long it was on its way."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from macs_zenoh.guard import Ages, Allowances, Fresh, Guard, Limits, sender_of
+from macs_zenoh.keyexpr import GROUP
+from macs_zenoh.messages import Metadata, NodeType
+from macs_zenoh.reading import Message
+from macs_zenoh.routing import unicast_key
+from macs_zenoh.wire import MACS, encode_frame, encode_message
+
+ME = (1, 7)
+KEY = unicast_key(1, 7, 2, 300)
+STOP = "nd__emergency_stop"
+
+
+def test_a_sender_is_what_its_keys_end_in() -> None:
+    """By id, by group, by broadcast and as a caller it is one."""
+    group = GROUP.of(group=3, type=1, from_type=2, from_id=300)
+    keys = [KEY, group, "macs/all/unity/300", "macs/call/ros/7/stop/unity/300"]
+    assert {sender_of(key) for key in keys} == {"unity/300"}
+    assert sender_of("x") == "x"
+
+
+def test_each_sender_has_an_allowance_of_its_own() -> None:
+    """Who floods is served at the rate; another's first message passes all the same."""
+    allowances = Allowances(100)
+    passed = sum(allowances.take("flooder", 300, number / 10_000) for number in range(20_000))
+    assert 290 <= passed <= 310
+    assert allowances.take("other", 300, 2.0)
+
+
+def test_all_together_have_an_allowance_too() -> None:
+    """A thousand senders at their limit cost no more than a few."""
+    allowances = Allowances(100)
+    passed = sum(allowances.take(f"s{number % 1000}", 300, number / 10_000) for number in range(20_000))
+    assert passed <= 100 * Allowances.TOGETHER * 3.1
+
+
+def test_a_large_message_costs_more_and_passes_nevertheless() -> None:
+    """One that is larger than all that a sender may send in a second passes, a second one right after it does not."""
+    allowances = Allowances(100)
+    assert allowances.take("a", 100 << 20, 0.0)
+    passed = sum(allowances.take("a", 100 << 20, 0.0) for _ in range(100))
+    assert passed <= 3
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e9, -1e9])
+def test_ages_need_no_common_clock(offset: float) -> None:
+    """However far two clocks are apart, and drift: what has waited is older, by as long as it waited."""
+    ages, drift = Ages(), 1.0001
+    for number in range(2000):
+        now = number / 10
+        age = ages.age("router", offset + (now - 0.02) * drift, now)
+        assert age < 0.02
+    for waited in (1.5, 1.0, 0.5, 0.0):
+        age = ages.age("router", offset + (200.0 - 0.02 - waited) * drift, 200.0)
+        assert age == pytest.approx(waited, abs=0.02)
+
+
+def test_a_clock_that_was_put_forward_makes_nothing_old() -> None:
+    """A hybrid clock stands still until time has come up to it; then it goes on."""
+    ages = Ages()
+    for number in range(100):
+        assert ages.age("router", number / 10, number / 10) == 0.0
+    for number in range(100):
+        now = 10 + number / 10
+        assert ages.age("router", max(now, 15.0 + number * 1e-8), now) < 0.11
+
+
+def test_of_commands_that_waited_none_is_carried_out() -> None:
+    """Ten commands that waited up to 1.6 s come at once: none passes, and the next one that comes in time does."""
+    fresh = Fresh(0.5)
+    assert fresh.take("a", 0.0, 0.0)
+    passed = [fresh.take("a", 1.6 - number / 10, 10.0 + number / 10_000) for number in range(16)]
+    assert not any(passed)
+    assert fresh.take("b", 0.3, 10.0), "others did not wait with it"
+    assert fresh.take("a", 0.02, 10.1)
+    assert fresh.take("a", 0.3, 10.2), "and a little late is not late"
+
+
+def test_a_way_that_has_become_longer_does_not_silence_for_ever() -> None:
+    """What comes regularly and is never too old passes after a moment."""
+    fresh = Fresh(0.5)
+    assert not fresh.take("a", 0.9, 0.0)
+    taken = [fresh.take("a", 0.3, number / 20) for number in range(1, 40)]
+    assert not any(taken[:15])
+    assert all(taken[25:])
+
+
+def test_no_limit_is_none() -> None:
+    """0 is no limit, for ages and for rates."""
+    assert Fresh(0).take("a", 1e9, 0.0)
+    assert all(Allowances(0).take("a", 1 << 30, 0.0) for _ in range(10_000))
+
+
+# -- the guard of a robot --------------------------------------------------------------------------------------------
+
+
+def frame(node: str = "nd__cmd_vel", data: bytes = b"\x00\x01\x00\x00\x01", kind: int = NodeType.PUBLISHER) -> bytes:
+    said = Metadata(node_type=kind, node_name=node, data_exchange_type="x")
+    return encode_frame(1, (7,), message=encode_message(said.encode(), data))
+
+
+@pytest.fixture
+def taken() -> list[Message]:
+    return []
+
+
+@pytest.fixture
+def guard(taken: list[Message]) -> Guard:
+    guard = Guard(Limits(100, 10, 0.5), MACS)
+    guard.me, guard.stop_name, guard.on_command = ME, STOP, taken.append
+    return guard
+
+
+def test_commands_are_taken_and_all_else_is_left(guard: Guard, taken: list[Message]) -> None:
+    """One command or several in one sample, in order; a request, and what cannot be read, is for the loop."""
+    assert guard.first(KEY, frame(data=b"a") + frame(data=b"b"), 0.0, 0.0)
+    assert guard.first(KEY, frame(data=b"c"), 0.0, 0.0)
+    assert [message.data for message in taken] == [b"a", b"b", b"c"]
+    for other in (
+        frame(kind=NodeType.CLIENT),
+        frame(node=""),
+        frame() + frame(kind=NodeType.CLIENT),
+        frame()[:-1],
+        b"",
+    ):
+        assert not guard.first(KEY, other, 0.0, 0.0)
+    assert len(taken) == 3
+
+
+def test_a_group_copy_is_dropped_where_the_id_is_named(guard: Guard, taken: list[Message]) -> None:
+    """One command by id and by group is carried out once."""
+    group = GROUP.of(group=3, type=1, from_type=2, from_id=300)
+    both = encode_frame(
+        1, (7,), (3,), message=encode_message(Metadata(node_type=2, node_name="nd__x").encode(), b"\x00\x01\x00\x00")
+    )
+    for _ in range(3):
+        guard.first(KEY, both, 0.0, 0.0)
+        guard.first(group, both, 0.0, 0.0)
+    assert len(taken) == 3
+
+
+def test_a_stop_passes_however_old_and_however_many(guard: Guard, taken: list[Message]) -> None:
+    """Who floods may stop the robot, in the middle of it, and a stop that has waited stops; a release does neither."""
+    dropped = []
+    guard.on_dropped = lambda name, sender, why: dropped.append(name)
+    stop, release = frame(STOP), frame(STOP, b"\x00\x01\x00\x00\x00")
+    assert guard.first(KEY, stop, 9.0, 0.0)
+    assert guard.first(KEY, release, 9.0, 0.0)
+    assert [message.data[4] for message in taken] == [1]
+    while guard.admits(KEY, len(stop), True, 0.0):
+        pass
+    guard.rescue(KEY, frame() + stop + release + frame(), 0.0)
+    guard.rescue(KEY, release, 0.0)
+    guard.rescue(KEY, frame(), 0.0)
+    assert [message.data[4] for message in taken] == [1, 1]
+    assert dropped == ["too_old", "flooded"]
+
+
+def test_requests_do_not_use_up_what_commands_may(guard: Guard) -> None:
+    """Urgent samples have an allowance of their own."""
+    admitted = list(itertools.takewhile(bool, (guard.admits(KEY, 300, False, 0.0) for _ in range(100))))
+    assert len(admitted) == 10
+    assert guard.admits(KEY, 300, True, 0.0)
+
+
+def test_nothing_is_taken_before_the_robot_is_there(guard: Guard) -> None:
+    """Until somebody judges commands, all goes to the loop."""
+    guard.on_command = None
+    assert not guard.first(KEY, frame(), 0.0, 0.0)
+    guard.rescue(KEY, frame(STOP), 0.0)
