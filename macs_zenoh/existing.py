@@ -29,7 +29,18 @@ from typing import NamedTuple
 
 import msgspec
 
-from .messages import MANAGERS, ROS, AddNode, AgentsGone, CallFailure, Metadata, NodeRefused, NodeType, Welcome
+from .messages import (
+    FOR_NEWER,
+    MANAGERS,
+    ROS,
+    AddNode,
+    AgentsGone,
+    CallFailure,
+    Metadata,
+    NodeRefused,
+    NodeType,
+    Welcome,
+)
 from .wire import Buffer, Frame, Header, encode_message
 
 CDR = b"\x00\x01\x00\x00"
@@ -224,6 +235,8 @@ def to_headset(metadata: Metadata, node_types: Mapping[str, int], asked: Asked, 
         wrong = _name_problem(manager)
         if not wrong and (manager in MANAGERS or manager.lower() in CLASSES):
             wrong = f"{manager} is a class of an existing headset that takes no messages of agents"
+        if not wrong and manager in FOR_NEWER:
+            wrong = f"an existing headset has no {manager}"
         return _no("forbidden_manager", wrong) if wrong else PASS
     wanted = asked.awaits(metadata)
     if wanted is not None:

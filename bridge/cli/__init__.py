@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import difflib
-import os
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -25,6 +24,7 @@ from bridge.cli import (
     keys,
     ls,
     options,
+    output,
     router,
     running,
     security,
@@ -128,42 +128,46 @@ def build_parser() -> Parser:
 
 
 def program() -> int:
-    """The process ``macs``: `main`, with stdout kept for data."""
-    # Zenoh writes its log to descriptor 1, in the middle of whatever reads our output as JSON or waits for a line
-    stdout = sys.stdout
-    own = os.dup(stdout.fileno())
-    os.dup2(sys.stderr.fileno(), stdout.fileno())
-    buffering = 1 if stdout.line_buffering else -1
-    sys.stdout = open(own, "w", encoding=stdout.encoding, errors=stdout.errors, buffering=buffering)  # noqa: SIM115, PTH123
+    """The process ``macs``: `main`, with streams that can be used whatever they are."""
+    output.prepare()
     return main()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; what a user can cause ends in one line on stderr, never in a traceback."""
-    parser = build_parser()
     words = sys.argv[1:] if argv is None else argv
+    try:
+        return _run(words)
+    except output.OutputLost as lost:
+        output.give_up()
+        return 1 if lost.reader_left else _fail(words[0] if words else "", lost, 1)
+
+
+def _run(words: Sequence[str]) -> int:
+    parser = build_parser()
     if not words:
         parser.print_help(sys.stderr)
         parser.exit(2, "\nmacs: no verb was given\n")
-    args = parser.parse_args(words)
+    try:
+        args = parser.parse_args(words)
+    except SystemExit:
+        output.finish()  # it may have printed help
+        raise
     args.words = list(words)
     options.start_logging(args)
     try:
         code: int = args.run(args)
-        sys.stdout.flush()
+        output.finish()
     except (ConfigError, UsageError) as error:
         return _fail(args.verb, error, 2)
     except MacsError as error:
         return _fail(args.verb, error, 1)
-    except BrokenPipeError:
-        # The reader of our output left, as `head` does. Python would complain once more at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
     except KeyboardInterrupt:
         return running.INTERRUPTED
     return code
 
 
 def _fail(verb: str, error: Exception, code: int) -> int:
-    sys.stderr.write(f"macs {verb}: {error}\n")
+    text = str(error)
+    output.note(text if text.startswith(f"macs {verb}: ") else f"macs {verb}: {text}")
     return code

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 
+from bridge.cli import output
 from bridge.cli.running import READY, STOP_WITH_STDIN
 from macs_zenoh.errors import MacsError
 
@@ -116,7 +117,7 @@ class Child:
         return await process.wait()
 
     def _pass_on(self, line: str) -> None:
-        sys.stderr.write(f"{self._prefix}{line}\n")
+        output.note(f"{self._prefix}{line}")
         if line.startswith(READY):
             self.ready.set()
 

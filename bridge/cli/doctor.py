@@ -20,7 +20,7 @@ import argparse
 import logging
 import sys
 
-from bridge.cli import options, running
+from bridge.cli import options, output, running
 from macs_zenoh.errors import UsageError
 from macs_zenoh.versions import installed
 
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         findings = judge(facts)
         in_colour = sys.stdout.isatty()
         text = report.as_json(findings, facts) if args.json else report.as_text(findings, facts, colours=in_colour)
-        sys.stdout.write(text + "\n")
+        output.say(text)
         return report.exit_code(findings)
 
     return running.until_stopped(examine, interrupted=running.INTERRUPTED)
@@ -78,6 +78,4 @@ def run(args: argparse.Namespace) -> int:
 
 def _progress(text: str) -> None:
     """Say on a terminal what is being done, in one line that is written over; nothing on a pipe."""
-    if sys.stderr.isatty():
-        sys.stderr.write(f"\r\033[K{text[:100]}")
-        sys.stderr.flush()
+    output.note_progress(f"\r\033[K{text[:100]}")

@@ -17,9 +17,9 @@ examples:
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from typing import Any
+
+from bridge.cli import output
 
 SUMMARY = "a scriptable headset over TCP, in place of the hardware"
 
@@ -52,5 +52,4 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print(line: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(line, ensure_ascii=False, allow_nan=False) + "\n")
-    sys.stdout.flush()
+    output.say(output.as_json(line))

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from bridge import shipped
+from bridge.cli import output
 from macs_zenoh.config import MeshSettings, RobotSettings
 from macs_zenoh.errors import UsageError
 
@@ -100,10 +100,10 @@ def run(args: argparse.Namespace) -> int:
     into.mkdir(parents=True, exist_ok=True)
     for path, text in written.items():
         path.write_text(text, encoding="utf-8")
-        sys.stdout.write(f"{path}\n")
-    sys.stderr.write(f"\n{kind.then.replace('DIR', str(into))}\n")
+        output.say(f"{path}")
+    output.note(f"\n{kind.then.replace('DIR', str(into))}")
     if (unit := f"macs-{args.kind}.service") in kind.files:
-        sys.stderr.write(f"To start it with the machine, what to copy where is said at the top of {into / unit}\n")
+        output.note(f"To start it with the machine, what to copy where is said at the top of {into / unit}")
     return 0
 
 

@@ -17,6 +17,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from bridge.cli import output
 from macs_zenoh.errors import Unreachable
 
 SUMMARY = "build ROS interface packages where ROS comes from pip"
@@ -39,11 +40,11 @@ def run(args: argparse.Namespace) -> int:
     if args.install:
         _install(built.wheel)
     if args.json:
-        sys.stdout.write(json.dumps({"wheel": str(built.wheel), "hashes": built.hashes}) + "\n")
+        output.say(json.dumps({"wheel": str(built.wheel), "hashes": built.hashes}))
         return 0
     width = max(map(len, built.hashes))
     lines = [f"{name:{width}}  {value}" for name, value in sorted(built.hashes.items())]
-    sys.stdout.write("\n".join([*lines, str(built.wheel)]) + "\n")
+    output.say("\n".join([*lines, str(built.wheel)]))
     return 0
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 
+from bridge.cli import output
 from macs_zenoh import keyexpr
 from macs_zenoh.keyexpr import Key
 
@@ -63,7 +63,7 @@ def _table(rows: list[dict[str, str]]) -> str:
 def _explain(key: str, *, as_json: bool) -> int:
     known = keyexpr.parse(key)
     if known is None:
-        sys.stderr.write(f"macs keys: {key!r} is no concrete key of this mesh (`macs keys` lists them)\n")
+        output.note(f"macs keys: {key!r} is no concrete key of this mesh (`macs keys` lists them)")
         return 1
     plane, fields = known
     space = keyexpr.KEYS[plane]
@@ -85,4 +85,4 @@ def _shown(name: str, value: int | str) -> str:
 
 
 def _print(text: str) -> None:
-    sys.stdout.write(text + "\n")
+    output.say(text)

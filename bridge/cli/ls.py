@@ -19,12 +19,11 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import sys
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from bridge.cli import options, robots, running
+from bridge.cli import options, output, robots, running
 from bridge.cli.robots import Node, Offers, Operator, Status
 from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import MacsError, NotServed, Refused, Unreachable
@@ -84,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
             asked = (_ask(operator, robot, gateways, answer_s, offers=args.verbose) for robot in online)
             told = dict(zip((robot.id for robot in online), await asyncio.gather(*asked), strict=True))
             away = await looking
-        sys.stdout.write((_json if args.json else _text)(agents, names, told, away, args.verbose) + "\n")
+        output.say((_json if args.json else _text)(agents, names, told, away, args.verbose))
         return 0
 
     return running.until_stopped(show, interrupted=running.INTERRUPTED)

@@ -10,6 +10,8 @@ import sys
 from collections.abc import Callable, Coroutine
 from typing import Any
 
+from bridge.cli import output
+
 log = logging.getLogger("macs")
 
 READY = "ready: "
@@ -101,5 +103,4 @@ def _new_loop() -> asyncio.AbstractEventLoop:
 
 def say_ready(what: str) -> None:
     """Print on stdout that this program does its work now, and where: people and ``macs up`` wait for this line."""
-    sys.stdout.write(f"{READY}{what}\n")
-    sys.stdout.flush()
+    output.say_if_possible(f"{READY}{what}")

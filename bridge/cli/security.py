@@ -19,11 +19,10 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bridge.cli import running
+from bridge.cli import output, running
 
 if TYPE_CHECKING:
     from bridge.security.check import Result
@@ -79,7 +78,7 @@ def _generate(args: argparse.Namespace) -> int:
         renew=args.renew,
         new_authority=args.new_ca,
     )
-    sys.stdout.write((_as_json(report) if args.json else _as_text(report)) + "\n")
+    output.say(_as_json(report) if args.json else _as_text(report))
     return 0
 
 
@@ -134,19 +133,17 @@ def _check(args: argparse.Namespace) -> int:
         logging.getLogger("macs.mesh").setLevel(logging.WARNING)  # of each of many sessions
 
     def progress(done: int, of: int) -> None:
-        if sys.stderr.isatty():
-            sys.stderr.write(f"\r{done} of {of} attempts\033[K" + ("\n" if done == of else ""))
-            sys.stderr.flush()
+        output.note_progress(f"\r{done} of {of} attempts\033[K" + ("\n" if done == of else ""))
 
     async def work() -> int:
         results = await check(read, Path(args.dir), args.connect, timeout_s=args.timeout, progress=progress)
         wrong = [result for result in results if not result.as_planned]
         if args.json:
-            sys.stdout.write(json.dumps([result.as_dict() for result in results]) + "\n")
+            output.say(json.dumps([result.as_dict() for result in results]))
         else:
             for result in results if args.all else wrong:
-                sys.stdout.write(_line(result) + "\n")
-            sys.stdout.write(f"{len(results)} attempts, {len(results) - len(wrong)} as planned, {len(wrong)} not\n")
+                output.say(_line(result))
+            output.say(f"{len(results)} attempts, {len(results) - len(wrong)} as planned, {len(wrong)} not")
         return 1 if wrong or not results else 0
 
     return running.until_stopped(work, interrupted=running.INTERRUPTED)

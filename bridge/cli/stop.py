@@ -20,11 +20,10 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import sys
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 
-from bridge.cli import options, robots, running
+from bridge.cli import options, output, robots, running
 from bridge.cli.robots import Operator, Status
 from macs_zenoh.config import Settings
 from macs_zenoh.errors import CallTimeout, MacsError, NotServed, Refused, Unreachable, UsageError
@@ -89,17 +88,16 @@ async def _stop(settings: Settings, args: argparse.Namespace) -> int:
                 outcome = await coming
                 outcomes.append(outcome)
                 if not args.json:
-                    sys.stdout.write(_line(outcome, release=args.release) + "\n")
-                    sys.stdout.flush()
+                    output.say_if_possible(_line(outcome, release=args.release))
         finally:
             for task in asked:
                 task.cancel()
             await asyncio.gather(*asked, return_exceptions=True)
     if args.json:
         ordered = sorted(outcomes, key=lambda outcome: outcome.id)
-        sys.stdout.write(json.dumps([asdict(outcome) for outcome in ordered]) + "\n")
+        output.say_if_possible(json.dumps([asdict(outcome) for outcome in ordered]))
     elif not outcomes:
-        sys.stdout.write("no such robot is online\n")
+        output.say_if_possible("no such robot is online")
     return 0 if outcomes and all(outcome.done for outcome in outcomes) else 1
 
 

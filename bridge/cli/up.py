@@ -21,11 +21,10 @@ import importlib.util
 import logging
 import os
 import socket
-import sys
 from contextlib import suppress
 from dataclasses import dataclass
 
-from bridge.cli import children, options, running
+from bridge.cli import children, options, output, running
 from bridge.cli.apart import Apart
 from bridge.cli.children import Child, stop_in_order
 from bridge.listening import bound
@@ -301,5 +300,4 @@ def _own_address() -> str:
 
 
 def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    output.say_if_possible(text)

@@ -560,7 +560,9 @@ class Script:
     async def _stop_jobs(self) -> None:
         for task in self._jobs:
             task.cancel()
-        await asyncio.gather(*self._jobs, return_exceptions=True)
+        for ended in await asyncio.gather(*self._jobs, return_exceptions=True):
+            if isinstance(ended, Exception):  # of ours, or results cannot be written
+                raise ended
 
 
 async def file_lines(path: str) -> AsyncIterator[str]:

@@ -19,7 +19,7 @@ from macs_zenoh.existing import (
     to_newer,
     to_robot,
 )
-from macs_zenoh.messages import MANAGERS, ROS, UNITY, AddNode, Metadata, NodeType
+from macs_zenoh.messages import FOR_NEWER, MANAGERS, ROS, UNITY, AddNode, Metadata, NodeType
 from macs_zenoh.wire import Header, encode_frame, encode_message, parse_frame, parse_frames, split_message
 
 TEXT = CDR + b"\x02\x00\x00\x00a\x00"
@@ -54,6 +54,13 @@ def heard(metadata: Metadata, nodes: dict[str, int] | None = None, *, there: boo
 
 
 # -- names -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("manager", sorted(FOR_NEWER))
+def test_extensions_go_to_those_who_know_them(manager: str) -> None:
+    """What only newer programs have is for them, and for no existing headset."""
+    assert heard(said(message_manager=manager)) == "forbidden_manager"
+    assert to_newer(said(message_manager=manager), {}) is PASS
 
 
 @pytest.mark.parametrize("manager", FORBIDDEN)
