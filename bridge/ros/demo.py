@@ -26,6 +26,8 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CompressedImage
 from std_srvs.srv import SetBool
 
+from bridge.ros.session import why
+
 log = logging.getLogger("macs.demo")
 
 IMAGE_HZ = 10.0
@@ -201,8 +203,12 @@ def main(
     """
     logging.basicConfig(format="%(asctime)s %(levelname).1s %(name)s: %(message)s", datefmt="%H:%M:%S")
     log.setLevel(logging.INFO)
-    rclpy.init(args=list(args) if args is not None else sys.argv)
-    node = rclpy.create_node("demo_robot")
+    try:
+        rclpy.init(args=list(args) if args is not None else sys.argv)
+        node = rclpy.create_node("demo_robot")
+    except RuntimeError as error:
+        log.error("ROS 2 cannot be reached: %s", why(error))
+        return 1
     try:
         DemoRobot(node)
         if alone and _others(node):

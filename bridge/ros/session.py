@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -72,7 +73,7 @@ class RosSession:
             )
         except RuntimeError as error:
             self.context.try_shutdown()
-            raise Unreachable("ROS 2", str(error).splitlines()[0]) from error
+            raise Unreachable("ROS 2", why(error)) from error
         self.intake = Intake(self.node)
         """For subscriptions whose messages are only passed on."""
         self._jobs: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
@@ -170,3 +171,13 @@ class RosSession:
 
     def _stop(self) -> None:
         self._spinning = False
+
+
+def why(error: RuntimeError) -> str:
+    """What rcl says is wrong, in a line, and what to do where it does not say that."""
+    first = str(error).splitlines()[0].split(", at /")[0]
+    if "log" in first and "directory" in first:
+        home = os.environ.get("HOME")
+        at = f"{home}/.ros/log cannot be made" if home else "HOME is not set"
+        return f"{first}: {at}; set ROS_LOG_DIR to a directory that can be written"
+    return first
