@@ -18,6 +18,7 @@ from __future__ import annotations
 import base64
 import binascii
 import importlib
+import keyword
 import math
 import os
 import sys
@@ -26,6 +27,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from bridge.headset import definitions
 from macs_zenoh.errors import UsageError, WireError
 
 MESSAGE_TYPE_PARTS = 3  # pkg, msg, Name
@@ -37,8 +39,11 @@ _BUILT_IN_SERVICES = {
 }
 """Definitions that everybody uses and that rosbags does not have (it brings messages only)."""
 
-_DEFAULTS: dict[tuple[str, str], object] = {("geometry_msgs/msg/Quaternion", "w"): 1.0}
-"""Defaults in the definitions that are not zero; rosbags does not keep them."""
+_DEFAULTS: dict[tuple[str, str], object] = {
+    ("geometry_msgs/msg/Quaternion", "w"): 1.0,
+    ("sensor_msgs/msg/NavSatStatus", "status"): -2,
+}
+"""Defaults that are not zero in the definitions that rosbags brings; it does not keep them."""
 
 _FILLER = "structure_needs_at_least_one_member"
 _TIME = "builtin_interfaces/msg/Time"
@@ -49,6 +54,8 @@ _INTEGER_RANGE = {
 } | {"byte": (0, 255), "char": (0, 255)}
 _FLOAT_LIMIT = {"float32": 3.4028234663852886e38, "float64": sys.float_info.max}
 _BYTE_TYPES = {"uint8": "uint8", "byte": "uint8", "char": "uint8"}
+_LARGE = frozenset({"int64", "uint64", "float64"})
+_SLACK_BYTES = 4 + 3
 _NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
@@ -112,6 +119,8 @@ class Types:
         except ImportError as error:
             raise MissingRosbags from error
         self._store: Any = self._typesys.get_typestore(self._typesys.Stores.ROS2_JAZZY)
+        self._defaults: dict[tuple[str, str], Any] = dict(_DEFAULTS)
+        self._slack: dict[str, bool] = {}
         self._folders = [Path(folder) for folder in definitions]
         for folder in self._folders:
             if not folder.is_dir():
@@ -136,10 +145,39 @@ class Types:
         """
         name = self._known(type_name)
         try:
-            message = self._store.deserialize_cdr(cdr, name)
+            message = self._store.deserialize_cdr(self._trimmed(name, cdr), name)
         except (self._serde_error, MemoryError) as error:
             raise BadCdr(name, str(error)) from error
         return self._plain_message(name, message, max_bytes)
+
+    def _trimmed(self, name: str, cdr: bytes | bytearray | memoryview) -> bytes | bytearray | memoryview:
+        """Without what rclpy leaves behind a message of some types, for which it asks for more room than they take."""
+        if len(cdr) <= _SLACK_BYTES or bytes(cdr[:2]) != b"\x00\x01" or not self._may_have_slack(name):
+            return cdr
+        msgdef = self._store.get_msgdef(name)
+        try:
+            _, end = msgdef.deserialize_cdr_le(cdr[4:], 0, msgdef.cls, self._store)
+        except Exception:  # noqa: BLE001 - generated code; what is wrong with it is said by who calls
+            return cdr
+        return cdr[: 4 + end]
+
+    def _may_have_slack(self, name: str) -> bool:
+        found = self._slack.get(name)
+        if found is None:
+            fields = self._store.fielddefs[name][1]
+            found = self._slack[name] = any(self._field_has_slack(description) for _, description in fields)
+        return found
+
+    def _field_has_slack(self, description: Any) -> bool:
+        kind, detail = description
+        if kind == self._kinds.NAME:
+            return definitions.WIDE.fullmatch(detail) is not None or self._may_have_slack(detail)
+        if kind == self._kinds.BASE:
+            return False
+        (item_kind, item), _ = detail
+        if item_kind == self._kinds.BASE:
+            return bool(kind == self._kinds.SEQUENCE and item[0] in _LARGE)
+        return self._field_has_slack((item_kind, item))
 
     # --- definitions ---
 
@@ -181,13 +219,27 @@ class Types:
 
     def _register(self, name: str, text: str) -> None:
         try:
-            found = self._typesys.get_types_from_msg(text, name)
-        except self._typesys.TypesysError as error:
+            definition = definitions.read(text)
+            for wide in definition.wide:
+                self._register_wide(wide)
+            found = self._typesys.get_types_from_msg(definition.text, name)
+        except (self._typesys.TypesysError, definitions.BadDefinition) as error:
             raise UnknownType(name, str(error)) from error
         for _, fields in found.values():
             for _, description in fields:
                 self._load_needed(description)
         self._store.register(found)
+        fields = dict(self._store.fielddefs[name][1])
+        for field, value in definition.defaults.items():
+            try:
+                self._defaults[name, field] = self._build_any(fields[field], value, field)
+            except BadValue as error:
+                raise UnknownType(name, f"the default of {field}: {error}") from error
+
+    def _register_wide(self, name: str) -> None:
+        name = f"{definitions.WIDE_PACKAGE}/msg/{name}"
+        if name not in self._store.fielddefs:
+            self._store.register(self._typesys.get_types_from_msg("uint32[] units", name))
 
     def _load_needed(self, description: Any) -> None:
         kind, detail = description
@@ -210,6 +262,8 @@ class Types:
         if name == _TIME and value == "now":
             nanoseconds = time.time_ns()
             value = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
+        if (wide := definitions.WIDE.fullmatch(name)) is not None:
+            return self._build_wide(name, int(wide["limit"] or 0), value, path)
         if not isinstance(value, Mapping):
             raise BadValue(name, path, f"an object was expected, not {_shown(value)}")
         fields = dict(self._store.fielddefs[name][1])
@@ -223,19 +277,30 @@ class Types:
         }
         if not fields:  # the store adds this field to an empty definition only in the class
             filled[_FILLER] = 0
-        return self._store.types[name](**filled)
+        return self._store.types[name](**{_attribute(field): item for field, item in filled.items()})
+
+    def _build_wide(self, name: str, limit: int, value: object, path: str) -> Any:
+        if not isinstance(value, str):
+            raise BadValue("wstring", path, f"a wstring was expected, not {_shown(value)}")
+        try:
+            units = definitions.units_of(value)
+        except UnicodeEncodeError as error:
+            raise BadValue("wstring", path, f"no text: {error.reason}") from error
+        if limit and len(units) > limit:
+            raise BadValue("wstring", path, f"at most {limit} UTF-16 units are allowed, not {len(units)}")
+        return self._store.types[name](units=self._array("uint32", units))
 
     def _build_field(self, name: str, field: str, description: Any, value: Mapping[str, object], path: str) -> Any:
         if field in value:
             return self._build_any(description, value[field], path)
-        if (name, field) in _DEFAULTS:
-            return _DEFAULTS[name, field]
+        if (name, field) in self._defaults:
+            return self._defaults[name, field]
         return self._default(description, path)
 
     def _build_any(self, description: Any, value: object, path: str) -> Any:
         kind, detail = description
         if kind == self._kinds.BASE:
-            return _base(detail[0], value, path)
+            return _base(detail[0], value, path, detail[1])
         if kind == self._kinds.NAME:
             return self._build(detail, value, path)
         return self._build_items(kind == self._kinds.ARRAY, detail, value, path)
@@ -262,20 +327,22 @@ class Types:
         if kind == self._kinds.BASE:
             return _zero(detail[0])
         if kind == self._kinds.NAME:
-            return self._build(detail, {}, path)
+            return self._build(detail, "" if definitions.WIDE.fullmatch(detail) else {}, path)
         (item_kind, item), length = detail
         count = length if kind == self._kinds.ARRAY else 0
         items = [self._default((item_kind, item), path) for _ in range(count)]
         return self._array(item[0], items) if item_kind == self._kinds.BASE and item[0] != "string" else items
 
     def _array(self, base: str, items: list[Any]) -> Any:
+        if base == "byte":
+            items = [item & 0xFF for item in items]
         return self._numpy.array(items, dtype=_BYTE_TYPES.get(base, base))
 
     # --- message -> Python value ---
 
     def _plain_message(self, name: str, message: Any, max_bytes: int | None) -> dict[str, Any]:
         return {
-            field: self._plain(description, getattr(message, field), max_bytes)
+            field: self._plain(description, getattr(message, _attribute(field)), max_bytes)
             for field, description in self._store.fielddefs[name][1]
             if field != _FILLER
         }
@@ -283,7 +350,9 @@ class Types:
     def _plain(self, description: Any, value: Any, max_bytes: int | None) -> Any:
         kind, detail = description
         if kind == self._kinds.BASE:
-            return _finite(value) if detail[0].startswith("float") else value
+            return _plain_base(detail[0], value)
+        if kind == self._kinds.NAME and definitions.WIDE.fullmatch(detail):
+            return definitions.text_of(value.units)
         if kind == self._kinds.NAME:
             return self._plain_message(detail, value, max_bytes)
         (item_kind, item), _ = detail
@@ -330,17 +399,17 @@ def _package_and_name(service: str) -> tuple[str, str]:
     return package, name
 
 
-def _base(base: str, value: object, path: str) -> Any:
+def _base(base: str, value: object, path: str, limit: int = 0) -> Any:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if base == "string" and isinstance(value, str):
-        return _string(value, path)
+        return _string(value, path, limit)
     if base == "bool" and isinstance(value, bool):
         return value
     if base in _INTEGER_RANGE and is_number and isinstance(value, int):
         low, high = _INTEGER_RANGE[base]
         if not low <= value <= high:
             raise BadValue(base, path, f"{_shown(value)} is outside {low}..{high}")
-        return value
+        return value - 256 if base == "byte" and value > 127 else value  # rosbags writes a byte with its sign
     if base in _FLOAT_LIMIT and is_number:
         return _float(base, value, path)
     if base in _FLOAT_LIMIT and isinstance(value, str) and value in _NON_FINITE:
@@ -348,11 +417,15 @@ def _base(base: str, value: object, path: str) -> Any:
     raise BadValue(base, path, f"a {base} was expected, not {_shown(value)}")
 
 
-def _string(value: str, path: str) -> str:
+def _string(value: str, path: str, limit: int) -> str:
     try:
-        value.encode()
+        size = len(value.encode())
     except UnicodeEncodeError as error:  # JSON can spell half a character
         raise BadValue("string", path, f"no text: {error.reason}") from error
+    if limit and size > limit:
+        raise BadValue("string", path, f"at most {limit} bytes are allowed, not {size}")
+    if "\0" in value:
+        raise BadValue("string", path, "ROS ends a text at its first zero character")
     return value
 
 
@@ -361,6 +434,17 @@ def _float(base: str, value: Any, path: str) -> float:
     if not (-limit <= value <= limit or (isinstance(value, float) and not math.isfinite(value))):
         raise BadValue(base, path, f"{_shown(value)} is outside {-limit:g}..{limit:g}")
     return float(value)
+
+
+def _attribute(field: str) -> str:
+    """The field's name in Python, as rosbags has it."""
+    return f"{field}_" if keyword.iskeyword(field) else field
+
+
+def _plain_base(base: str, value: Any) -> Any:
+    if base.startswith("float"):
+        return _finite(value)
+    return value & 0xFF if base == "byte" else value
 
 
 def _zero(base: str) -> Any:

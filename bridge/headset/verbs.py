@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from typing import Any, NoReturn
 
 from macs_zenoh import addresses
@@ -256,10 +257,17 @@ def agent_type(name: str) -> int:
     return _AGENT_TYPES[name]
 
 
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text[:40]} is too large for a number")
+    return number
+
+
 def json_object(text: str) -> dict[str, Any]:
     """A JSON object from the command line. Raises UsageError."""
     try:
-        value = json.loads(text)
+        value = json.loads(text, parse_float=_finite)
     except ValueError as error:
         raise UsageError(f"{text!r} is not JSON: {error}") from error
     if not isinstance(value, dict):

@@ -48,10 +48,19 @@ def _fill(message: Any, values: Mapping[str, Any], what: str) -> None:
             _fill(before, value, f"{what}.{field}")
             continue
         try:
-            setattr(message, field, float(value) if isinstance(before, float) else value)
+            setattr(message, field, _as_python(known[field], before, value))
         except (AssertionError, TypeError, ValueError) as error:  # rclpy's setters assert
             text = f"{what}.{field} of this robot's settings: {value!r} is no {known[field]}"
             raise Refused(text) from error
+
+
+def _as_python(of_type: str, before: Any, value: Any) -> Any:
+    """A value of a settings file as rclpy wants it: it has no bytes there, and a whole number for a float is one."""
+    if isinstance(before, float):
+        return float(value)
+    if "octet" in of_type:
+        return [bytes([item]) for item in value] if isinstance(value, list) else bytes([value])
+    return value
 
 
 def _name(message: Any) -> str:
