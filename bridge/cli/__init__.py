@@ -32,6 +32,7 @@ from bridge.cli import (
     up,
 )
 from macs_zenoh.errors import ConfigError, MacsError, UsageError
+from macs_zenoh.plain import plain
 from macs_zenoh.versions import installed
 
 VERBS = {
@@ -169,5 +170,5 @@ def _run(words: Sequence[str]) -> int:
 
 def _fail(verb: str, error: Exception, code: int) -> int:
     text = str(error)
-    output.note(text if text.startswith(f"macs {verb}: ") else f"macs {verb}: {text}")
+    output.note(plain(text if text.startswith(f"macs {verb}: ") else f"macs {verb}: {text}"))
     return code

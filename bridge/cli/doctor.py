@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         findings = judge(facts)
         in_colour = sys.stdout.isatty()
         text = report.as_json(findings, facts) if args.json else report.as_text(findings, facts, colours=in_colour)
-        output.say(text)
+        output.say(text, coloured=in_colour and not args.json)
         return report.exit_code(findings)
 
     return running.until_stopped(examine, interrupted=running.INTERRUPTED)

@@ -13,6 +13,7 @@ import json
 from bridge.cli import output
 from macs_zenoh import keyexpr
 from macs_zenoh.keyexpr import Key
+from macs_zenoh.plain import plain
 
 SUMMARY = "the key map, or what one key means"
 
@@ -81,7 +82,7 @@ def _shown(name: str, value: int | str) -> str:
     """A type by number as well, since that is what frames carry."""
     if name.endswith("type") and isinstance(value, int):
         return f"{keyexpr.type_name(value)} (type {value})"
-    return str(value)
+    return plain(str(value))
 
 
 def _print(text: str) -> None:

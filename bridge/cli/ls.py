@@ -29,6 +29,7 @@ from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import MacsError, NotServed, Refused, Unreachable
 from macs_zenoh.messages import ROS
 from macs_zenoh.named import Named
+from macs_zenoh.plain import plain
 
 SUMMARY = "who is online, and what robots are doing"
 VERBOSE = "all about each robot"
@@ -164,7 +165,7 @@ def _text(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], aw
     if verbose:
         for robot, what in told.items():
             shown += ["", f"robot {robot}", *(f"  {line}" for line in _details(what))]
-    return "\n".join(robots.printable(line.rstrip()) for line in shown)
+    return "\n".join(plain(line.rstrip()) for line in shown)
 
 
 def _state(robot: Told | None) -> str:

@@ -10,6 +10,7 @@ import argparse
 import logging
 import os
 
+from bridge.logs import log_to_stderr
 from macs_zenoh import config
 from macs_zenoh.config import Settings
 
@@ -64,16 +65,7 @@ def settings(args: argparse.Namespace) -> Settings:
     return config.changed(base, mesh=mesh)
 
 
-LOG_FORMAT = "%(asctime)s %(levelname).1s %(name)s: %(message)s"
-
-
 def start_logging(args: argparse.Namespace) -> None:
     """Log ``macs.*`` to stderr, one short line each; other libraries only from WARNING on."""
-    logging.basicConfig(format=LOG_FORMAT, datefmt="%H:%M:%S")
+    log_to_stderr()
     logging.getLogger("macs").setLevel(logging.DEBUG if args.verbose else logging.INFO)
-
-
-def prefix_logs(prefix: str) -> None:
-    """Put ``prefix`` before each line of our own log, as before those of other programs on the same terminal."""
-    for handler in logging.getLogger().handlers:
-        handler.setFormatter(logging.Formatter(prefix + LOG_FORMAT, datefmt="%H:%M:%S"))

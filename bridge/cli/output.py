@@ -1,7 +1,8 @@
 """What a program does with its standard streams, whatever they are: closed, full, a pipe nobody reads, not UTF-8.
 
 Data goes to stdout. When it cannot, a verb that has to say something ends with 1 and one line; one that serves, or
-stops robots, goes on. Stderr is for people: what it does not take is lost.
+stops robots, goes on. Stderr is for people: what it does not take is lost. What others said is in both, so both are
+filtered (`macs_zenoh.plain`); the log is as well (`bridge.logs`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import os
 import sys
 from contextlib import suppress
 from typing import Any
+
+from macs_zenoh.plain import plain_json, plain_lines
 
 
 class OutputLost(Exception):
@@ -72,9 +75,10 @@ def give_up() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def say(text: str) -> None:
-    """A line on stdout, at once. Raises OutputLost."""
-    sys.stdout.write(text + "\n")
+def say(text: str, *, coloured: bool = False) -> None:
+    """A line or several on stdout, at once, without control characters; ``coloured``: with those of colours, and what
+    others said was filtered before. Raises OutputLost."""
+    sys.stdout.write((text if coloured else plain_lines(text)) + "\n")
     sys.stdout.flush()
 
 
@@ -89,9 +93,9 @@ def say_if_possible(text: str) -> None:
 
 
 def note(text: str) -> None:
-    """A line on stderr, where that is possible."""
+    """A line or several on stderr, where that is possible, without control characters."""
     with suppress(OSError, ValueError):
-        sys.stderr.write(text + "\n")
+        sys.stderr.write(plain_lines(text) + "\n")
         sys.stderr.flush()
 
 
@@ -104,5 +108,6 @@ def note_progress(text: str) -> None:
 
 
 def as_json(value: Any) -> str:
-    """One line of JSON in the encoding of stdout."""
-    return json.dumps(value, ensure_ascii=_encoding().lower() not in ("utf-8", "utf8"), allow_nan=False)
+    """One line of JSON in the encoding of stdout, with control characters as JSON writes them."""
+    ascii_only = _encoding().lower() not in ("utf-8", "utf8")
+    return plain_json(json.dumps(value, ensure_ascii=ascii_only, allow_nan=False))

@@ -257,8 +257,3 @@ def read(answer: bytes, kind: type[_T]) -> tuple[dict[str, Any], _T]:
         return document, msgspec.convert(document, kind)
     except (ValueError, RecursionError, msgspec.ValidationError) as error:
         raise Unreachable("the robot", f"its answer makes no sense: {error}") from error
-
-
-def printable(text: str) -> str:
-    """What another program said, without what moves a terminal's cursor."""
-    return "".join(character if character.isprintable() else "?" for character in text)

@@ -28,6 +28,7 @@ from bridge.cli.robots import Operator, Status
 from macs_zenoh.config import Settings
 from macs_zenoh.errors import CallTimeout, MacsError, NotServed, Refused, Unreachable, UsageError
 from macs_zenoh.messages import ROS
+from macs_zenoh.plain import plain
 
 SUMMARY = "stop robots, and release them"
 
@@ -168,8 +169,8 @@ async def _why_unserved(operator: Operator, robot: int) -> str:
 def _line(outcome: Outcome, *, release: bool) -> str:
     what = "released" if release else "stopped"
     if not outcome.done:
-        return robots.printable(f"robot {outcome.id} is NOT {what}: {outcome.problem}")
-    return robots.printable(f"robot {outcome.id} is {what}" + ("" if release else f", by {outcome.by}"))
+        return plain(f"robot {outcome.id} is NOT {what}: {outcome.problem}")
+    return plain(f"robot {outcome.id} is {what}" + ("" if release else f", by {outcome.by}"))
 
 
 def _robot(text: str) -> int:

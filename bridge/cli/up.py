@@ -28,6 +28,7 @@ from bridge.cli import children, options, output, running
 from bridge.cli.apart import Apart
 from bridge.cli.children import Child, stop_in_order
 from bridge.listening import bound
+from bridge.logs import prefix_logs
 from macs_zenoh.addresses import EVERYWHERE, joined, reachable
 from macs_zenoh.config import GatewaySettings, RobotSettings, Settings, changed
 from macs_zenoh.errors import MacsError, Unreachable, UsageError
@@ -81,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.once and not args.demo:
         raise UsageError("--once belongs to --demo")
-    options.prefix_logs(children.prefix("up"))
+    prefix_logs(children.prefix("up"))
     plan = make_plan(args, options.settings_file(args))
     try:
         return running.until_stopped(lambda: _up(plan), interrupted=running.INTERRUPTED if plan.once else 0)

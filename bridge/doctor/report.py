@@ -10,6 +10,8 @@ from typing import Any
 
 import msgspec
 
+from macs_zenoh.plain import plain
+
 from .facts import Facts
 from .findings import Finding, worst
 from .kinds import OK, Severity
@@ -77,7 +79,12 @@ def _finding(finding: Finding, colours: bool) -> list[str]:
 
 def _wrapped(text: str, indent: str) -> list[str]:
     return textwrap.wrap(
-        text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False
+        plain(text.replace("\n", " ")),
+        WIDTH,
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_on_hyphens=False,
+        break_long_words=False,
     )
 
 

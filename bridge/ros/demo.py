@@ -26,6 +26,7 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CompressedImage
 from std_srvs.srv import SetBool
 
+from bridge.logs import log_to_stderr
 from bridge.ros.session import why
 
 log = logging.getLogger("macs.demo")
@@ -201,7 +202,7 @@ def main(
 
     ``alone``: for who will be driven without anybody looking: 1 when another node of this domain would drive, too.
     """
-    logging.basicConfig(format="%(asctime)s %(levelname).1s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    log_to_stderr()
     log.setLevel(logging.INFO)
     try:
         rclpy.init(args=list(args) if args is not None else sys.argv)
