@@ -352,6 +352,9 @@ class Peer:
 
     def _reject(self, error: WireError, count: int, events: list[Event]) -> None:
         self.drops[type(error).__name__] += count
+        # where it was raised leads to the frame, and back here through ``events``: a circle, which would keep the
+        # frame's megabytes until Python looks for circles
+        error.__traceback__ = error.__cause__ = error.__context__ = None
         events.append(Rejected(error))
 
     def _covered(self, frame: Frame, now: float) -> bool:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 
+from bridge import memory
 from bridge.cli import options, running
 from macs_zenoh.config import Settings, changed
 
@@ -39,6 +40,7 @@ async def _serve(settings: Settings, ros_args: list[str]) -> int:
     from bridge.doctor.first import told_while_waiting
     from bridge.ros import agent
 
+    memory.give_back()
     await agent.run(
         settings,
         ros_args=ros_args,

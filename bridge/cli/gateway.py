@@ -17,6 +17,7 @@ import resource
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 
+from bridge import memory
 from bridge.cli import options, running
 from bridge.cli.children import Child, stop_in_order
 from bridge.listening import bound
@@ -118,6 +119,7 @@ async def _serve(settings: Settings) -> int:
     from macs_zenoh.mesh import Mesh
 
     _raise_descriptor_limit()
+    memory.give_back()
     own = managers.load(settings.gateway.managers)
     waiting = told_while_waiting(settings.mesh)
     async with await Mesh.open(settings.mesh, traffic=settings.traffic, on_waiting=waiting) as mesh:

@@ -18,6 +18,7 @@ import logging
 
 import msgspec
 
+from bridge import memory
 from bridge.cli import options, running
 from macs_zenoh.config import EVERY_INTERFACE, MeshSettings, changed
 
@@ -41,6 +42,8 @@ def run(args: argparse.Namespace) -> int:
 
 async def _serve(settings: MeshSettings) -> int:
     from bridge.router import open_to_anybody, serve
+
+    memory.give_back()
 
     def ready() -> None:
         for endpoint in open_to_anybody(settings):

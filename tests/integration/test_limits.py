@@ -29,6 +29,9 @@ from macs_zenoh.wire import encode_frame, encode_message
 from tests.integration.conftest import Connect, StartGateway, until
 from tests.programs import Program, free_port
 
+CONFIGURATION = encode_frame(
+    management=b'{"agentType":2,"agentId":2,"groupId":0,"requestId":1,"messageManager":"AgentclientConfigurer"}'
+)
 GREETING = Metadata(message_manager="Greeting").encode()
 
 
@@ -108,6 +111,29 @@ async def test_a_stalled_headset_costs_its_limit() -> None:
                 await asyncio.wait_for(images.__anext__(), 0.2)
                 arrived += 1
         assert memory_bytes(gateway.pid) - before < (8 + 16) << 20
+
+
+async def test_large_frames_leave_nothing() -> None:
+    """After frames of 30 MiB, passed on and refused, the gateway has about the memory that it had before them."""
+    async with site() as (_, gateway), await Headset.connect("127.0.0.1", gateway.port) as headset:
+        await answers(headset)
+        before = memory_bytes(gateway.pid)
+        connections = [await asyncio.open_connection("127.0.0.1", gateway.port) for _ in range(3)]
+        for size in (30 << 20, 29 << 20, 31 << 20):
+            for to in (bytes(4), b"{}"):  # metadata of nothing is refused
+                body = struct.pack("<I", len(to)) + to + struct.pack("<I", size) + bytes(size)
+                for _, writer in connections:
+                    writer.write(CONFIGURATION + struct.pack("<BH28xII", 2, headset.id, 0, len(body)) + body)
+                    await writer.drain()
+        for _, writer in connections:
+            writer.close()
+        await answers(headset)
+
+        async def given_back() -> None:
+            while memory_bytes(gateway.pid) - before > 80 << 20:
+                await asyncio.sleep(0.1)
+
+        await asyncio.wait_for(given_back(), 20)
 
 
 async def test_silent_connections_are_closed(start_gateway: StartGateway) -> None:

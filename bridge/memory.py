@@ -1,0 +1,28 @@
+"""Memory that large frames took is given back when they are gone."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from contextlib import suppress
+
+LARGE_BYTES = 4 << 20
+"""So much and more is mapped by itself. What is smaller comes from the heap, which is faster."""
+SPARE_BYTES = 32 << 20
+"""The heap keeps so much at its end."""
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+
+
+def give_back() -> None:
+    """Hold the C library to these numbers, where it has them (glibc).
+
+    By itself it raises both with the largest piece that was ever freed, to 32 and 64 MiB: after a few frames of
+    31 MiB a program kept 60 to 80 MiB that nobody used.
+    """
+    if sys.platform != "linux":
+        return
+    with suppress(OSError, AttributeError):  # musl has no mallopt
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_M_MMAP_THRESHOLD, LARGE_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, SPARE_BYTES)
