@@ -1,7 +1,7 @@
 """The door itself: accepts connections as long as there are descriptors, and says when there are none.
 
-libuv closes whom it has no descriptor for without a word, so this is done here. Some descriptors are kept for what a
-gateway needs besides: its links to routers, above all.
+libuv closes whom it has no descriptor for without a word, so this is done here where they can run out. Some are kept
+for what a gateway needs besides: its links to routers, above all.
 """
 
 from __future__ import annotations

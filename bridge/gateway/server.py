@@ -62,7 +62,7 @@ from .connection import Connection
 from .delivery import Delivery, Stream
 from .door import Door
 from .leases import Leases
-from .listener import Listener, descriptors
+from .listener import BACKLOG, Listener, descriptors
 from .memory import Memory
 from .own_keys import OwnKeys
 from .renumbering import Renumbering
@@ -132,7 +132,7 @@ class Gateway:
         self._waiting = WaitingRoom(settings.handshake_s, self._no_id)
         self._routes: dict[Connection, Routes] = {}
         self._subscriptions: dict[str, Subscription] = {}
-        self._listeners: list[Listener] = []
+        self._listeners: list[Listener | asyncio.AbstractServer] = []
         self._run = NO_RUN
         self._brake = Brake()
         mesh.on_room(self._brake.release)
@@ -189,16 +189,21 @@ class Gateway:
         self._subscriptions["ping"] = self.mesh.answer_pings()
         sockets = bound(self.settings.host, self.settings.port, shared=self.settings.reuse_port)
         self.port = sockets[0].getsockname()[1]
+        room = (descriptors() - OTHER_DESCRIPTORS - BACKLOG) // 2
+        if room < self.settings.max_connections:
+            problem = "gateway.max_connections is %d, and at most %d connections have room: few files may be open"
+            log.warning(problem, self.settings.max_connections, max(0, room + BACKLOG // 2))
         for listening in sockets:
             try:
-                self._listeners.append(Listener(listening, self._connection, self._turned_away))
+                if room < self.settings.max_connections:
+                    self._listeners.append(Listener(listening, self._connection, self._turned_away))
+                else:  # quicker, and silent where there are no descriptors
+                    create = asyncio.get_running_loop().create_server
+                    self._listeners.append(await create(self._connection, sock=listening, backlog=BACKLOG))
             except OSError as error:  # two gateways can hold a port, and one of them can listen
                 why = f"cannot listen there: {error.strerror or error}"
                 raise Unreachable(self.address, why) from error
         log.info("listening on %s", self.address)
-        if (room := (descriptors() - OTHER_DESCRIPTORS) // 2) < self.settings.max_connections:
-            problem = "%d connections at most have room, not gateway.max_connections = %d: few files may be open"
-            log.warning(problem, room, self.settings.max_connections)
 
     def _turned_away(self, whom: str) -> None:
         """There was no descriptor for a connection."""

@@ -57,7 +57,8 @@ class Agent:
 
     def register(self, node_type: int, topic: str, robots: list[int], groups: list[int] | None = None) -> None:
         """Ask for an interface node."""
-        spec = frames.NodeSpec(NodeType(node_type), topic, "std_msgs/String")
+        kind = "std_srvs/Trigger" if node_type == NodeType.SERVICE else "std_msgs/String"
+        spec = frames.NodeSpec(NodeType(node_type), topic, kind)
         self.writer.write(frames.registration(self.id, spec, robots, groups or []))
 
     def bodies(self, manager: str) -> list[bytes]:
