@@ -307,6 +307,9 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     """Own management messages, as my_package.world_class_manager:WorldClassManager (docs/managers.md)."""
     tell_refusals: bool = True
     """Tell a headset when a robot refused its registration, by a management message that existing programs ignore."""
+    groups: dict[str, list[str]] = {}
+    """Groups that not everybody here may choose, and the networks whose agents may: ``{9 = ["10.0.3.0/24"]}``. Who may
+    not is in no group. For robots that give rights to a group (`RobotSettings.groups`). Other groups are free."""
     robot_packages: list[str] = []
     """Packages of ROS types that existing robot programs here have, besides the common ones and those of the topics
     and services that they name. A type of another package ends such a program's thread, so it is refused."""
@@ -318,11 +321,15 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
             msgspec.structs.force_setattr(self, "host", addresses.bare(self.host))
         except ValueError as error:
             raise self._wrong("host", str(error)) from None
-        for network in self.allow:
-            try:
-                ipaddress.ip_network(network, strict=False)
-            except ValueError as error:
-                raise self._wrong("allow", f"{network!r} is not a network, as in 192.168.1.0/24: {error}") from None
+        for group in self.groups:
+            if not _names_agents(f"group/{group}"):
+                raise self._wrong(f"groups.{group}", "is no group: 1 to 255")
+        for where, networks in [("allow", self.allow), *((f"groups.{g}", of) for g, of in self.groups.items())]:
+            for network in networks:
+                try:
+                    ipaddress.ip_network(network, strict=False)
+                except ValueError as error:
+                    raise self._wrong(where, f"{network!r} is not a network, as in 192.168.1.0/24: {error}") from None
 
 
 class TopicRule(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -431,11 +438,26 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     all are."""
     rules: list[TopicRule] = []
 
+    groups: dict[str, list[AgentPattern]] = {}
+    """Who is believed to be in a group where rights name it: ``{9 = ["block/1"]}``. Agents choose their groups; so
+    somebody has to answer for them, as the gateway of block 1 does with `GatewaySettings.groups`."""
+
     def _check(self) -> None:
+        for group, patterns in self.groups.items():
+            if not _names_agents(f"group/{group}"):
+                raise self._wrong(f"groups.{group}", "is no group: 1 to 255")
+            for pattern in patterns:
+                if pattern.startswith("group/") or not _names_agents(pattern):
+                    problem = f"{pattern!r} names no agents, as *, unity, unity/5, ros and block/1 do"
+                    raise self._wrong(f"groups.{group}", problem)
         for field in ("stop_allow", "release_allow", "register_allow"):
             for number, pattern in enumerate(getattr(self, field)):
                 if not _names_agents(pattern) and (field, pattern) != ("release_allow", WHO_STOPPED):
                     problem = f"{pattern!r} names no agents, as *, unity, unity/5, operator/5, block/1 and group/3 do"
+                    raise self._wrong(f"{field}[{number}]", problem)
+                kind, _, group = pattern.partition("/")
+                if kind == "group" and group not in self.groups:
+                    problem = f"{pattern!r}: say in robot.groups whom this robot believes to be in group {group}"
                     raise self._wrong(f"{field}[{number}]", problem)
 
 

@@ -13,7 +13,7 @@ Frames that come before the configuration are held until it is there, because he
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from enum import Enum
 from typing import NamedTuple
@@ -177,8 +177,10 @@ class Peer:
         layout: Layout = MACS,
         scratch: bytearray | None = None,
         credit: Credit | None = None,
+        closed_groups: Collection[int] = (),
     ) -> None:
-        """``credit`` is what an earlier connection left, if there was one."""
+        """``credit`` is what an earlier connection left, if there was one; ``closed_groups`` are not to be chosen."""
+        self._closed_groups = closed_groups
         self.agent_id = agent_id
         self.former_ids: set[int] = set()
         self.connection_number = connection_number
@@ -431,6 +433,9 @@ class Peer:
         if self.state is ONLINE and kind != self.agent_type:
             raise NotAllowed(f"a configured agent of type {self.agent_type} cannot become type {kind}")
         same = configuration.extensions == self.extensions
+        if group in self._closed_groups:
+            self._reject(NotAllowed(f"group {group} is not to be chosen from there (gateway.groups)"), 1, events)
+            group = 0
         self.extensions = configuration.extensions
         self.functionality = configuration.functionality or self.functionality
         if self.state is ONLINE and group == self.group and same:

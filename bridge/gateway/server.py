@@ -122,7 +122,9 @@ class Gateway:
             frames_per_s=settings.max_frames_per_s,
         )
         self._scratch = bytearray(FrameDecoder.SMALL_BYTES)  # sockets of one loop receive one after the other
-        self._door = Door(settings.allow, settings.max_connections, settings.max_connections_per_address)
+        self._door = Door(
+            settings.allow, settings.max_connections, settings.max_connections_per_address, settings.groups
+        )
         self._nodes = Budget("interface nodes", each=NODES_EACH, per_address=NODES_PER_ADDRESS, total=NODES_IN_ALL)
         self._credits: Credits[str] = Credits(settings.max_frames_per_s)
         self._online_reply = b""
@@ -296,6 +298,7 @@ class Gateway:
                 custom=self._custom,
                 layout=self._layout,
                 scratch=self._scratch,
+                closed_groups=self._door.closed_groups(connection.host),
             )
             self.agents.enter(agent_id, connection)
             self._routes[connection] = Routes(self.directory, self.mesh.limited, time.monotonic())

@@ -239,8 +239,9 @@ class RobotAgent:
             self.nodes.drops.note("failed", str(to), str(error))
 
     def _group_of(self, agent: Registrant) -> int:
+        """As far as rights go. Agents choose their groups, so only some are believed."""
         found = self.agent.directory.get(*agent)
-        return found.group if found else 0
+        return self.nodes.robot.rules.believed_group(found.type_name, found.id, found.group) if found else 0
 
     def _id_changed(self, _old: int, new: int) -> None:
         """Whoever registered here asked for the old id, which is another robot's now; as after a restart, gateways

@@ -92,7 +92,7 @@ class Robot:
         layout: of the mesh's frames.
         send: a message to one agent.
         rules: what the settings say by name.
-        group_of: an agent's group now, 0 for none.
+        group_of: an agent's group now as far as rights go, 0 for none.
         stop: the emergency stop.
         alarms: calls back at a time, whatever the loop is busy with.
         refusals: who was told lately why what he sent was not taken.

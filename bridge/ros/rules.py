@@ -58,6 +58,11 @@ class Rules:
         if not self.exposes(name):
             raise Refused(f"{name} is not open to headsets on this robot")
 
+    def believed_group(self, agent_type: str, agent_id: int, group: int) -> int:
+        """The group of an agent as far as rights go: 0 unless the settings believe that it is in the one it says."""
+        believed = self.settings.groups.get(str(group), ())
+        return group if names_agent(believed, agent_type, agent_id, 0) else 0
+
     def of(self, name: str) -> TopicRule:
         """Every setting from the first rule that fits and gives it."""
         rule = self._merged.get(name)

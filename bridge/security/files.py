@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -362,8 +362,8 @@ def _command(client: Client, directory: str) -> str:
 
 
 def _sections(plan: Plan, client: Client) -> list[str]:
-    if isinstance(client, Gateway) and client.blocks:
-        return ["", "[gateway]", "# the certificate is good for these only", f"blocks = {json.dumps(client.blocks)}"]
+    if isinstance(client, Gateway):
+        return _gateway_section(client)
     if isinstance(client, Operator) and client.id is not None:
         return [
             "",
@@ -377,10 +377,41 @@ def _sections(plan: Plan, client: Client) -> list[str]:
     commanders = [pattern for other in plan.clients if plan.may(other, "command", client) for pattern in _who(other)]
     lines += ["# who may command it; who may only see it registers for its topics and for nothing else"]
     lines += [f"register_allow = {json.dumps(list(dict.fromkeys(commanders)))}"]
+    lines += _believed(plan, client)
     if client.called is not None:
         name = json.dumps(client.called, ensure_ascii=False)
         lines += ["", "[awareness]", f"name = {name}", f"id = {client.id}", "beside = true"]
     return lines
+
+
+def _gateway_section(gateway: Gateway) -> list[str]:
+    lines = []
+    if gateway.blocks:
+        lines += ["# the certificate is good for these only", f"blocks = {json.dumps(gateway.blocks)}"]
+    if gateway.groups:
+        lines += ["# robots believe these groups of its headsets", f"groups = {_table(gateway.groups)}"]
+    return ["", "[gateway]", *lines] if lines else []
+
+
+def _believed(plan: Plan, robot: Robot) -> list[str]:
+    """Who is in which group, where a robot is told rights of a group: robots by their certificates, headsets as their
+    gateways answer for it."""
+    groups: dict[str, list[str]] = {}
+    for other in plan.robots:
+        if other.group and plan.related(robot, other):
+            groups.setdefault(str(other.group), []).extend(_who(other))
+    for gateway in plan.gateways:
+        if plan.related(robot, gateway):
+            for group in gateway.groups:
+                groups.setdefault(group, []).extend(_who(gateway))
+    if not groups:
+        return []
+    return ["# who is believed to be in a group, where a setting gives rights to one", f"groups = {_table(groups)}"]
+
+
+def _table(lists: Mapping[str, list[str]]) -> str:
+    """An inline table of TOML."""
+    return "{ " + ", ".join(f"{name} = {json.dumps(words)}" for name, words in lists.items()) + " }"
 
 
 def _who(client: Client) -> list[str]:

@@ -30,7 +30,7 @@ import msgspec
 from msgspec import Meta
 
 from macs_zenoh.addresses import joined
-from macs_zenoh.config import AgentId, AgentName, GroupId, MeshSettings, TrafficRule
+from macs_zenoh.config import AgentId, AgentName, GatewaySettings, GroupId, MeshSettings, TrafficRule
 from macs_zenoh.errors import ConfigError
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=63)]
@@ -101,6 +101,8 @@ class Gateway(_Client, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     blocks: list[GroupId] = []
     """The blocks of 256 ids that it gives out, so that its certificate is good for these ids only. Empty: any."""
+    groups: dict[str, list[str]] = {}
+    """Groups that robots believe of its headsets, for rights, and the networks whose headsets may choose them."""
 
 
 class Operator(_Client, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -309,6 +311,12 @@ def _check(plan: Plan) -> None:
         _check_router(router, plan)
     for client in plan.clients:
         _known(f"{client.name}.routers", client.routers, [router.name for router in plan.routers])
+    for gateway in plan.gateways:
+        try:
+            GatewaySettings(groups=gateway.groups)
+        except ConfigError as error:
+            field = error.path.rpartition("gateway.")[2]
+            raise ConfigError(f"gateways: {gateway.name}.{field}", error.problem) from None
     for number, permission in enumerate(plan.permissions):
         _check_permission(f"permissions[{number}]", permission, plan)
     for field in ELSEWHERE:

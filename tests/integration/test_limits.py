@@ -352,3 +352,14 @@ async def test_frames_that_do_not_end_have_a_limit_together() -> None:
         with suppress(ConnectionError):
             await ended
         assert any("its frame does not end" in line for line in gateway.log)
+
+
+async def test_a_group_is_chosen_from_its_networks(router: str, start_gateway: StartGateway) -> None:
+    """Who comes from elsewhere is online in no group; groups that are not named are free."""
+    gateway = await start_gateway(groups={"9": ["10.0.0.0/8"], "8": ["127.0.0.0/8", "::1"]})
+    for chosen, got in ((9, 0), (8, 8), (7, 7)):
+        async with await Headset.connect("127.0.0.1", gateway.port, group=chosen) as headset:
+            await until(lambda headset=headset: gateway.directory.get(2, headset.id) is not None)
+            found = gateway.directory.get(2, headset.id)
+            assert found is not None
+            assert found.group == got

@@ -21,6 +21,7 @@ SETTINGS = """
 [robot]
 id = 7
 register_allow = ["group/3"]
+groups = { 3 = ["unity"] }
 stop_allow = ["unity"]
 release_allow = ["unity"]
 

@@ -15,6 +15,7 @@ from ros_peer import Peer, adding, drive, get, removing, until
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
+import macs_zenoh
 from bridge.ros.agent import RobotAgent, open_robot
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
@@ -242,7 +243,7 @@ async def test_who_may_not_act_is_heard_nowhere(session: RosSession, peer: Peer)
 async def test_a_right_ends_when_it_is_taken_away(session: RosSession) -> None:
     """What was found out about an agent is asked again when somebody came, left or changed its group."""
     groups = {Registrant(2, OPERATOR): 9}
-    rules = Rules(RobotSettings(register_allow=["group/9"]))
+    rules = Rules(RobotSettings(register_allow=["group/9"], groups={"9": ["unity"]}))
     robot = Robot(session, 7, lambda node, frame: None, rules=rules, group_of=lambda agent: groups.get(agent, 0))
     nodes = InterfaceNodes(robot)
     try:
@@ -255,6 +256,30 @@ async def test_a_right_ends_when_it_is_taken_away(session: RosSession) -> None:
         assert nodes.drops == {"not_allowed": 1}
     finally:
         nodes.close()
+
+
+async def test_a_group_that_one_only_says_gives_no_right(router: str, domain: int) -> None:
+    """A right of a group is for those of whom the settings believe it; others are refused, and heard nowhere."""
+    allow = RobotSettings(id=ROBOT, rules=RULES, register_allow=["group/9"], groups={"9": ["unity/5"]})
+    async with (
+        open_robot(Settings(mesh=MeshSettings(connect=[router]), robot=allow), domain_id=domain) as robot,
+        macs_zenoh.join("unity", id=OPERATOR, group=9, connect=[router]) as operator,
+        macs_zenoh.join("unity", id=STRANGER, group=9, connect=[router]) as stranger,
+    ):
+        await until(lambda: all((1, ROBOT) in agent.directory for agent in (operator, stranger)))
+        await until(lambda: all((2, number) in robot.agent.directory for number in (OPERATOR, STRANGER)))
+        await operator.call("ros", ROBOT, "add_node", encode_data(publishing("/cmd_vel")))
+        with pytest.raises(Refused, match="unity/6 may only register for topics"):
+            await stranger.call("ros", ROBOT, "add_node", encode_data(publishing("/cmd_vel", STRANGER)))
+        take = encode_data(ControlRequest("take", "/cmd_vel"))
+        assert b"unity/6 may" in await stranger.call("ros", ROBOT, "control", take)
+        metadata = Metadata(node_type=NodeType.PUBLISHER, node_name="nd__cmd_vel")
+        stranger.send(drive(1).data, to="ros", ids=[ROBOT], metadata=metadata)
+        await until(lambda: robot.nodes.drops["not_allowed"] == 1)
+        operator.send(drive(1).data, to="ros", ids=[ROBOT], metadata=metadata)
+        node = robot.nodes.on_topic(NodeType.PUBLISHER, "/cmd_vel")
+        assert node is not None
+        await until(lambda: node.status()["control"]["holder"] == "unity/5")
 
 
 # -- who serves ------------------------------------------------------------------------------------------------------

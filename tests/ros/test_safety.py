@@ -110,7 +110,7 @@ RULES = [
 
 @pytest.fixture
 async def nodes(session: RosSession) -> AsyncIterator[InterfaceNodes]:
-    rules = Rules(RobotSettings(rules=RULES, release_allow=["group/3"]))
+    rules = Rules(RobotSettings(rules=RULES, release_allow=["group/3"], groups={"3": ["unity"]}))
     groups = {SIX: 3}
     robot = Robot(session, 7, lambda node, frame: None, rules=rules, group_of=lambda agent: groups.get(agent, 0))
     nodes = InterfaceNodes(robot)

@@ -62,6 +62,11 @@ def test_a_file_sets_its_fields(tmp_path: Path) -> None:
         ("[robot]\nstop_allow = ['bob']", "f.toml: robot.stop_allow[0]", "'bob' names no agents, as *, unity"),
         ("[robot]\nrelease_allow = ['*', 'operator5']", "f.toml: robot.release_allow[1]", "operator/5"),
         ("[robot]\nregister_allow = ['group/0']", "f.toml: robot.register_allow[0]", "'group/0' names no agents"),
+        ("[robot]\nregister_allow = ['group/9']", "f.toml: robot.register_allow[0]", "say in robot.groups whom"),
+        ("[robot]\ngroups = { 0 = [] }", "f.toml: robot.groups.0", "is no group"),
+        ("[robot]\ngroups = { 9 = ['group/3'] }", "f.toml: robot.groups.9", "'group/3' names no agents"),
+        ("[gateway]\ngroups = { 9 = ['x'] }", "f.toml: gateway.groups.9", "'x' is not a network"),
+        ("[gateway]\ngroups = { x = [] }", "f.toml: gateway.groups.x", "is no group"),
         ("[robot]\nregister_allow = ['block/256']", "f.toml: robot.register_allow[0]", "'block/256' names no agents"),
         ("[robot]\nregister_allow = ['unity/']", "f.toml: robot.register_allow[0]", "'unity/' names no agents"),
         ("[robot]\nregister_allow = ['ros/70000']", "f.toml: robot.register_allow[0]", "'ros/70000' names no agents"),
@@ -110,7 +115,7 @@ def test_a_file_has_rules_for_traffic_and_topics() -> None:
 def test_patterns_of_agents() -> None:
     """Everybody, a type by word or number, one agent, a group and a block can be allowed."""
     patterns = ["*", "ros", "unity", "operator", "7", "unity/5", "operator/0", "7/65535", "group/255", "block/0"]
-    assert RobotSettings(stop_allow=patterns, release_allow=[]).stop_allow == patterns
+    assert RobotSettings(stop_allow=patterns, release_allow=[], groups={"255": ["block/0"]}).stop_allow == patterns
 
 
 def test_a_later_file_wins_setting_by_setting(tmp_path: Path) -> None:

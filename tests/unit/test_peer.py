@@ -989,3 +989,14 @@ def test_other_layouts_work_alike() -> None:
     assert sent.frame.header.ids == ids
     assert sent.frame.layout == layout
     assert sent.metadata.sender_agent_id == 7
+
+
+def test_a_group_that_is_not_to_be_chosen() -> None:
+    """The agent comes online in no group; it may choose another one, and not this one later."""
+    peer = Peer(7, 42, 0.0, closed_groups={9})
+    for group, got in ((9, 0), (3, 3), (9, 0)):
+        events = peer.receive(configuration(group=group), 0.0)
+        joined = [event for event in events if isinstance(event, Joined)]
+        assert [event.group for event in joined] == [got]
+        assert peer.group == got
+    assert peer.drops["NotAllowed"] == 2

@@ -284,6 +284,19 @@ def test_settings_say_who_somebody_is() -> None:
     assert config.parse(files.settings_toml(numbered, anna, "/etc/macs")).operator.id == 5
 
 
+def test_groups_are_believed_of_those_who_are_answered_for() -> None:
+    """Where a gateway says from where a group may be chosen, robots that have to do with it believe its headsets;
+    robots are in the group that their certificate is for."""
+    text = TEXT.replace("blocks: [1]", "blocks: [1], groups: {'9': [10.0.3.0/24]}")
+    found = plan.parse(text)
+    made = {client.name: config.parse(files.settings_toml(found, client, "/x")) for client in found.clients}
+    assert made["hall-1"].gateway.groups == {"9": ["10.0.3.0/24"]}
+    assert made["hall-2"].gateway.groups == {}
+    assert made["robot-7"].robot.groups["9"] == ["block/1"]
+    with pytest.raises(ConfigError, match=r"gateways: hall-1\.groups\.9.*is not a network"):
+        plan.parse(text.replace("10.0.3.0/24", "somewhere"))
+
+
 def test_a_robot_knows_who_may_command_it() -> None:
     """What somebody registers for is in a payload, where no router sees it, so the robot's settings say who may."""
     text = TEXT.replace("{name: anna}", "{name: anna, id: 5}\n  - {name: berta}").replace(", blocks: [1]", "")
