@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
+import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import TypeVar
@@ -47,6 +48,8 @@ REQUESTS = frozenset({FunctionalityRequest.manager, STATUS, ControlRequest.manag
 ABSENT_S = 5.0
 """How long an agent may be registered without being online: its registration can come before its presence, and also
 after its end, when it left in that moment."""
+JUDGED_S = 1.0
+"""How long the registration of an agent that is not seen yet waits for its presence, where that decides."""
 SESSIONS = 8192
 """Of so many agents the robot remembers who had their ids last."""
 STOP_MESSAGES_S = 0.1
@@ -78,6 +81,7 @@ class RobotAgent:
             send=self._send,
             rules=Rules(settings),
             group_of=self._group_of,
+            is_online=lambda agent: agent in self.agent.directory,
             prioritise_stream=agent.prioritise_stream,
             keep_stream=agent.keep_stream,
         )
@@ -193,11 +197,21 @@ class RobotAgent:
 
     async def _add_node(self, call: Call) -> bytes:
         request = _own(decode_data(AddNode, call.data), call)
-        await self.nodes.add(request)
         registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
+        await self._until_judged(registrant)
+        await self.nodes.add(request)
         if registrant not in self.agent.directory:
             asyncio.get_running_loop().call_later(ABSENT_S, self._forget_absent, registrant)
         return b""
+
+    async def _until_judged(self, registrant: Registrant) -> None:
+        """A registration can come before the presence of its agent, on whose group its rights may depend."""
+        deadline = time.monotonic() + JUDGED_S
+        may_act = self.nodes.rights.may_act
+        while registrant not in self.agent.directory and time.monotonic() < deadline:
+            if may_act(type_name(registrant.agent_type), registrant.agent_id):
+                return
+            await asyncio.sleep(0.02)
 
     def _forget_absent(self, registrant: Registrant) -> None:
         """Nobody would ever see it leave."""
@@ -266,9 +280,9 @@ class RobotAgent:
                 node.cut_off()
 
     def _presence(self, agent: AgentInfo, online: bool) -> None:
-        self.nodes.rights.changed()
         agent_key = Registrant(agent.type, agent.id)
         if not online:
+            self.nodes.rights.changed()
             self._forget(agent_key)
             return
         before = self._sessions.pop(agent_key, None)
@@ -279,6 +293,7 @@ class RobotAgent:
             self.nodes.returned(agent_key)
         elif before is not None:  # whether it was seen to leave or not: what it had is not the next one's
             self._forget(agent_key, for_good=True)
+        self.nodes.arrived(agent_key)
 
     def _forget(self, gone: Registrant, *, for_good: bool = False) -> None:
         self.nodes.forget(gone, for_good=for_good)

@@ -65,6 +65,15 @@ class EarlyMessages:
             self._waiting[key] = deque(early for early in waiting if not any(early.message is t for t in taken))
         return taken
 
+    def of(self, sender: tuple[int, int]) -> list[tuple[NodeKey, Message]]:
+        """What waits of one sender, with what it is for."""
+        return [
+            (key, early.message)
+            for key, waiting in self._waiting.items()
+            for early in waiting
+            if (type_number(early.message.sender_type), early.message.sender_id) == sender
+        ]
+
     def drop(self, sender: tuple[int, int]) -> None:
         """Forget what somebody sent who has left: its id may be another one's by the time there is a node."""
         for key in list(self._waiting):

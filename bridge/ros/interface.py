@@ -93,6 +93,8 @@ class Robot:
         send: a message to one agent.
         rules: what the settings say by name.
         group_of: an agent's group now as far as rights go, 0 for none.
+        is_online: whether an agent has been seen: what it sends can come before its presence, on which its rights
+            may depend.
         stop: the emergency stop.
         alarms: calls back at a time, whatever the loop is busy with.
         refusals: who was told lately why what he sent was not taken.
@@ -106,6 +108,7 @@ class Robot:
     send: SendTo = lambda to, metadata, data: None
     rules: Rules = field(default_factory=Rules)
     group_of: Callable[[Registrant], int] = lambda agent: 0
+    is_online: Callable[[Registrant], bool] = lambda agent: True
     stop: EmergencyStop = field(default_factory=EmergencyStop)
     prioritise_stream: Callable[[str, Priority | None], None] = lambda node, priority: None
     keep_stream: Callable[[str, int | None], bool] = lambda node, frames: False

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import operator
 import threading
 import time
 from collections.abc import Iterator
@@ -224,6 +225,16 @@ class InterfaceNodes:
                 else:
                     self._deregister(node, registrant)
 
+    def arrived(self, registrant: Registrant) -> None:
+        """An agent is seen now; what it sent before waits to be judged."""
+        self.rights.changed()
+        with self._early_lock:
+            waiting = self._early.of(registrant)
+            for key, message in waiting:
+                self._early.take(key, partial(operator.is_, message))
+        for _, message in waiting:
+            self.deliver(message)
+
     def returned(self, registrant: Registrant) -> None:
         """An agent that seemed to have left is there again, the same one."""
         for node in self:
@@ -244,13 +255,15 @@ class InterfaceNodes:
         key = NodeKey(message.metadata.node_type, message.metadata.node_name)
         node = self._meant(key, message)
         stops = node is not None and node is self.stop  # who may is its own matter
-        if not stops and not self.rights.may_act(message.sender_type, message.sender_id):
+        allowed = stops or self.rights.may_act(message.sender_type, message.sender_id)
+        if not allowed and self.robot.is_online(Registrant.of(message)):
             self._refuse(node, key, message)
             return
-        if node is None or not node.is_open:
+        if node is None or not node.is_open or not allowed:
             with self._early_lock:
-                node = self._meant(key, message)  # it may have been opened in this moment
-                if node is None or not node.is_open:
+                node = self._meant(key, message)  # it may have been opened in this moment, or its sender been seen
+                allowed = allowed or self.rights.may_act(message.sender_type, message.sender_id)
+                if node is None or not node.is_open or not allowed:
                     self._keep_early(key, message)
                     return
         node.receive(message)
@@ -424,6 +437,11 @@ class InterfaceNodes:
                 with self._early_lock:
                     for message in messages:  # its node comes late, but it comes; its sender knows how long to wait
                         self._early.hold(key, message, now)
+                continue
+            for message in [m for m in messages if not self.rights.may_act(m.sender_type, m.sender_id)]:
+                messages.remove(message)
+                self._refuse(self._meant(key, message), key, message)
+            if not messages:
                 continue
             reason = f"nobody registered this node with type {key.node_type}"
             if self._places.first(key) is not None:

@@ -33,13 +33,14 @@ class Rights:
         """Whether an agent may command, call, serve and give goals. From any thread."""
         if self._everybody:
             return True
-        known = self._known.get((agent_type, agent_id))
+        results = self._known  # what is found out now is not remembered when `changed` comes meanwhile
+        known = results.get((agent_type, agent_id))
         if known is None:
             group = self._group_of(Registrant(int(type_number(agent_type)), agent_id))
             known = names_agent(self._allow, agent_type, agent_id, group)
-            if len(self._known) >= self.KNOWN:  # ids come from the network
-                self._known.clear()
-            self._known[agent_type, agent_id] = known
+            if len(results) >= self.KNOWN:  # ids come from the network
+                results.clear()
+            results[agent_type, agent_id] = known
         return known
 
     def check(self, agent: Registrant) -> None:
@@ -49,4 +50,4 @@ class Rights:
 
     def changed(self) -> None:
         """Somebody came, left, or is in another group: what was found may hold no longer."""
-        self._known.clear()
+        self._known = {}

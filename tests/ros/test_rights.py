@@ -258,6 +258,29 @@ async def test_a_right_ends_when_it_is_taken_away(session: RosSession) -> None:
         nodes.close()
 
 
+async def test_what_comes_before_the_presence_of_its_sender_waits(session: RosSession, peer: Peer) -> None:
+    """A command can overtake the news that its sender is in a group; it is judged when that has come, or given up."""
+    seen: set[Registrant] = set()
+    rules = Rules(RobotSettings(register_allow=["group/9", "unity/1"], groups={"9": ["unity"]}))
+    robot = Robot(session, 7, lambda node, frame: None, rules=rules, group_of=lambda agent: 9 * (agent in seen))
+    robot.is_online = seen.__contains__
+    nodes = InterfaceNodes(robot)
+    received = await heard(nodes, peer, "/cmd_vel")
+    try:
+        await nodes.add(publishing("/cmd_vel", 1))
+        for sender in (OPERATOR, STRANGER):
+            assert not nodes.deliver_at_once(drive(sender, sender))
+            nodes.deliver(drive(sender, sender))
+        assert nodes.drops == {}
+        seen.add(Registrant(2, OPERATOR))
+        nodes.arrived(Registrant(2, OPERATOR))
+        assert (await get(received)).linear.x == OPERATOR
+        await until(lambda: nodes.drops == {"not_allowed": 1})
+        assert received.empty()
+    finally:
+        nodes.close()
+
+
 async def test_a_group_that_one_only_says_gives_no_right(router: str, domain: int) -> None:
     """A right of a group is for those of whom the settings believe it; others are refused, and heard nowhere."""
     allow = RobotSettings(id=ROBOT, rules=RULES, register_allow=["group/9"], groups={"9": ["unity/5"]})
