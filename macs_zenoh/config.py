@@ -289,6 +289,10 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     """A larger declared frame closes its connection before a byte of it is stored."""
     max_frames_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0
     """Frames of every kind from one connection; the rest is dropped and counted. 0: no limit."""
+    max_commands_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
+    """Of these, commands to robots; as a robot's own limit, before they fill the way to it. Stops are not counted."""
+    max_requests_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
+    """And all else that goes to robots."""
     handshake_s: Seconds = 10.0
     """A connection that has not configured itself by then is closed."""
     silence_s: Seconds = 60.0

@@ -22,6 +22,7 @@ from macs_zenoh.budget import Toll
 from macs_zenoh.existing import Asked, Verdict, to_headset, to_newer, to_robot
 from macs_zenoh.limits import REQUESTS_PER_S, UNFINISHED_FREE_BYTES
 from macs_zenoh.messages import ROS, AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
+from macs_zenoh.pace import Pace
 from macs_zenoh.peer import Event, Joined, Left, Peer, Rejected, Sent, State
 from macs_zenoh.queues import Chunk, Outbox
 from macs_zenoh.robot_nodes import RobotNodes
@@ -68,6 +69,9 @@ LEAST_READ_BYTES = 1024
 class Owner(Protocol):
     """What a connection needs of its gateway."""
 
+    def pace(self) -> Pace:
+        """What a new connection may send to robots."""
+
     def opened(self, connection: Connection) -> bool:
         """A socket connected: False refuses it; otherwise it is greeted, now or soon."""
 
@@ -107,6 +111,7 @@ class Connection(asyncio.BufferedProtocol):
     ) -> None:
         self.owner = owner
         self.peer: Peer
+        self.pace: Pace
         self.greeted = False
         self.host = self.address = "?"
         self.drops: Counter[str] = Counter()
@@ -194,6 +199,7 @@ class Connection(asyncio.BufferedProtocol):
         """The agent has an id: tell it, and begin to listen."""
         self.peer = peer
         self.greeted = True
+        self.pace = self.owner.pace()
         self._write([peer.welcome()])
         self.resume()
         self._schedule()

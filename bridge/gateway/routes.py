@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from macs_zenoh.credit import Credit
 from macs_zenoh.messages import BROADCAST as EVERYBODY
+from macs_zenoh.messages import ROS
 from macs_zenoh.registrations import AgentKey
 from macs_zenoh.routing import keys_of
 from macs_zenoh.wire import Frame, Header
@@ -28,6 +29,8 @@ class Route(NamedTuple):
     """Whether a traffic rule limits one of the keys, so that frames count one by one."""
     left_out: int = 0
     """Destinations that were too many strangers."""
+    to_robots: bool = False
+    """Whether robots are among those it goes to."""
 
 
 class Routes:
@@ -50,7 +53,8 @@ class Routes:
         keys = keys_of(header, *sender)
         # type 0 goes to everybody, whatever ids it names
         agents = [(header.agent_type, agent_id) for agent_id in header.ids] if header.agent_type else []
-        route = Route(keys, agents, any(self._is_limited(key) for key in keys), left_out)
+        limited = any(self._is_limited(key) for key in keys)
+        route = Route(keys, agents, limited, left_out, header.agent_type in (ROS, EVERYBODY))
         if not left_out:
             if len(self._known) >= KNOWN_ROUTES:
                 self._known.clear()

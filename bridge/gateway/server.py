@@ -40,6 +40,7 @@ from macs_zenoh.messages import (
     OnlineReply,
     encode_data,
 )
+from macs_zenoh.pace import Pace, Passing
 from macs_zenoh.peer import (
     Asked,
     AskedOnline,
@@ -74,6 +75,8 @@ from .waiting import NAMED_S, WaitingRoom
 log = logging.getLogger("macs.gateway")
 
 PUBLISHER = int(NodeType.PUBLISHER)
+STOP_TYPES = frozenset({"std_msgs/Bool", "std_msgs/msg/Bool"})
+"""Of emergency stops, which no limit here concerns: what a robot's is called, only the robot knows."""
 COMMAND, CALL = Traffic.COMMAND, Traffic.CALL  # looked up by a Python call otherwise, for each message
 OTHER_DESCRIPTORS = 64
 """What a gateway has open besides its connections, of which each takes up to two."""
@@ -136,6 +139,8 @@ class Gateway:
         self._subscriptions: dict[str, Subscription] = {}
         self._listeners: list[Listener | asyncio.AbstractServer] = []
         self._run = NO_RUN
+        self._waited: dict[tuple[bytes, str], tuple[Route, bytes | bytearray]] = {}
+        """Commands that have waited in their connection, the newest of each kind, until all that came is seen."""
         self._brake = Brake()
         mesh.on_room(self._brake.release)
         self.directory = self._presence.directory
@@ -399,6 +404,8 @@ class Gateway:
         traffic = COMMAND if metadata.node_type == PUBLISHER else CALL
         if traffic is CALL and (metadata.node_type or metadata.message_manager) and asks(metadata):
             connection.asks(metadata, frame.header)
+        if route.to_robots and not self._may_go(connection, sent, route, traffic):
+            return
         if route.limited:
             self._put_run()
             for single in frame.each():
@@ -411,10 +418,38 @@ class Gateway:
         run.frames.append(frame.data)
         run.bytes += len(frame.data)
 
+    def pace(self) -> Pace:
+        """For a new connection."""
+        return Pace(self.settings.max_commands_per_s, self.settings.max_requests_per_s, time.monotonic())
+
+    def _may_go(self, connection: Connection, sent: Sent, route: Route, traffic: Traffic) -> bool:
+        """Whether a frame to robots goes on now; a command that has waited may, after all that came with it."""
+        now, count, metadata = time.monotonic(), sent.frame.count, sent.metadata
+        if traffic is COMMAND:
+            passing = connection.pace.command(count, now, may_stop=metadata.data_exchange_type in STOP_TYPES)
+        else:
+            passing = connection.pace.request(count, now)
+        if passing is Passing.NOW:
+            return True
+        if passing is Passing.FLOODED:
+            connection.complain("flooded", "it sends robots more than one agent may", count)
+            return False
+        *_, newest = sent.frame.each()
+        held = (sent.frame.destination, metadata.node_name)
+        older = count - 1 + (self._waited.pop(held, None) is not None)
+        self._waited[held] = (route, newest.data)
+        if older:
+            connection.complain("too_old", "commands that waited with newer ones", older)
+        return False
+
     def received(self, connection: Connection) -> None:
         """All that one read of a socket brought is forwarded or handled."""
         if self._run.frames:
             self._put_run()
+        if self._waited:
+            for route, newest in self._waited.values():
+                self._put(route.keys, newest, COMMAND)
+            self._waited.clear()
         if self.mesh.backlogged:
             self._brake.hold(connection)
 

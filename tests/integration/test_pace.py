@@ -1,0 +1,102 @@
+"""What a headset sends to a robot through a gateway: not more than its share, and nothing that has waited."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+
+import pytest
+
+import macs_zenoh
+from bridge.gateway import Gateway
+from bridge.headset.client import Headset
+from macs_zenoh.agent import Agent
+from macs_zenoh.messages import Metadata
+from macs_zenoh.reading import Message
+from macs_zenoh.wire import encode_frame, encode_message
+from tests.integration.conftest import Connect, StartGateway, until
+from tests.integration.test_gateway import Socket, socket
+
+MOVE, STOP = ("nd__cmd_vel", "geometry_msgs/Twist"), ("nd__emergency_stop", "std_msgs/Bool")
+
+
+@pytest.fixture
+async def robot(router: str) -> AsyncIterator[Agent]:
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as robot:
+        yield robot
+
+
+def frame(number: int, node: tuple[str, str] = MOVE, node_type: int = 2) -> bytes:
+    metadata = Metadata(node_type=node_type, node_name=node[0], data_exchange_type=node[1])
+    return encode_frame(1, (7,), message=encode_message(metadata.encode(), b"%d" % number))
+
+
+def taken(robot: Agent, node: tuple[str, str] = MOVE) -> list[int]:
+    """What has come so far of one kind, and is forgotten."""
+    messages: list[Message] = list(robot._inbox)
+    return [int(message.data) for message in messages if message.metadata.node_name == node[0]]
+
+
+async def ready(gateway: Gateway, headset: Socket) -> None:
+    headset.configure()
+    await until(lambda: (1, 7) in gateway.directory and (2, headset.id) in gateway.directory)
+
+
+def drops(gateway: Gateway, headset: Socket) -> dict[str, int]:
+    return dict(gateway.agents.find(2, headset.id).all_drops())
+
+
+async def test_a_headset_whose_network_stood_still_does_not_make_up_for_it(
+    start_gateway: StartGateway, robot: Agent
+) -> None:
+    """It drove at 20 Hz, nothing came for more than a second, then all at once: the newest command of each topic goes
+    on, and the stop that was among them."""
+    gateway = await start_gateway()
+    async with socket(gateway) as headset:
+        await ready(gateway, headset)
+        for number in range(10):
+            headset.writer.write(frame(number))
+            await asyncio.sleep(0.05)
+        await asyncio.sleep(1.1)
+        arm = ("nd__arm", MOVE[1])
+        waited = [frame(100 + number) + frame(200 + number, arm) for number in range(100)]
+        headset.writer.write(b"".join([*waited[:50], frame(1, STOP), *waited[50:]]))
+        await until(lambda: taken(robot)[-1:] == [199] and taken(robot, arm)[-1:] == [299] and taken(robot, STOP))
+        assert len(taken(robot)) <= 10 + 3, "one for each read of the socket"
+        assert taken(robot)[:10] == list(range(10))
+        await asyncio.sleep(0.2)
+        headset.writer.write(frame(1000))
+        await until(lambda: taken(robot)[-1] == 1000)
+        assert drops(gateway, headset)["too_old"] > 190
+
+
+async def test_a_burst_of_commands_is_passed_on(start_gateway: StartGateway, robot: Agent) -> None:
+    """A program that does not drive at a pace may say many things at once, now and then, and in order."""
+    gateway = await start_gateway()
+    async with socket(gateway) as headset:
+        await ready(gateway, headset)
+        for begin in (0, 100):
+            headset.writer.write(b"".join(frame(number) for number in range(begin, begin + 100)))
+            await until(lambda begin=begin: len(taken(robot)) == begin + 100)
+            await asyncio.sleep(1.1)
+        assert taken(robot) == list(range(200))
+
+
+@pytest.mark.parametrize("node_type", [2, 3], ids=["commands", "requests"])
+async def test_a_flood_is_held_to_its_share_and_a_stop_is_not(
+    start_gateway: StartGateway, connect: Connect, robot: Agent, node_type: int
+) -> None:
+    """Of 20 000 messages to a robot at once a second's worth goes on, the rest is counted; stops of the flooder and
+    commands of another headset all do."""
+    gateway = await start_gateway(max_commands_per_s=300, max_requests_per_s=300)
+    other: Headset = await connect(gateway)
+    commands = await other.advertise("/arm", MOVE[1], agents=[7])
+    async with socket(gateway) as headset:
+        await ready(gateway, headset)
+        flood = b"".join(frame(number, node_type=node_type) for number in range(10_000))
+        headset.writer.write(flood + frame(1, STOP) + flood)
+        for number in range(10):
+            await commands.publish(b"%d" % number)
+        await until(lambda: taken(robot, STOP) == [1] and len(taken(robot, ("nd__arm", ""))) == 10)
+        await until(lambda: drops(gateway, headset).get("flooded", 0) > 10_000, 20)
+        assert len(taken(robot)) < 5000
