@@ -25,6 +25,9 @@ JSON_FIELDS = 64
 METADATA_BYTES = 4 << 10
 """The JSON in front of a message's data; with three of the longest names it has 1 KiB."""
 
+SAMPLE_BYTES = 256 << 10
+"""Several frames in one sample, together: what one read of a socket brought is half of that."""
+
 NAME_BYTES = 255
 """Characters of one name: interface node, topic, service, type, manager. ROS 2, where each is a byte, allows 247."""
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from .errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations
-from .limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES
+from .limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, SAMPLE_BYTES
 
 MAX_FRAME_BYTES = 32 << 20
 """Default limit of a whole frame; camera frames of 20 MiB pass."""
@@ -303,6 +303,8 @@ def parse_frames(data: bytes | bytearray, layout: Layout = MACS, *, runs: bool =
             raise BadSizes("frame", size, end - start)
         if management_bytes > MANAGEMENT_BYTES:
             raise TooLong("management data", management_bytes, MANAGEMENT_BYTES)
+        if stop != end > SAMPLE_BYTES:
+            raise TooLong("a sample of several frames", end, SAMPLE_BYTES)
         if runs and stop != end and not management_bytes:
             stop = _run_end(data, start, message_at, size, end)
         frame = Frame(data[start:stop] if start or stop != end else data, layout, message_at, size)

@@ -50,6 +50,8 @@ class Arrivals:
     LIMIT_BYTES = 128 << 20
     """Of payloads that are large; the others are bounded by their number."""
     BATCH = 512
+    BATCH_BYTES = 128 << 10
+    """Handled without a pause in which the loop does other things: it can be thousands of small frames."""
     PATIENCE_S = 0.1
     AT_ONCE_BYTES = 128 << 10
     """Larger ones take too long for a thread that reads from the link."""
@@ -218,7 +220,13 @@ class Arrivals:
     def _deliver_batch(self) -> None:
         self._waiting = False
         queue = self._queue
-        arrived = [queue.popleft() for _ in range(min(len(queue), self.BATCH))]
+        arrived, room = [], self.BATCH_BYTES
+        for _ in range(min(len(queue), self.BATCH)):
+            item = queue.popleft()
+            arrived.append(item)
+            room -= len(item[1][1])
+            if room <= 0:
+                break
         if queue and not self._waiting:
             self._waiting = True
             self._loop.call_soon(self._deliver)

@@ -114,7 +114,7 @@ def samples_that_are_no_frames(target: Target) -> None:
     puts(target, _everybody(target), [*cut, *lying, inner, whole + b"x", bytes(8 * MIB)], every_s=0.5)
 
 
-@attack(1, "mesh", single=True)
+@attack(1, "mesh", single=True, seen=True)
 def one_sample_of_many_frames(target: Target) -> None:
     """One sample that is 200 000 frames, good ones and ones of nothing."""
     good = _to_headset(metadata(message_manager="Hello"), b"x") * 100_000

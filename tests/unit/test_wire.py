@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from recordings import cut_around, one_by_one
 
 from macs_zenoh.errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations
-from macs_zenoh.limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES
+from macs_zenoh.limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, SAMPLE_BYTES
 from macs_zenoh.wire import (
     COPY_BYTES,
     EMPTY_MESSAGE,
@@ -557,3 +557,14 @@ def test_a_probe_carries_no_frame() -> None:
         parse_frames(PROBE[:-1])
     with pytest.raises(BadSizes):
         parse_frames(PROBE.ljust(MACS.header_bytes, b"x"))
+
+
+def test_several_frames_in_a_sample_are_bounded_together() -> None:
+    """One frame may be as large as it likes, several only so large that they are handled in a moment."""
+    small = encode_frame(2, (1,), message=encode_message(b"{}", bytes(100)))
+    count = SAMPLE_BYTES // len(small)
+    assert sum(frame.count for frame in parse_frames(small * count, runs=True)) == count
+    for data in (small * (count + 1), encode_frame(message=encode_message(b"{}", bytes(SAMPLE_BYTES))) + small):
+        with pytest.raises(TooLong):
+            parse_frames(data)
+    assert len(parse_frames(encode_frame(message=encode_message(b"{}", bytes(2 * SAMPLE_BYTES))))) == 1
