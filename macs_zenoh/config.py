@@ -598,7 +598,9 @@ def _document(text: str, source: str) -> dict[str, Any]:
     try:
         document: dict[str, Any] = tomllib.loads(text)
         return document
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError as error:
+        raise ConfigError(source, "not TOML that anybody wrote: it nests too deep") from error
+    except ValueError as error:  # a TOMLDecodeError, or of a number or a date
         raise ConfigError(source, f"not TOML: {error}") from error
 
 

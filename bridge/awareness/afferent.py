@@ -144,7 +144,7 @@ class GatewayClientAfferent:
             return None
         try:
             document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        except (OSError, ValueError, TypeError, OverflowError, RecursionError, yaml.YAMLError) as error:
             log.error("%s cannot be read: %s", path, str(error).replace("\n", " "))
             return None
         listed = document.get("modules") if isinstance(document, dict) else None

@@ -278,6 +278,8 @@ def _yaml(text: str, source: str) -> Any:
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
             seen = set()
             for key, _ in node.value:
+                if not isinstance(key, yaml.ScalarNode):
+                    raise yaml.constructor.ConstructorError(None, None, "a list as a name", key.start_mark)
                 if key.value in seen:
                     raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} twice", key.start_mark)
                 seen.add(key.value)
@@ -289,6 +291,10 @@ def _yaml(text: str, source: str) -> Any:
         line = f": line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise ConfigError(f"{source}{line}", f"not YAML: {error.problem}") from error
     except yaml.YAMLError as error:
+        raise ConfigError(source, f"not YAML: {error}") from error
+    except RecursionError as error:
+        raise ConfigError(source, "not YAML that anybody wrote: it nests too deep") from error
+    except (ValueError, TypeError, OverflowError) as error:  # of a date, or a number
         raise ConfigError(source, f"not YAML: {error}") from error
 
 

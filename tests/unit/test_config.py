@@ -87,6 +87,9 @@ def test_a_file_sets_its_fields(tmp_path: Path) -> None:
         ("[mesh]\nnamespace = 'a/**'", "f.toml: mesh.namespace", "not a plain key"),
         ("[mesh]\nmode = 'broker'", "f.toml: mesh.mode", "broker"),
         ("[mesh", "f.toml", "not TOML"),
+        ("a = " + "[" * 20_000 + "]" * 20_000, "f.toml", "nests too deep"),
+        ("a = " + "9" * 100_000, "f.toml", "not TOML"),
+        ("a = 2020-99-99", "f.toml", "not TOML"),
     ],
 )
 def test_an_error_names_file_and_field(text: str, path: str, problem: str) -> None:

@@ -124,6 +124,12 @@ WRONG = [
     ("[1, 2]", "a plan has routers"),
     ("routers: [", "line 1: not YAML"),
     ("routers: [{name: s, addresses: [x]}]\nrouters: []", "line 2: not YAML: 'routers' twice"),
+    ("? [a, b]\n: 1", "line 1: not YAML: a list as a name"),
+    ("routers: [{? {a: 1} : 2}]", "line 1: not YAML: a list as a name"),
+    ("a: " + "[" * 20_000 + "]" * 20_000, "nests too deep"),
+    ("a: " + "{a: " * 5000 + "1" + "}" * 5000, "nests too deep"),
+    ("a: 2020-99-99", "not YAML"),
+    ("2020-99-99: 1", "not YAML"),
     (BASE + "  - {name: robot-7}", "name robot-7 is robot-7's already"),
     (BASE + "  - {name: Robot-7}", "name robot-7 is robot-7's already"),
     (BASE + "  - {name: all}", "is a word of the plan"),
@@ -151,7 +157,9 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("text", "words"), WRONG, ids=[words for _, words in WRONG])
+@pytest.mark.parametrize(
+    ("text", "words"), WRONG, ids=[f"{words} {number}" for number, (_, words) in enumerate(WRONG)]
+)
 def test_a_wrong_plan_is_refused(text: str, words: str) -> None:
     """What cannot be is refused with where it is and what would be right."""
     with pytest.raises(ConfigError, match=r"^site\.yaml") as refused:
