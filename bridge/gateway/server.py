@@ -22,7 +22,7 @@ from macs_zenoh.budget import Budget
 from macs_zenoh.config import GatewaySettings
 from macs_zenoh.credit import Credits
 from macs_zenoh.directory import Change
-from macs_zenoh.errors import Refused, Unreachable
+from macs_zenoh.errors import Refused, Unreachable, UsageError
 from macs_zenoh.existing import asks
 from macs_zenoh.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
 from macs_zenoh.limits import NODES_EACH, NODES_IN_ALL, NODES_PER_ADDRESS
@@ -585,7 +585,12 @@ class Gateway:
     def _streams_wanted(self, changes: StreamChanges) -> None:
         """Listen to exactly those streams of robots on which somebody is registered."""
         for (robot_id, node), registrants in changes:
-            key = STREAM.of(type=ROS, id=robot_id, node=node)
+            try:
+                key = STREAM.of(type=ROS, id=robot_id, node=node)
+            except UsageError as error:  # it was judged when it came; should another way in be found, others go on
+                self._drops["bad_name"] += 1
+                log.warning("a registration on robot %d is left out: %s", robot_id, error)
+                continue
             if registrants is None:
                 self._delivery.streams.pop(key, None)
                 self._unsubscribe(key)
@@ -619,4 +624,7 @@ class Gateway:
                 connection.send_call(message)
             self._delivery.flush()
         for change in changes:
-            self._robots.presence(change)
+            try:
+                self._robots.presence(change)
+            except Exception:  # one robot's registrations must not cost another its own
+                log.exception("telling %s what is registered for it failed", change.agent)

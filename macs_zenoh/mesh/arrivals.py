@@ -9,7 +9,7 @@ import operator
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import zenoh
@@ -30,6 +30,19 @@ _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 def now_s() -> float:
     """The time on that clock."""
     return time.clock_gettime(_CLOCK)
+
+
+class _Batch(list[Any]):
+    """Samples, of which it is known how many have been looked at."""
+
+    def __init__(self, samples: list[Any]) -> None:
+        super().__init__(samples)
+        self.following: Iterator[Any] = iter(())
+        """Those after the one that is being handled."""
+
+    def __iter__(self) -> Iterator[Any]:
+        self.following = super().__iter__()
+        return self.following
 
 
 class Arrivals:
@@ -235,10 +248,23 @@ class Arrivals:
             with self._large_lock:
                 self._large_bytes -= freed
         for on_batch, group in itertools.groupby(arrived, key=operator.itemgetter(0)):
+            self.hand_over(on_batch, [sample for _, sample in group])
+
+    def hand_over(self, on_batch: Callable[[list[Any]], None], samples: list[Any]) -> None:
+        """Let a subscription have its samples. One that cannot be handled, for a reason that nobody thought of, costs
+        itself: those behind it are somebody else's."""
+        while samples:
+            batch = _Batch(samples)
             try:
-                on_batch([sample for _, sample in group])
+                on_batch(batch)
+                return
             except Exception:
-                log.exception("handling samples failed")  # ours to mend; other subscriptions get theirs
+                rest = list(batch.following)
+                self._drops["failed_sample"] += 1
+                if self._drops["failed_sample"] == 1:
+                    key = samples[-len(rest) - 1][0]
+                    log.exception("a sample on %s failed (logged once, counted as failed_sample)", key)
+                samples = rest
 
     def _has_room(self) -> bool:
         return self._patiently(lambda: len(self._queue) < self.LIMIT)

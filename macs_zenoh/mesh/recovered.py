@@ -135,7 +135,7 @@ class Recovered:
         if deadline < math.inf:
             self._timer = self._loop.call_later(max(0.0, deadline - now), self._go_on, [])
         if freed:
-            self._on_batch(freed)
+            self._arrivals.hand_over(self._on_batch, freed)
 
     def _ask(self, ask: Ask) -> None:
         dropped: list[bool] = []

@@ -58,6 +58,7 @@ class Mesh:
 
     ``drops`` counts, by name, what was lost here: ``no_route`` (put while no router was connected), ``backlog``
     (more waiting to be sent than ``backlog_bytes``), ``loop_behind`` (samples came faster than they were handled),
+    ``failed_sample`` (handling it failed, which is a fault of ours),
     ``over_size``, ``over_rate`` and ``over_budget`` (more than a traffic rule allows), ``missed`` (what a reliable
     source did not have any more, or did not send, when it was asked).
     """

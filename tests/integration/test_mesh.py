@@ -85,3 +85,23 @@ async def test_a_lost_router_costs_nothing_between_agents_of_one_program() -> No
             mesh.put(KEY, payload)
         await until(lambda: len(here) == 6)
         assert [end for _, end in here] == [i.to_bytes(4, "big") for i in range(6)]
+
+
+async def test_a_sample_that_fails_costs_itself(router: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Samples behind one that a subscription cannot handle are handled, in order; it is counted, and told once."""
+    async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
+        found: list[bytes] = []
+
+        def handle(batch: list[Sample]) -> None:
+            for _, payload in batch:
+                if payload in (b"3", b"5"):
+                    raise ZeroDivisionError
+                found.append(bytes(payload))
+
+        mesh.subscribe(KEY, handle)
+        for number in range(8):
+            mesh.put(KEY, str(number).encode())
+        await until(lambda: len(found) >= 6)
+        assert found == [b"0", b"1", b"2", b"4", b"6", b"7"]
+        assert mesh.drops["failed_sample"] == 2
+        assert sum("counted as failed_sample" in record.getMessage() for record in caplog.records) == 1
