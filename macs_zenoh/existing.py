@@ -29,6 +29,7 @@ from typing import NamedTuple
 
 import msgspec
 
+from .least_bytes import ANSWERS, LEAST, is_whole
 from .messages import (
     FOR_NEWER,
     MANAGERS,
@@ -302,20 +303,26 @@ def _data(metadata: Metadata, without_fields: frozenset[str]) -> Data:
     return Data.EMPTY_TOO if metadata.data_exchange_type in without_fields else Data.CDR
 
 
-def fitting(frame: Frame, data: Data) -> tuple[Sequence[Buffer], int]:
+def least_bytes(metadata: Metadata) -> int:
+    """How long the data of a node's message must be at least, as far as that is known."""
+    if metadata.node_type in (SUBSCRIBER, PUBLISHER):
+        return LEAST.get(metadata.data_exchange_type, 0)
+    answers = metadata.node_type == (CLIENT if metadata.sender_agent_type == ROS else SERVICE)
+    return ANSWERS.get(metadata.data_exchange_type, 0) if answers else 0
+
+
+def fitting(frame: Frame, data: Data, metadata: Metadata) -> tuple[Sequence[Buffer], int]:
     """The messages of a frame, or of a run, whose data is as it must be; and how many are not."""
-    if data is not Data.JSON and frame.carries(CDR):
-        return frame.messages, 0
     good: list[Buffer] = []
     for single in frame.each():
-        if (message := _fitting(single, data)) is not None:
+        if (message := _fitting(single, data, metadata)) is not None:
             good.append(message)
     return good, frame.count - len(good)
 
 
-def _fitting(frame: Frame, data: Data) -> Buffer | None:
-    if data is not Data.JSON and frame.carries(CDR):
-        return frame.message
+def _fitting(frame: Frame, data: Data, metadata: Metadata) -> Buffer | None:
+    if data is not Data.JSON and frame.carries(CDR, least_bytes(metadata)):
+        return frame.message if is_whole(frame.body, metadata.data_exchange_type) else None
     if data is Data.EMPTY_TOO and frame.body == CDR:
         return encode_message(frame.metadata, CDR + b"\x00")  # as ROS writes it, which is what ROS reads
     if data in (Data.JSON, Data.FAILURE_TOO) and _is_json_object(frame.body):

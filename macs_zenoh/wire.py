@@ -215,10 +215,10 @@ class Frame:
         """The data part of the message, of the first frame."""
         return memoryview(self.data)[self._body_at : self._size]
 
-    def carries(self, beginning: bytes) -> bool:
-        """Whether the data of each frame begins like this, and goes on."""
+    def carries(self, beginning: bytes, least: int = 0) -> bool:
+        """Whether the data of each frame begins like this and goes on, and is of at least so many bytes."""
         data, size, at = self.data, self._size, self._body_at
-        if size - at <= len(beginning):
+        if size - at <= len(beginning) or size - at < least:
             return False
         if len(data) == size:
             return data.startswith(beginning, at)

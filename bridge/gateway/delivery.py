@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from macs_zenoh.directory import Directory
 from macs_zenoh.errors import WireError
-from macs_zenoh.existing import CDR, PASS, Data, Verdict, fitting, readable, refuses, topic_data
+from macs_zenoh.existing import CDR, PASS, Data, Verdict, fitting, least_bytes, readable, refuses, topic_data
 from macs_zenoh.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue, type_name
 from macs_zenoh.mesh import Payload, Sample
 from macs_zenoh.messages import ROS, Metadata, NodeType, StreamData, correct_sender, decode_management
@@ -144,12 +144,13 @@ class Delivery:
                 continue  # the last registrant has just left
             for frame, metadata in self._read(key, payload, stream.robot):
                 registered = stream.registrants if stream.carries(metadata) else NOBODY
+                fits = frame.carries(CDR, least_bytes(metadata))
                 for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
                     connection = self._agents.find(*registrant)
                     if connection is None:
                         continue
                     if registrant in registered:
-                        if connection.existing and not frame.carries(CDR):
+                        if connection.existing and not fits:
                             self._send_fitting(connection, frame, metadata, topic_data(metadata), stream.node)
                         else:
                             connection.send_stream(stream.node, frame.messages)
@@ -193,7 +194,7 @@ class Delivery:
             return None
         if len(self._seen) >= SEEN:
             self._seen.clear()
-        if not frame.carries(CDR):
+        if not frame.carries(CDR, least_bytes(metadata)):
             return None
         seen = self._seen[key, len(payload)] = Seen(frame.beginning + CDR, frame.message_at, registrants)
         return seen
@@ -240,7 +241,7 @@ class Delivery:
         self, connection: Connection, frame: Frame, metadata: Metadata, data: Data, stream: str | None = None
     ) -> None:
         """Send what has data that the agent survives; with ``stream`` as topic data of that node."""
-        messages, others = fitting(frame, data)
+        messages, others = fitting(frame, data, metadata)
         if others:
             about = metadata.node_name[:80] or "a request"
             problem = f"data for {about} that is not {data.value} (sent by {_who(metadata)})"

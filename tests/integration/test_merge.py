@@ -553,8 +553,9 @@ async def test_a_robot_program_keeps_its_id_unless_another_has_it(sites: Sites) 
         await headset.advertise("/talk", "std_msgs/String", agents=[256])
         while (await first.next()).metadata.message_manager != AddNode.manager:
             pass
-        await headset.publish("/talk", "std_msgs/String", CDR + b"to it", agents=[256])
-        assert (await first.until(CDR + b"to it")).metadata.sender_agent_id == 257
+        text = CDR + b"\x06\x00\x00\x00to it\x00"
+        await headset.publish("/talk", "std_msgs/String", text, agents=[256])
+        assert (await first.until(text)).metadata.sender_agent_id == 257
 
 
 async def test_parting_again_while_ids_change(sites: Sites) -> None:

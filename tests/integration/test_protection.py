@@ -32,6 +32,8 @@ from macs_zenoh.wire import PROBE, encode_frame, encode_message
 from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_gateway import Socket, socket
 
+TEXT = CDR + b"\x05\x00\x00\x00text\x00"
+
 
 def topic_data(robot: Socket, receivers: list[int], text: bytes) -> bytes:
     """A frame of an existing robot's topic /chatter."""
@@ -204,9 +206,9 @@ async def test_topic_data_stops_when_the_registration_does(
         await left.online()
         metadata = Metadata(ROS, 7, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__chatter", "std_msgs/String")
         management = encode_management(StreamData({"2": [left.id, stays.id]}))
-        message = encode_message(metadata.encode(), CDR + b"text")
+        message = encode_message(metadata.encode(), TEXT)
         robot.publish_stream("nd__chatter", encode_frame(ROS, management=management, message=message))
-        assert (await stays.message())[1] == CDR + b"text"
+        assert (await stays.message())[1] == TEXT
         robot.broadcast(b"next")
         assert (await left.message())[1] == b"next"
         assert gateway.drops == {"not_registered": 1}

@@ -234,7 +234,7 @@ def test_which_data_fits(data: Data) -> None:
     raw = said().encode()
     frames = {name: encode_frame(2, (1,), message=encode_message(raw, shape)) for name, shape in SHAPES.items()}
     for name, frame in frames.items():
-        messages, others = fitting(parse_frame(frame), data)
+        messages, others = fitting(parse_frame(frame), data, said())
         assert (len(messages), others) == ((1, 0) if name in FITS[data] else (0, 1)), name
         for message in messages:
             sent = bytes(split_message(message)[1])
@@ -248,9 +248,31 @@ def test_a_run_is_judged_message_by_message() -> None:
     (frame,) = parse_frames(
         b"".join(encode_frame(2, (1,), message=encode_message(raw, body)) for body in bodies), runs=True
     )
-    messages, others = fitting(frame, Data.CDR)
+    messages, others = fitting(frame, Data.CDR, said())
     assert [bytes(split_message(message)[1]) for message in messages] == [body for body in bodies if body[:4] == CDR]
     assert others == 3
+
+
+def test_what_is_cut_off_is_seen_where_the_length_is_known() -> None:
+    """Of types that people drive with, data that is too short does not fit; answers of services have their own."""
+    cases = [
+        (2, "geometry_msgs/Twist", 52, True),
+        (2, "geometry_msgs/Twist", 51, False),
+        (1, "std_msgs/Bool", 5, True),
+        (1, "std_msgs/Float64", 11, False),
+        (3, "std_srvs/SetBool", 5, True),
+        (4, "std_srvs/SetBool", 12, False),
+        (4, "std_srvs/SetBool", 13, True),
+        (2, "my_msgs/Any", 5, True),
+    ]
+    for node_type, name, size, fits in cases:
+        metadata = Metadata(UNITY, 1, 0, "", node_type, "nd__a", name)
+        frame = parse_frame(encode_frame(1, (1,), message=encode_message(metadata.encode(), CDR + bytes(size - 4))))
+        assert len(fitting(frame, Data.CDR, metadata)[0]) == fits, (node_type, name, size)
+    metadata = of_node(2)
+    for text, fits in ((TEXT, True), (TEXT[:-1], False), (TEXT + b"\x00\x00", True), (CDR + b"\xff" * 8, False)):
+        frame = parse_frame(encode_frame(1, (1,), message=encode_message(metadata.encode(), text)))
+        assert len(fitting(frame, Data.CDR, metadata)[0]) == fits
 
 
 # -- metadata --------------------------------------------------------------------------------------------------------

@@ -1,0 +1,461 @@
+"""Nothing that deafens an existing program reaches one: every name, metadata and shape of data, from everybody, by
+every way, and what the two existing programs make of what they get, as docs/protocol.md and the recordings tell it."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import re
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any
+
+import pytest
+
+import macs_zenoh
+from bridge.gateway import Gateway
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.errors import Refused, WireError
+from macs_zenoh.keyexpr import BROADCAST, GROUP, STREAM
+from macs_zenoh.mesh import Mesh
+from macs_zenoh.messages import (
+    MANAGERS,
+    ROS,
+    UNITY,
+    AddNode,
+    Functionality,
+    Metadata,
+    StreamData,
+    encode_data,
+    encode_management,
+)
+from macs_zenoh.routing import call, unicast_key
+from macs_zenoh.wire import encode_frame, encode_message
+from tests.integration.conftest import Connect, StartGateway, until
+
+TYPES = {"nd__chatter": "std_msgs/String", "nd__cmd": "std_msgs/String", "nd__set": "std_srvs/SetBool"}
+TYPES["nd__serve"] = "std_srvs/SetBool"
+KINDS = {"nd__chatter": 1, "nd__cmd": 2, "nd__set": 3, "nd__serve": 4}
+GROUP_ID = 3
+OFFERS = {"subscribers": {"/cmd": "std_msgs/msg/String"}, "publishers": {}, "services": {}}
+HEADER = b"\x00\x01\x00\x00"
+TEXT = HEADER + b"\x03\x00\x00\x00hi\x00"
+DONE = HEADER + b"\x05\x00\x00\x00done\x00"
+
+# -- the two existing programs, as far as they are known ------------------------------------------------------------
+
+
+class Deaf(Exception):
+    """The program's thread for messages has ended."""
+
+
+def read_metadata(raw: bytes) -> dict[str, Any]:
+    """Metadata as both programs read it: the seven keys, each of its type."""
+    if not raw:
+        raise Deaf("metadata of length 0")
+    try:
+        fields = json.loads(raw)
+    except ValueError as error:
+        raise Deaf(f"metadata that is no JSON: {raw[:60]!r}") from error
+    texts, numbers = ("messageManager", "nodeName", "dataExchangeType"), ("requestId", "nodeType")
+    if not isinstance(fields, dict) or not all(isinstance(fields.get(key), str) for key in texts):
+        raise Deaf(f"metadata without its texts: {raw[:80]!r}")
+    if not all(type(fields.get(key)) is int for key in numbers):
+        raise Deaf(f"metadata without its numbers: {raw[:80]!r}")
+    folded = [key for key in re.findall(r'"(\w+)":', raw.decode()) if key.lower().replace("_", "") == "nodename"]
+    if folded != ["nodeName"]:
+        raise Deaf(f"a node's name in two ways: {raw[:80]!r}")
+    return fields
+
+
+def read_cdr(data: bytes, name: str, *, answer: bool) -> None:
+    """Take ROS data as the type of this node."""
+    if data[:4] != HEADER:
+        raise Deaf(f"{data[:20]!r} on {name}, which is no CDR")
+    if len(data) < 5:
+        raise Deaf(f"{data!r} on {name}, which is cut short")
+    if TYPES[name] == "std_msgs/String" or answer:
+        at = 4 if TYPES[name] == "std_msgs/String" else 8
+        size = struct.unpack_from("<I", data, at)[0] if len(data) >= at + 4 else 1 << 30
+        if at + 4 + size > len(data):
+            raise Deaf(f"{data[:20]!r} on {name}, which is cut short")
+
+
+class Program:
+    """An existing program on its socket. ``deaf`` is why, once it is; ``got`` counts what it took."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, kind: int) -> None:
+        self.writer, self.kind = writer, kind
+        self.id = 0
+        self.deaf = ""
+        self.got: list[tuple[dict[str, Any], bytes]] = []
+        self._reading = asyncio.ensure_future(self._read(reader))
+
+    @classmethod
+    async def start(cls, gateway: Gateway) -> Program:
+        """Connect, and configure as such programs do."""
+        self = cls(*await asyncio.open_connection("127.0.0.1", gateway.port))  # type: ignore[call-arg]
+        await until(lambda: self.id or self.deaf)
+        told = {"agentType": self.kind, "agentId": self.id, "groupId": GROUP_ID, "requestId": 1}
+        told |= {"functionality": OFFERS} if self.kind == ROS else {}
+        self.manage("AgentclientConfigurer", told)
+        await until(lambda: gateway.agents.find(self.kind, self.id))
+        return self
+
+    def manage(self, manager: str, told: dict[str, Any], message: bytes = bytes(8)) -> None:
+        """Send management data."""
+        management = json.dumps({"messageManager": manager, **told}).encode()
+        self.writer.write(encode_frame(management=management, message=message))
+
+    def say(self, to: int, ids: list[int], data: bytes, **fields: Any) -> None:
+        """Send a message."""
+        fields = {"messageManager": "", "requestId": 0, "nodeType": 0, "nodeName": "", **fields}
+        fields = {"senderAgentType": self.kind, "senderAgentId": self.id, "dataExchangeType": "", **fields}
+        self.writer.write(encode_frame(to, ids, message=encode_message(json.dumps(fields).encode(), data)))
+
+    async def close(self) -> None:
+        """End the connection."""
+        self._reading.cancel()
+        self.writer.close()
+
+    async def _read(self, reader: asyncio.StreamReader) -> None:
+        with suppress(asyncio.IncompleteReadError, ConnectionError):
+            while not self.deaf:
+                metadata = await reader.readexactly(struct.unpack("<i", await reader.readexactly(4))[0])
+                data = await reader.readexactly(struct.unpack("<i", await reader.readexactly(4))[0])
+                try:
+                    fields = read_metadata(metadata)
+                    self.take(fields, data)
+                    self.got.append((fields, data))
+                except Deaf as end:
+                    self.deaf = f"{end} ({metadata[:200]!r})"
+
+    def take(self, fields: dict[str, Any], data: bytes) -> None:
+        """Handle a message. Raises Deaf."""
+        raise NotImplementedError
+
+    def take_welcome(self, fields: dict[str, Any], data: bytes) -> None:
+        """The id, from the router only."""
+        if fields["senderAgentType"] is not None or self.id:
+            raise Deaf(f"another id: {data!r}")
+        self.id = json.loads(data)["agentId"]
+
+
+class Headset(Program):
+    """The headset in C#: nodes by name, managers by the names of classes, answers by their number."""
+
+    CLASSES = {*MANAGERS, "ManagementMessageManager"} - {"InterfaceNodeRefused"}
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        super().__init__(reader, writer, UNITY)
+        self.robot = 0
+        self.asked: set[int] = set()
+
+    def register(self, robot: int) -> None:
+        """Register its four nodes on a robot."""
+        self.robot = robot
+        for name, kind in KINDS.items():
+            self.manage(*registration(self.id, robot, name, kind))
+
+    def take(self, fields: dict[str, Any], data: bytes) -> None:
+        name, manager = fields["nodeName"], fields["messageManager"]
+        if name:
+            if name not in KINDS:
+                return
+            if fields["nodeType"] != KINDS[name]:
+                raise Deaf(f"{name} as type {fields['nodeType']}")
+            if (fields["senderAgentType"], fields["senderAgentId"]) != (ROS, self.robot):
+                raise Deaf(f"{name} of another than its robot")
+            if KINDS[name] == 2:
+                raise Deaf(f"a message for the publisher {name}")
+            read_cdr(data, name, answer=KINDS[name] == 3)
+        elif manager == "AgentConfigurer":
+            self.take_welcome(fields, data)
+        elif manager == "PrunedUnityAgentsInterfaceNodesCleaner" and fields["senderAgentType"] is None:
+            assert isinstance(json.loads(data)["agents"], list)
+        elif manager in self.CLASSES or not re.fullmatch(r"\w*", manager, re.ASCII):
+            raise Deaf(f"the class {manager!r}")
+        elif not manager and fields["requestId"] in self.asked:
+            self.asked.discard(fields["requestId"])
+            if not data.startswith(b"{") or fields["senderAgentId"] not in (None, self.robot):
+                raise Deaf(f"{data[:30]!r} as an answer of {fields['senderAgentId']}")
+
+
+class Robot(Program):
+    """The robot in Python: one thread that ends on what it has no handling for."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        super().__init__(reader, writer, ROS)
+        self.nodes: dict[str, tuple[int, str, str, set[int]]] = {}
+        self.asked: set[int] = set()
+
+    def take(self, fields: dict[str, Any], data: bytes) -> None:
+        name, manager = fields["nodeName"], fields["messageManager"]
+        if name:
+            node = self.nodes.get(name)
+            if node is None or node[0] != fields["nodeType"] or node[0] not in (2, 3, 4):
+                raise Deaf(f"{name} of type {fields['nodeType']}, which it does not have")
+            if node[0] == 4 and (fields["senderAgentId"] not in node[3] or fields["requestId"] not in self.asked):
+                raise Deaf("an answer that it has not asked for")
+            if fields["dataExchangeType"] != node[2]:
+                raise Deaf(f"the type {fields['dataExchangeType']!r} for {node[2]}")
+            read_cdr(data, name, answer=node[0] == 4)
+        elif manager == "AgentConfigurer":
+            self.take_welcome(fields, data)
+        elif manager == "PrunedUnityAgentsInterfaceNodesCleaner" and fields["senderAgentType"] is None:
+            gone = {agent["agent_id"] for agent in json.loads(data)["agents"]}
+            self.nodes = {name: node for name, node in self.nodes.items() if node[3] - gone}
+        elif manager == "InterfaceNodeAdder":
+            self._add(json.loads(data))
+        elif manager == "InterfaceNodeRemover":
+            said = json.loads(data)
+            self.nodes[said["nodeName"]][3].remove(said["registrantAgentId"])
+        else:
+            raise Deaf(f"the manager {manager!r}")
+
+    def _add(self, said: dict[str, Any]) -> None:
+        name, who = said["nodeName"], said["registrantAgentId"]
+        new = (said["nodeType"], said["tosName"], said["dataExchangeType"])
+        there = self.nodes.setdefault(name, (*new, set()))
+        if there[:3] != new or who in there[3] or (new[0] == 4 and there[3]):
+            raise Deaf(f"a second node {said}")
+        if new[0] not in (1, 2, 3, 4) or new[2] not in {*TYPES.values()} or name != "nd_" + new[1].replace("/", "_"):
+            raise Deaf(f"a node that cannot be made: {said}")
+        there[3].add(who)
+
+
+def registration(agent: int, robot: int, name: str, kind: int, **fields: Any) -> tuple[str, dict[str, Any], bytes]:
+    """Management data and message of a registration."""
+    node = {"nodeType": kind, "nodeName": name, "tosName": name[3:].replace("_", "/"), "dataExchangeType": "x/Y"}
+    node |= {"dataExchangeType": TYPES.get(name, "x/Y"), **fields}
+    adding = {"registrantAgentType": UNITY, "registrantAgentId": agent, **node}
+    metadata = Metadata(UNITY, agent, message_manager="InterfaceNodeAdder").encode()
+    told = {"registrantAgentId": agent, "registrarAgentIds": [robot], "registrarGroupIds": [], **node}
+    return "RosAgentNodeRegistrationForwarder", told, encode_message(metadata, json.dumps(adding).encode())
+
+
+# -- all that may be said --------------------------------------------------------------------------------
+
+SHAPES = [
+    b"",
+    b"\x00",
+    HEADER,
+    TEXT[:-3],
+    b"\x00\x00\x00\x03hi\x00",
+    b"hello",
+    b"{",
+    b"{}",
+    b'{"agentId": 9}',
+    b"\xff" * 9,
+]
+NAMES = [
+    *MANAGERS,
+    *("ManagementMessageManager", "RobotStatus", "RobotControl", "InterfaceCallFailure", "Greeting", "ActionGoal"),
+    *("os.system", "a b", "Grüße", "System.Console", "a" * 300, ""),
+]
+ODD = [
+    b"",
+    b"{}",
+    b"[1]",
+    b"{",
+    b"\xff\xfe",
+    b'{"nodeName":null}',
+    b'{"nodeName":"","nodeName":"nd__chatter","nodeType":2}',
+    b'{"NODENAME":"nd__chatter","nodeType":2}',
+    b'{"node_name":"nd__chatter","node_type":2,"nodeName":""}',
+    b'{"messageManager":"AgentConfigurer","senderAgentType":null,"senderAgentId":null}',
+    b'{"nodeType":1.5}',
+    b'{"requestId":-1}',
+]
+
+
+def said(kind: int, agent: int) -> Iterator[tuple[bytes, bytes]]:
+    """Metadata and data, all there are, of an agent that says it is this one."""
+    for manager, data, number in itertools.product(NAMES, SHAPES, (0, 7)):
+        yield Metadata(kind, agent, number, manager).encode(), data
+    for name, node_type, data in itertools.product([*KINDS, "nd__none"], (0, 1, 2, 3, 4, 5, 255), SHAPES):
+        manager = StreamData.manager if node_type == 1 else ""
+        metadata = Metadata(kind, agent, 0, manager, node_type, name, TYPES.get(name, "std_msgs/String"))
+        yield metadata.encode(), data
+    for metadata, data in itertools.product(ODD, SHAPES):
+        yield metadata, data
+    yield (
+        Metadata(kind, agent, 0, "InterfaceCallFailure", 3, "nd__set", "std_srvs/SetBool").encode(),
+        b'{"kind":"absent"}',
+    )
+    yield Metadata(kind, agent, 0, "", 2, "nd__cmd", "os/path").encode(), TEXT
+
+
+Send = Callable[[int, list[int], list[int], bytes, bytes], None]
+
+
+def keys(to: int, ids: list[int], groups: list[int], kind: int, agent: int) -> list[str]:
+    """Where a program on the mesh puts it."""
+    if not to:
+        return [BROADCAST.of(from_type=kind, from_id=agent)]
+    return [unicast_key(to, each, kind, agent) for each in ids] + [
+        GROUP.of(group=group, type=to, from_type=kind, from_id=agent) for group in groups
+    ]
+
+
+async def everything(send: Send, kind: int, agent: int, headset: Headset, robot: Robot, *, raw: bool) -> None:
+    """Say it all: by id, by group and to everybody."""
+    for count, (metadata, data) in enumerate(said(kind, agent)):
+        if not raw:
+            try:
+                Metadata.decode(metadata)
+            except WireError:
+                continue
+        for to, program in ((UNITY, headset), (ROS, robot)):
+            send(to, [program.id], [], metadata, data)
+            send(to, [], [GROUP_ID], metadata, data)
+        send(0, [], [], metadata, data)
+        if count % 50 == 0:
+            await asyncio.sleep(0.01)  # no flood, for which there are limits of their own
+
+
+@pytest.fixture
+async def stage(start_gateway: StartGateway, connect: Connect) -> Any:
+    """A gateway with an existing robot and an existing headset that uses all it has, and does so at the end."""
+    gateway = await start_gateway(max_connections=100)
+    robot, headset = await Robot.start(gateway), await Headset.start(gateway)  # type: ignore[call-arg]
+    assert isinstance(headset, Headset)
+    assert isinstance(robot, Robot)
+    headset.register(robot.id)
+    await until(lambda: len(robot.nodes) == len(KINDS) or robot.deaf)
+    yield gateway, headset, robot
+    served = Metadata(ROS, robot.id, 0, StreamData.manager, 1, "nd__chatter", "std_msgs/String")
+    robot.manage(StreamData.manager, {"destAgents": {"2": [headset.id]}}, encode_message(served.encode(), DONE))
+    headset.say(ROS, [robot.id], DONE, nodeType=2, nodeName="nd__cmd", dataExchangeType="std_msgs/String")
+    await until(lambda: all(DONE in [data for _, data in each.got] or each.deaf for each in (headset, robot)), 30)
+    assert (headset.deaf, robot.deaf) == ("", "")
+    for program in (headset, robot):
+        await program.close()
+
+
+@pytest.mark.parametrize("kind", [UNITY, ROS], ids=["headset", "robot"])
+async def test_a_tcp_agent_deafens_nobody(kind: int, stage: tuple[Gateway, Headset, Robot]) -> None:
+    """Whatever another headset or robot sends over TCP, also as topic data and as registrations, harms neither."""
+    gateway, headset, robot = stage
+    other = await (Headset if kind == UNITY else Robot).start(gateway)  # type: ignore[call-arg]
+
+    def send(to: int, ids: list[int], groups: list[int], metadata: bytes, data: bytes) -> None:
+        other.writer.write(encode_frame(to, ids, groups, message=encode_message(metadata, data)))
+
+    await everything(send, kind, other.id, headset, robot, raw=True)
+    for metadata, data in said(kind, other.id):
+        targets = {"destAgents": {"2": [headset.id], "1": [robot.id]}}
+        other.manage(StreamData.manager, targets, encode_message(metadata, data))
+    wrong: list[dict[str, Any]] = [
+        {"dataExchangeType": each} for each in ("os/Path", "no/Such", "std_msgs/NoSuch", "")
+    ]
+    wrong += [{"tosName": "/a b"}, {"nodeType": 5}, {"nodeName": "nd__cmd"}, {"bufferSize": 1 << 60}]
+    for fields in wrong:
+        other.manage(
+            *registration(other.id, robot.id, "nd__x", 1, **{"dataExchangeType": "std_msgs/String", **fields})
+        )
+    other.manage(*registration(other.id, robot.id, "nd__serve", 4))
+    await asyncio.wait_for(other.writer.drain(), 30)
+    other.say(UNITY, [headset.id], b"{}", messageManager="Finished")
+    await until(lambda: headset.deaf or headset.got[-1][0]["messageManager"] == "Finished", 60)
+    other.writer.close()
+
+
+@pytest.mark.parametrize("kind", [UNITY, ROS], ids=["headset", "robot"])
+async def test_a_program_on_the_mesh_deafens_nobody(
+    kind: int, router: str, stage: tuple[Gateway, Headset, Robot]
+) -> None:
+    """Whatever a Zenoh session puts, also in the name of the robot and on its topics, harms neither."""
+    _, headset, robot = stage
+    async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
+        for agent in (900, robot.id if kind == ROS else headset.id):
+
+            def send(
+                to: int, ids: list[int], groups: list[int], metadata: bytes, data: bytes, me: int = agent
+            ) -> None:
+                frame = encode_frame(to, ids, groups, message=encode_message(metadata, data))
+                for key in keys(to, ids, groups, kind, me):
+                    mesh.put(key, frame)
+
+            # in the robot's own name not what it may say itself: its CDR cannot be judged
+            await everything(send, kind, agent, headset, robot, raw=True)
+            management = encode_management(StreamData({"2": [headset.id], "1": [robot.id]}))
+            for name, (metadata, data) in itertools.product(KINDS, said(ROS, agent)):
+                if kind == ROS and not (agent == robot.id and data == TEXT[:-3]):
+                    frame = encode_frame(ROS, management=management, message=encode_message(metadata, data))
+                    mesh.put(STREAM.of(type=ROS, id=agent, node=name), frame)
+        message = encode_message(Metadata(message_manager="Finished").encode(), b"{}")
+        mesh.put(unicast_key(UNITY, headset.id, UNITY, 900), encode_frame(UNITY, (headset.id,), message=message))
+        await until(lambda: headset.deaf or headset.got[-1][0]["messageManager"] == "Finished", 60)
+
+
+async def test_a_python_agent_deafens_nobody(router: str, stage: tuple[Gateway, Headset, Robot]) -> None:
+    """What README shows, and the rest that the API can say, harms neither; questions to the robot are answered."""
+    _, headset, robot = stage
+    async with macs_zenoh.join("ros", id=900, connect=[router]) as agent:
+        agent.broadcast(b"robot 900 is here")
+        agent.send(b"got it", to="ros", ids=[robot.id])
+        agent.send(b"got it", to="unity", ids=[headset.id])
+
+        def send(to: int, ids: list[int], groups: list[int], metadata: bytes, data: bytes) -> None:
+            if to:
+                agent.send(data, to=str(to), ids=ids, groups=groups, metadata=Metadata.decode(metadata))
+            else:
+                agent.broadcast(data, metadata=Metadata.decode(metadata))
+
+        await everything(send, ROS, 900, headset, robot, raw=False)
+        assert json.loads(await agent.call("ros", robot.id, "offers")) == OFFERS
+        for verb in ("status", "stop", "control", "x"):
+            with pytest.raises(Refused, match="an existing program"):
+                await agent.call("ros", robot.id, verb)
+        node = AddNode(ROS, 900, 5, "nd__act", "/act", "std_msgs/String")
+        key, frame = call((ROS, robot.id), "add_node", (ROS, 900), encode_data(node), Metadata(ROS, 900))
+        with pytest.raises(Refused, match="no nodes of type 5"):
+            await agent.mesh.query(key, frame, timeout_s=5)
+        agent.send(b"{}", to="unity", ids=[headset.id], metadata=Metadata(message_manager="Finished"))
+        await until(lambda: headset.deaf or headset.got[-1][0]["messageManager"] == "Finished", 60)
+
+
+async def test_the_gateway_answers_for_an_existing_robot(
+    stage: tuple[Gateway, Headset, Robot], connect: Connect
+) -> None:
+    """What a robot offers is in its configuration, the last one; what it does not know is refused with a reason."""
+    gateway, _, robot = stage
+    asking = await connect(gateway)
+    assert json.loads(await asking.ask(robot.id, "FunctionalityGetter")) == OFFERS
+    told = {"agentType": ROS, "agentId": robot.id, "groupId": GROUP_ID, "requestId": 1}
+    robot.manage("AgentclientConfigurer", {**told, "functionality": {**OFFERS, "publishers": {"/a": "b/msg/C"}}})
+    robot.say(UNITY, [asking.id], b"{}", messageManager="Configured")
+    assert (await asking.receive(5)).metadata.message_manager == "Configured"
+    assert json.loads(await asking.ask(robot.id, "FunctionalityGetter"))["publishers"] == {"/a": "b/msg/C"}
+    for manager in ("RobotStatus", "RobotControl", "MyOwn"):
+        with pytest.raises(Refused, match=f"does not survive messages of {manager}"):
+            await asking.ask(robot.id, manager)
+    with pytest.raises(Refused, match="nobody registered nd__none"):
+        await asking.call("/none", "no_such/Type", robot.id, TEXT, failures=True)
+
+
+async def test_an_answer_comes_from_who_was_asked(stage: tuple[Gateway, Headset, Robot], router: str) -> None:
+    """A headset's request to its robot is answered by that robot, once; and the robot's to the headset likewise."""
+    _, headset, robot = stage
+    headset.say(ROS, [robot.id], HEADER + b"\x01", nodeType=3, nodeName="nd__set", dataExchangeType=TYPES["nd__set"])
+    await until(lambda: robot.deaf or [f for f, _ in robot.got if f["nodeName"] == "nd__set"])
+    answer = HEADER + b"\x01\x00\x00\x00\x03\x00\x00\x00ok\x00"
+    fields = {"nodeType": 3, "nodeName": "nd__set", "dataExchangeType": TYPES["nd__set"]}
+    for _ in range(3):
+        robot.say(UNITY, [headset.id], answer, **fields)
+    robot.asked.add(5)
+    serving = {"nodeType": 4, "nodeName": "nd__serve", "dataExchangeType": TYPES["nd__serve"], "requestId": 5}
+    robot.say(UNITY, [headset.id], HEADER + b"\x01", **serving)
+    await until(lambda: headset.deaf or [f for f, _ in headset.got if f["nodeName"] == "nd__serve"])
+    headset.say(ROS, [robot.id], answer, **serving)
+    headset.say(ROS, [robot.id], answer, **serving)
+    await until(lambda: robot.deaf or [f for f, _ in robot.got if f["nodeName"] == "nd__serve"])
+    assert len([f for f, _ in headset.got if f["nodeName"] == "nd__set"]) == 1
+
+
+def test_functionality_is_read_as_it_is_written() -> None:
+    """The robot's own spelling of what it offers is that of the answer."""
+    assert Functionality(**OFFERS) == Functionality(subscribers={"/cmd": "std_msgs/msg/String"})
