@@ -440,6 +440,9 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     max_command_age_s: Annotated[float, Meta(ge=0, le=3600)] = 0.5
     """A command that has waited longer than this on its way is not carried out, nor are those that waited with it. 0:
     all are."""
+    max_frame_bytes: Bytes = 32 * 1024 * 1024
+    """A larger message to headsets is not sent, and they are told. Gateways and headsets have limits of their own, by
+    which such a message can end a connection."""
     rules: list[TopicRule] = []
 
     groups: dict[str, list[AgentPattern]] = {}

@@ -557,23 +557,52 @@ class FrameDecoder:
         return frame
 
 
-class MessageDecoder:
-    """Cuts the stream that a TCP agent receives into whole messages (they have no header and no outer size)."""
+class Skipped(NamedTuple):
+    """A message that was too large: its size, and its metadata."""
 
-    def __init__(self, max_message_bytes: int = MAX_FRAME_BYTES) -> None:
+    size: int
+    metadata: bytes
+
+
+class MessageDecoder:
+    """Cuts the stream that a TCP agent receives into whole messages (they have no header and no outer size).
+
+    With ``skip_large`` a message whose data is too large is let go of unread, for `skipped`; otherwise it is an error.
+    """
+
+    def __init__(self, max_message_bytes: int = MAX_FRAME_BYTES, *, skip_large: bool = False) -> None:
         self.max_message_bytes = max_message_bytes
+        self.skipped: list[Skipped] = []
+        """Messages that were too large; whoever reads takes them out."""
+        self._skip_large = skip_large
+        self._skip_bytes = 0
         self._buffer = bytearray()
 
     def feed(self, data: Buffer) -> list[bytes]:
         """Take the next bytes and return the messages that are now whole. Raises FrameTooLarge."""
+        if self._skip_bytes:
+            data = memoryview(data)
+            skipped = min(self._skip_bytes, len(data))
+            self._skip_bytes -= skipped
+            data = data[skipped:]
         self._buffer += data
         messages = []
         start = 0
-        while (size := self._message_size(start)) is not None and len(self._buffer) - start >= size:
-            messages.append(bytes(memoryview(self._buffer)[start : start + size]))
-            start += size
+        while (size := self._message_size(start)) is not None:
+            if size > self.max_message_bytes:
+                self.skipped.append(self._metadata_of(start, size))
+                self._skip_bytes = max(0, size - (len(self._buffer) - start))
+            elif len(self._buffer) - start >= size:
+                messages.append(bytes(memoryview(self._buffer)[start : start + size]))
+            else:
+                break
+            start = min(start + size, len(self._buffer))
         del self._buffer[:start]
         return messages
+
+    def _metadata_of(self, at: int, size: int) -> Skipped:
+        metadata_bytes: int = _U32.unpack_from(self._buffer, at)[0]
+        return Skipped(size, bytes(memoryview(self._buffer)[at + 4 : at + 4 + metadata_bytes]))
 
     def _message_size(self, at: int) -> int | None:
         """Size of the message at ``at``, None while that is not known yet."""
@@ -585,7 +614,8 @@ class MessageDecoder:
         if available < MESSAGE_OVERHEAD + metadata_bytes:
             return None
         data_bytes: int = _U32.unpack_from(self._buffer, at + 4 + metadata_bytes)[0]
-        self._judge(MESSAGE_OVERHEAD + metadata_bytes + data_bytes)
+        if not self._skip_large:
+            self._judge(MESSAGE_OVERHEAD + metadata_bytes + data_bytes)
         return MESSAGE_OVERHEAD + metadata_bytes + data_bytes
 
     def _judge(self, size: int) -> None:

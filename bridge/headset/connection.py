@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import socket
 from collections import deque
 
@@ -11,6 +12,8 @@ from macs_zenoh import greetings
 from macs_zenoh.addresses import joined
 from macs_zenoh.errors import Unreachable
 from macs_zenoh.wire import MessageDecoder
+
+log = logging.getLogger("macs.headset")
 
 _READ_BYTES = 256 << 10
 _DRAIN_ABOVE_BYTES = 256 << 10
@@ -34,7 +37,9 @@ class Connection:
         self.last_output = 0.0
         self._reader = reader
         self._writer = writer
-        self._decoder = MessageDecoder(max_message_bytes)
+        self._decoder = MessageDecoder(max_message_bytes, skip_large=True)
+        self.too_large = 0
+        """How many messages were let go of because they were."""
         self._whole: deque[bytes] = deque()
         self._draining = asyncio.Lock()
 
@@ -96,7 +101,16 @@ class Connection:
             if not data:
                 raise Unreachable(self.target, "the router closed the connection")
             self._whole.extend(self._decoder.feed(data))
+            self._note_skipped()
         return self._whole.popleft()
+
+    def _note_skipped(self) -> None:
+        for skipped in self._decoder.skipped:
+            self.too_large += 1
+            limit = self._decoder.max_message_bytes
+            about = skipped.metadata[:400].decode("utf-8", "backslashreplace")
+            log.warning("a message of %d bytes was dropped, more than %d: %r", skipped.size, limit, about)
+        self._decoder.skipped.clear()
 
     async def send(self, frame: bytes) -> None:
         """Write one frame; wait only while much is unsent. Raises Unreachable when the connection is gone."""

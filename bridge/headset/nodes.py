@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError
-from macs_zenoh.messages import CallFailure, Metadata, decode_data, encode_data
+from macs_zenoh.messages import CallFailure, Metadata, NodeType, decode_data, encode_data
 
 from . import frames
 from .frames import NodeSpec
@@ -123,7 +123,8 @@ class Node:
         before = self.refusals.get(robot)
         self.refusals[robot] = Refusal(reason, final, time.monotonic())
         if before is None or before.reason != reason:
-            what = "refused" if final else "does not take what is sent for"
+            part = "send something of" if self.spec.kind == NodeType.SUBSCRIBER else "take what is sent for"
+            what = "refused" if final else f"does not {part}"
             log.warning("robot %d %s %s: %s", robot, what, self.spec.tos_name, reason)
         self._refused.set()
 

@@ -257,6 +257,13 @@ class InterfaceNode(ABC):
     def retire(self) -> None:  # noqa: B027 - only some nodes have something open
         """The node will be closed: end what is open. On the loop, before `close`."""
 
+    def tell_registrants(self, kind: str, reason: str) -> None:
+        """Tell registrants that know our extensions what is wrong with this node; not often. On the loop."""
+        for registrant in self.registrants:
+            about = Metadata(*registrant, node_type=self.key.node_type, node_name=self.key.node_name)
+            message = Message(type_name(registrant.agent_type), registrant.agent_id, about, b"")
+            self.robot.tell_refused(message, self.topic, kind, reason)
+
     def metadata(self, manager: str = "", request_id: int = 0) -> Metadata:
         """Of a message from this node."""
         return Metadata(

@@ -187,6 +187,9 @@ class ClientNode(InterfaceNode):
             asker = Registrant.of(message)
             if asker in self.unity:
                 response = to_unity(self._response_cdr, response)
+            if (size := len(response)) > (limit := self.robot.rules.settings.max_frame_bytes):
+                self._fail(message, CallFailed("failed", f"the response has {size} bytes, more than {limit}"))
+                return
             self.robot.send(asker, answer_metadata(self.robot.agent_id, message.metadata), response)
 
     async def _ask(self, data: bytes) -> bytes:
@@ -432,6 +435,10 @@ class ServiceNode(InterfaceNode):
             return
         if registrant in self.unity:
             request = to_unity(self._request_cdr, request)
+        if (size := len(request)) > (limit := self.robot.rules.settings.max_frame_bytes):
+            self.robot.drops.note("too_large", self.topic, f"a request of {size} bytes, more than {limit}")
+            self._fail(request_id, f"the request has {size} bytes, more than {limit}")
+            return
         # we understand a failure; receivers look at the node name first
         self.robot.send(registrant, self.metadata(CallFailure.manager, request_id), request)
 

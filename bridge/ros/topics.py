@@ -37,6 +37,9 @@ from macs_zenoh.recovery import SILENT_S
 log = logging.getLogger("macs.ros")
 
 
+TOO_LARGE = "too_large"
+
+
 class TopicNode(InterfaceNode):
     """What both kinds of topic nodes have in common."""
 
@@ -63,6 +66,7 @@ class SubscriberNode(TopicNode):
         self._rate = RateLimit(self.rule.max_hz) if self.rule.max_hz else None
         self._rate_lock = threading.Lock()
         self._gaps = Gaps()
+        self._max_frame_bytes = robot.rules.settings.max_frame_bytes
         self._loop = asyncio.get_running_loop()
         self._translate: Callable[[bytes], bytes] | None = None
         self._fanout_lock = threading.Lock()
@@ -212,9 +216,17 @@ class SubscriberNode(TopicNode):
     def _put(self, cdr: bytes, fanout: Fanout | None = None) -> None:
         try:
             for frame in (fanout or self._fanout)(cdr):
+                if len(frame) > self._max_frame_bytes:
+                    self._note_too_large(len(frame))
+                    continue
                 self.robot.publish_stream(self.key.node_name, frame)
         except MacsError as error:
             self.robot.drops.note("failed", self.topic, str(error))
+
+    def _note_too_large(self, size: int) -> None:
+        reason = f"a message makes a frame of {size} bytes, more than max_frame_bytes ({self._max_frame_bytes})"
+        self.robot.drops.note(TOO_LARGE, self.topic, reason)
+        self._loop.call_soon_threadsafe(self.tell_registrants, TOO_LARGE, reason)
 
     def _publisher_matched(self, change: Any) -> None:
         self._gaps.publishers(change.current_count)

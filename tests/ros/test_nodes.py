@@ -16,7 +16,9 @@ from std_msgs.msg import String, UInt8MultiArray
 from bridge.ros.early import EarlyMessages, NodeKey
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
+from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
+from macs_zenoh.config import RobotSettings
 from macs_zenoh.errors import Refused
 from macs_zenoh.messages import DataRefused, Metadata, NodeType, StreamData, decode_data, decode_management
 from macs_zenoh.wire import parse_frame
@@ -451,6 +453,32 @@ async def _look(nodes: InterfaceNodes) -> None:
         lambda: nodes.look_at_types(node.get_topic_names_and_types(), node.get_service_names_and_types())
     )
     await asyncio.sleep(0)
+
+
+async def test_a_message_that_is_too_large_is_dropped_at_its_source(
+    session: RosSession, streams: Streams, peer: Peer
+) -> None:
+    """It is counted and told to each registrant, not often, and what comes after it arrives."""
+    rules = Rules(RobotSettings(max_frame_bytes=2000))
+    nodes = InterfaceNodes(Robot(session, 7, streams.put, rules=rules))
+    told = Told()
+    nodes.robot.send = lambda *message: told.queue.put_nowait(message)
+    for registrant in (5, 6):
+        await nodes.add(adding("/big", registrant=registrant))
+    publisher = await peer.publisher(String, "/big", matched=1)
+    for _ in range(5):
+        publisher.publish(String(data="x" * 2000))
+    publisher.publish(String(data="small"))
+    assert (await streams.next())[1].data == "small"
+    assert nodes.drops == {"too_large": 5}
+    refusals = [await told.next() for _ in range(2)]
+    assert {to.agent_id for to, _ in refusals} == {5, 6}
+    assert {(refused.kind, refused.tos_name, refused.node_type) for _, refused in refusals} == {
+        ("too_large", "/big", 1)
+    }
+    assert "more than max_frame_bytes (2000)" in refusals[0][1].reason
+    assert told.queue.empty()
+    nodes.close()
 
 
 async def test_a_refused_name_can_be_registered_properly_after(nodes: InterfaceNodes) -> None:

@@ -369,6 +369,19 @@ def test_messages_have_a_limit_too() -> None:
         assert (raised.value.size, raised.value.limit) == (101, 100)
 
 
+@pytest.mark.parametrize("piece", [1, 7, 64, 1000])
+def test_a_large_message_can_be_let_go_of(piece: int) -> None:
+    """What comes before and behind a message that is too large arrives, however it is cut; the large one is told."""
+    small, large = encode_message(b"{}", bytes(90)), encode_message(b'{"a": 1}', bytes(500))
+    stream, decoder = small + large + small + large + large + small, MessageDecoder(100, skip_large=True)
+    got = [message for at in range(0, len(stream), piece) for message in decoder.feed(stream[at : at + piece])]
+    assert got == [small] * 3
+    assert [tuple(skipped) for skipped in decoder.skipped] == [(len(large), b'{"a": 1}')] * 3
+    with pytest.raises(FrameTooLarge):  # metadata is never so large: that is no message
+        decoder.feed(encode_message(bytes(93), b""))
+    assert peak_bytes(lambda: MessageDecoder(100, skip_large=True).feed(small + large[:16])) < 200_000
+
+
 # -- what is parsed is small ------------------------------------------------------------------------------------------
 
 
