@@ -340,15 +340,21 @@ class Mesh:
             elif answer is not None:
                 done.set_result(answer)
 
+        answered = False
+
         def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                self._from_thread(settle, reply.ok.payload.to_bytes(), None)
+            nonlocal answered
+            keep_attached()
+            answered = True
+            if (ok := reply.ok) is not None:
+                self._from_thread(settle, ok.payload.to_bytes(), None)
             elif reply.err is not None:
                 problem = _problem(key, reply.err.payload.to_bytes(), timeout_s)
                 self._from_thread(settle, None, problem)
 
         def on_end() -> None:
-            self._from_thread(settle, None, NotServed(key))
+            if not answered:
+                self._from_thread(settle, None, NotServed(key))
 
         self._arrivals.stirred = True
         priority, congestion, express = self._outgoing.way(key, traffic)
@@ -470,6 +476,7 @@ class Mesh:
         """Call ``on_change(key, alive)`` for every token that exists, comes or goes."""
 
         def receive(sample: zenoh.Sample) -> None:
+            keep_attached()
             self._from_thread(on_change, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         return Subscription(
