@@ -192,6 +192,15 @@ class Operator:
             return f"it does not answer {self._caller}; access rules may not allow it (--as operator/N)"
         return ""
 
+    async def why_not_allowed(self, robot: int, verb: str, *, timeout_s: float) -> str:
+        """Whether what a robot agent always serves does not get through to it; empty when it is no such agent."""
+        try:
+            await self.ask(robot, "status", timeout_s=timeout_s)
+        except MacsError:
+            return ""
+        right = f"a plan gives it by `may: call` with `verbs: [{verb}]`, or `may: command`"
+        return f"access rules do not let {self._caller} call its verb {verb}; {right} (docs/security.md)"
+
     async def ask(self, robot: int, verb: str, data: bytes = b"", *, timeout_s: float, urgent: bool = False) -> bytes:
         """What a robot answers. ``urgent``: at the priority of commands.
 

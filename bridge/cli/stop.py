@@ -161,7 +161,10 @@ async def _why_unserved(operator: Operator, robot: int) -> str:
         for agent in await operator.online():
             if agent.key == (ROS, robot):
                 gateways = await operator.gateways()
-                why = await operator.why_silent(agent, gateways, timeout_s=FIRST_S)
+                why = ""
+                if agent.zid not in gateways:
+                    why = await operator.why_not_allowed(robot, "stop", timeout_s=FIRST_S)
+                why = why or await operator.why_silent(agent, gateways, timeout_s=FIRST_S)
                 return why or "it is online, and has no emergency stop"
     return ""
 

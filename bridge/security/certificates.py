@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime as dt
 import ipaddress
 import os
+import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,6 +69,8 @@ def authority(into: Path, plan: Plan, now: dt.datetime, *, renew: bool = False) 
     found = Authority(_read_certificate(certificate), _read_key(key), certificate.read_bytes())
     if not _belongs(found.certificate, found.key):
         raise ConfigError(str(key), "is not the key of the certificate beside it; use --new-ca")
+    if not _is_authority(found.certificate):
+        raise ConfigError(str(certificate), "is no authority; use --new-ca")
     return found, Issued(CA_DIRECTORY, _until(found.certificate))
 
 
@@ -214,6 +217,16 @@ def _address(text: str) -> x509.GeneralName:
         return x509.DNSName(text)
 
 
+def _is_authority(certificate: x509.Certificate) -> bool:
+    """Whether it may sign for others, and has signed itself."""
+    try:
+        may_sign = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+        certificate.verify_directly_issued_by(certificate)
+    except (x509.ExtensionNotFound, InvalidSignature, ValueError, TypeError):
+        return False
+    return may_sign
+
+
 def _belongs(certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> bool:
     return certificate.public_key() == key.public_key()
 
@@ -221,8 +234,29 @@ def _belongs(certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> 
 # -- files -------------------------------------------------------------------------------------------------------
 
 
+def check_own(*paths: Path) -> None:
+    """Raise ConfigError for what is there and somebody else has put or linked there: whoever prepared a directory
+    would have our keys, or we would take his for ours. Nothing is found there: nothing is wrong."""
+    for path in paths:
+        try:
+            found = path.lstat()
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise ConfigError(str(path), error.strerror or str(error)) from error
+        if stat.S_ISLNK(found.st_mode):
+            raise ConfigError(str(path), "is a link; keys are neither read nor written through one")
+        if not (stat.S_ISDIR(found.st_mode) or stat.S_ISREG(found.st_mode)):
+            raise ConfigError(str(path), "is neither a directory nor a file")
+        if found.st_uid not in (os.geteuid(), 0):
+            raise ConfigError(str(path), f"belongs to user {found.st_uid}, not to who runs this")
+        if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            raise ConfigError(str(path), "can be written by others; take that right from them, or use another place")
+
+
 def private_directory(path: Path) -> None:
-    """Make a directory that only its owner can look into. Raises UsageError."""
+    """Make a directory that only its owner can look into. Raises UsageError; ConfigError where it is not ours."""
+    check_own(path)
     try:
         path.mkdir(mode=PRIVATE_DIRECTORY, parents=True, exist_ok=True)
         path.chmod(PRIVATE_DIRECTORY)

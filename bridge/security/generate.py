@@ -9,11 +9,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bridge.security import certificates, files
-from bridge.security.certificates import CA_DIRECTORY, PRIVATE_DIRECTORY, PRIVATE_FILE, Issued
+from bridge.security.certificates import (
+    AUTHORITY,
+    CA_DIRECTORY,
+    CERTIFICATE,
+    KEY,
+    PRIVATE_DIRECTORY,
+    PRIVATE_FILE,
+    Issued,
+)
 from bridge.security.plan import ALL, Plan, Router
 from macs_zenoh.errors import UsageError
 
 ROUTER_FILE, SETTINGS_FILE = "router.json5", "macs.toml"
+FILES = (ROUTER_FILE, SETTINGS_FILE, CERTIFICATE, KEY, AUTHORITY)
+"""Of a node's directory."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +76,9 @@ def generate(
         into.mkdir(mode=PRIVATE_DIRECTORY, parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{into}: {error.strerror or error}") from error
+    certificates.check_own(into)
+    for directory in [into / CA_DIRECTORY, *(into / name for name in names)]:
+        certificates.check_own(directory, *(directory / name for name in FILES))
     authority, about_authority = certificates.authority(into, plan, now, renew=new_authority)
     report = Report(into, about_authority, [])
     for node in plan.nodes:

@@ -823,6 +823,42 @@ async def test_an_operator_stops_with_its_own_file(tmp_path: Path) -> None:
         assert f"tells nothing: {denied}" in out
 
 
+@pytest.mark.parametrize("verbs", ["status", "status, ping"])
+async def test_an_operator_who_may_not_stop_hears_which_right_is_missing(tmp_path: Path, verbs: str) -> None:
+    """A robot that tells its state has an emergency stop; that this operator may not use it is said."""
+    site = made(tmp_path / "pki", CLIENTS.replace("[status]", f"[{verbs}]"))
+
+    async def answer(call: macs_zenoh.Call) -> bytes:
+        return b'{"ros_node": "/r", "stopped": true, "stop": {"by": "operator/0"}, "nodes": []}'
+
+    async with (
+        Router(site.file()),
+        macs_zenoh.join("ros", id=7, group=3, settings=site.settings("robot-7")) as robot,
+    ):
+        for verb in ("status", "stop"):
+            robot.serve(verb, answer)
+        settings = ("--settings", str(site.directory / "anna" / "macs.toml"))
+        while not (await macs("ls", "--json", *settings))[0]["status"]:
+            await asyncio.sleep(0.02)
+        code, out, _ = await ended("stop", "--timeout", "1", *settings)
+        assert (code, out.partition(";")[0]) == (
+            1,
+            "robot 7 is NOT stopped: access rules do not let operator/0 call its verb stop",
+        )
+        assert "a plan gives it by `may: call` with `verbs: [stop]`" in out
+
+
+def test_the_shipped_wan_plan_has_an_operator_who_may_stop() -> None:
+    """Somebody who looks at robots from wherever can stop them, and can do no more to them."""
+    wan = plan.load(ROOT / "config" / "wan" / "plan.yaml")
+    (anna,) = wan.operators
+    for robot in wan.robots:
+        verbs = wan.verbs(anna, robot)
+        assert verbs is not None
+        assert {"status", "stop"} <= set(verbs)
+        assert not wan.may(anna, "command", robot)
+
+
 @pytest.mark.parametrize(
     ("file", "content", "problem"),
     [

@@ -484,3 +484,45 @@ def test_files_know_where_they_will_be(site: Plan, tmp_path: Path) -> None:
     assert '"/etc/macs/site/key.pem"' in (tmp_path / "site" / "router.json5").read_text()
     generate(site, tmp_path, NOW)
     assert str(tmp_path / "robot-7" / "key.pem") in (tmp_path / "robot-7" / "macs.toml").read_text()
+
+
+# -- a directory that somebody has prepared --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "planted", ["ca", "ca/key.pem", "ca/ca.pem", "robot-7", "robot-7/key.pem", "robot-7/macs.toml"]
+)
+def test_nothing_is_written_or_read_through_a_link(site: Plan, tmp_path: Path, planted: str) -> None:
+    """Who prepared the directory gets no key of ours, and no authority of his is taken for ours."""
+    into, elsewhere = tmp_path / "pki", tmp_path / "elsewhere"
+    generate(site, into, NOW)
+    moved = into / planted
+    moved.rename(elsewhere)
+    moved.symlink_to(elsewhere)
+    before = sorted(path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file())
+    with pytest.raises(ConfigError, match="is a link"):
+        generate(site, into, NOW, renew=["all"])
+    assert sorted(path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()) == before
+
+
+def test_a_directory_of_others_is_not_used(site: Plan, tmp_path: Path) -> None:
+    """What belongs to somebody else, or can be written by others, is refused with what to do."""
+    generate(site, tmp_path / "pki", NOW)
+    (tmp_path / "pki" / "ca" / "key.pem").chmod(0o660)
+    with pytest.raises(ConfigError, match="can be written by others"):
+        generate(site, tmp_path / "pki", NOW)
+    (tmp_path / "pki" / "ca" / "key.pem").chmod(0o600)
+    generate(site, tmp_path / "pki", NOW)
+    if os.geteuid() == 0:
+        os.chown(tmp_path / "pki" / "ca" / "ca.pem", 12345, -1)
+        with pytest.raises(ConfigError, match="belongs to user 12345"):
+            generate(site, tmp_path / "pki", NOW)
+
+
+def test_a_certificate_that_is_no_authority_signs_nothing(site: Plan, tmp_path: Path) -> None:
+    """A node's certificate and key in the authority's place are found out."""
+    generate(site, tmp_path, NOW)
+    for name, source in (("ca.pem", "cert.pem"), ("key.pem", "key.pem")):
+        (tmp_path / "ca" / name).write_bytes((tmp_path / "robot-7" / source).read_bytes())
+    with pytest.raises(ConfigError, match="is no authority; use --new-ca"):
+        generate(site, tmp_path, NOW)
