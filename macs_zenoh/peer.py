@@ -479,7 +479,7 @@ class Peer:
         elif manager == RemoveNode.manager:
             node = decode_data(RemoveNode, frame.body)
         else:
-            raise BadField("registration", f"its message is neither {AddNode.manager} nor {RemoveNode.manager}")
+            raise BadField("registration", _NO_NODE)
         if (node.registrant_agent_type, node.registrant_agent_id) != (self.agent_type, self.agent_id):
             self.corrected += 1
             node = structs.replace(node, registrant_agent_type=self.agent_type, registrant_agent_id=self.agent_id)
@@ -526,6 +526,12 @@ class Peer:
 
     def _gone(self) -> bool:
         return self.state is GONE
+
+
+_NO_NODE = (
+    f"its message names neither {AddNode.manager} nor {RemoveNode.manager}: management data and message are one "
+    "frame, not two (docs/unity.md)"
+)
 
 
 def _refusal(registration: Registration | None, error: WireError) -> RegistrationRefused:

@@ -20,10 +20,12 @@ from macs_zenoh.messages import (
     UNITY,
     AddNode,
     Metadata,
+    NodeRefused,
     NodeType,
     Registration,
     RemoveNode,
     StreamData,
+    decode_data,
     encode_data,
     encode_management,
 )
@@ -310,3 +312,23 @@ async def test_a_silent_agent_is_away_and_stays(
         assert lively.connected
         await taken_off.online()
         assert await told() == []
+
+
+async def test_a_registration_in_two_frames_is_refused(start_gateway: StartGateway) -> None:
+    """A client that sends management data and message as frames of their own is told that they are one."""
+    gateway = await start_gateway()
+    async with socket(gateway) as robot, socket(gateway) as headset:
+        robot.configure(agent_type=ROS)
+        headset.configure()
+        await until(lambda: (ROS, robot.id) in gateway.directory)
+        node = AddNode(UNITY, headset.id, 1, "nd__chatter", "/chatter", "std_msgs/String")
+        management = encode_management(Registration(headset.id, 1, "nd__chatter", [robot.id], [], "/chatter"))
+        message = encode_message(Metadata(message_manager=node.manager).encode(), encode_data(node))
+        headset.writer.write(encode_frame(management=management) + encode_frame(ROS, (robot.id,), message=message))
+        metadata, body = await headset.message()
+        assert metadata.message_manager == NodeRefused.manager
+        refused = decode_data(NodeRefused, body)
+        assert refused.tos_name == "/chatter"
+        assert "one frame, not two" in refused.reason
+        headset.writer.write(registration(headset, [robot.id], node))
+        assert (await robot.message())[0].message_manager == AddNode.manager

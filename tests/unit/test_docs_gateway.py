@@ -22,6 +22,7 @@ from macs_zenoh.messages import (
     node_name,
 )
 from macs_zenoh.peer import DEFAULT_LIMITS
+from macs_zenoh.wire import encode_frame, encode_message
 from tests.replay import RULES
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -41,8 +42,19 @@ def json_texts(section: str) -> list[str]:
 
 
 def test_the_registration_is_shown_as_it_is_sent() -> None:
-    """The three JSON texts are a registration, the node that it adds, and the metadata of a request."""
-    management, data, metadata = json_texts("## The four kinds of nodes")
+    """The four JSON texts are a registration, its message's two parts, and the metadata of a request; the table of
+    bytes is the frame of the first three."""
+    management, adding, data, metadata = json_texts("## The four kinds of nodes")
+    frame = encode_frame(management=management.encode(), message=encode_message(adding.encode(), data.encode()))
+    rows = re.findall(
+        r"^\| (\d+) \| (\d+)?[^|]*?(?:`([0-9a-f ]+)`)? \|", UNITY.partition("**one frame**")[2], re.MULTILINE
+    )
+    shown = {int(at): bytes.fromhex(text) * int(times or 1) for at, times, text in rows if text}
+    assert len(shown) == 5
+    for at, content in shown.items():
+        assert frame[at : at + len(content)] == content
+    assert f"to byte {len(frame)} |" in UNITY
+    assert Metadata.decode(adding.encode()).message_manager == AddNode.manager
     registration = decode_management(management.encode())
     node = decode_data(AddNode, data.encode())
     assert isinstance(registration, Registration)
