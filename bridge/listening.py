@@ -6,7 +6,7 @@ import errno
 import socket
 from collections.abc import Iterator
 
-from macs_zenoh.addresses import joined
+from macs_zenoh.addresses import EVERYWHERE, joined
 from macs_zenoh.errors import Unreachable
 
 BOTH_FAMILIES = ("", "::")
@@ -68,3 +68,16 @@ def _bind(family: int, address: tuple[object, ...], *, shared: bool) -> socket.s
         opened.close()
         raise
     return opened
+
+
+def for_others(host: str) -> str:
+    """What others call a host that we listen on: for every address, this machine's in its network."""
+    if host not in EVERYWHERE:
+        return host
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # of a UDP socket: sends nothing
+        except OSError:
+            return socket.gethostname()
+        address: str = probe.getsockname()[0]
+        return address

@@ -32,6 +32,8 @@ class Pong(msgspec.Struct, frozen=True, kw_only=True):
     """What its session lost since it started, by name."""
     now: dict[str, int] = {}
     """What is so at this moment and should not be, by name: ``waiting_for_id`` connections of a gateway."""
+    address: str = ""
+    """Where headsets reach it, as HOST:PORT, when it is a gateway."""
     away: list[tuple[int, int]] = []
     """(type, id) of agents of a gateway that it has not heard of for a while, though they are connected."""
 
@@ -45,6 +47,7 @@ def pong(
     drops: dict[str, int],
     now: dict[str, int],
     away: list[tuple[int, int]],
+    address: str = "",
 ) -> Pong:
     """What a program with these settings says of itself."""
     return Pong(
@@ -59,6 +62,7 @@ def pong(
         drops=drops,
         now=now,
         away=away[:MOST_AWAY],
+        address=address,
     )
 
 

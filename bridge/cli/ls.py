@@ -1,9 +1,10 @@
-"""List the agents that are online: robots and headsets, whichever gateway they are behind.
+"""List the agents that are online, robots and headsets, whichever gateway they are behind; then gateways and routers.
 
 A headset's session is its gateway's, so headsets with one session share a gateway. Robots are asked for their state:
 STATE says which are stopped, who has control of which topic, and ? for a robot that should answer and does not: it
 hangs, or access rules do not let you ask it ([operator] in the settings, or --as, say who you are). A headset that
 nothing was heard of for 10 s is away: taken off, or out of reach; its gateway lets it go later (silence_s).
+Of a gateway the address is where headsets connect to it; routers may hide theirs.
 -v adds, for each robot: the emergency stop, who has registered what, control and dead-man of each topic, what was
 lost, and what it offers. Exit code 1 when no router answers, 130 after Ctrl-C.
 
@@ -12,27 +13,33 @@ examples:
   macs ls -v -e tcp/192.168.1.10:7447
   macs ls --json | jq '.[] | select(.type == "ros").id'
   macs ls --json | jq '.[] | select(.status.stopped) | {id, by: .status.stop.by}'
-  macs ls -v --json | jq '.[] | {id, topics: .offers.publishers}'"""
+  macs ls -v --json | jq '.[] | select(.type == "ros") | {id, topics: .offers.publishers}'
+  macs ls -v --json | jq '.[] | select(.type == "gateway").address'"""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
 import json
-from collections.abc import Collection, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 from bridge.cli import options, output, robots, running
-from bridge.cli.robots import Node, Offers, Operator, Status
+from bridge.cli.robots import Node, Offers, Operator, Router, Status
 from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import MacsError, NotServed, Refused, Unreachable
 from macs_zenoh.messages import ROS
 from macs_zenoh.named import Named
+from macs_zenoh.ping import Pong
 from macs_zenoh.plain import plain
 
 SUMMARY = "who is online, and what robots are doing"
 VERBOSE = "all about each robot"
+
+SHORT = 8
+"""Of a session's id so much tells it from others; --json has all of it."""
 
 ANSWER_S = 1.0
 """How long robots may take to tell their state; without -v nobody wants to wait for one that is stuck."""
@@ -79,12 +86,20 @@ def run(args: argparse.Namespace) -> int:
         async with robots.operator(settings.mesh, caller, timeout_s=args.timeout) as operator:
             agents, names = await operator.online(), await operator.names()
             gateways = await operator.gateways()
-            looking = asyncio.ensure_future(operator.away(gateways, timeout_s=answer_s))
+            looking = asyncio.gather(
+                operator.pongs(gateways, timeout_s=answer_s), operator.routers(timeout_s=answer_s)
+            )
             online = [agent for agent in agents if agent.type == ROS]
             asked = (_ask(operator, robot, gateways, answer_s, offers=args.verbose) for robot in online)
             told = dict(zip((robot.id for robot in online), await asyncio.gather(*asked), strict=True))
-            away = await looking
-        output.say((_json if args.json else _text)(agents, names, told, away, args.verbose))
+            pongs, routers = await looking
+            elsewhere = Counter() if agents or names or args.json else await operator.elsewhere()
+        away = {agent for pong in pongs.values() if pong is not None for agent in pong.away}
+        if args.json:
+            output.say(_json(agents, names, told, away, _infrastructure(agents, pongs, routers), args.verbose))
+        else:
+            text = _text(agents, names, told, away, args.verbose) or _nobody(elsewhere)
+            output.say("\n".join([text, *_shown_infrastructure(_infrastructure(agents, pongs, routers))]))
         return 0
 
     return running.until_stopped(show, interrupted=running.INTERRUPTED)
@@ -132,14 +147,37 @@ def _rows(agents: list[AgentInfo], names: list[Named], away: Away) -> list[dict[
     ]
 
 
-def _json(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], away: Away, verbose: bool) -> str:
+def _infrastructure(
+    agents: list[AgentInfo], pongs: dict[str, Pong | None], routers: list[Router]
+) -> list[dict[str, Any]]:
+    """A row for each gateway and each router."""
+    behind = Counter(agent.zid for agent in agents)
+    rows: list[dict[str, Any]] = []
+    for zid, pong in sorted(pongs.items()):
+        said = {"address": "", "macs": "", "zenoh": ""}
+        if pong is not None:
+            said = {"address": pong.address, "macs": pong.macs, "zenoh": pong.zenoh}
+        rows.append({"type": "gateway", "zid": zid, "agents": behind[zid], **said, "answers": pong is not None})
+    for router in routers:
+        rows.append({"type": "router", "zid": router.zid, "addresses": router.locators, "zenoh": router.release})
+    return rows
+
+
+def _json(
+    agents: list[AgentInfo],
+    names: list[Named],
+    told: dict[int, Told],
+    away: Away,
+    infrastructure: list[dict[str, Any]],
+    verbose: bool,
+) -> str:
     rows = _rows(agents, names, away)
     for row in rows:
         if row["type"] == "ros" and (robot := told.get(row["id"])) is not None:
             row["status"], row["problem"] = robot.raw_status, robot.problem
             if verbose:
                 row["offers"] = robot.raw_offers
-    return json.dumps(rows)
+    return json.dumps(rows + infrastructure if verbose else rows)
 
 
 # -- for people ------------------------------------------------------------------------------------------------------
@@ -148,14 +186,14 @@ def _json(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], aw
 def _text(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], away: Away, verbose: bool) -> str:
     rows = _rows(agents, names, away)
     if not rows:
-        return "nobody is online"
+        return ""
     states = [_state(told.get(row["id"])) if row["type"] == "ros" else "" for row in rows]
     states = ["away" if row.get("away") else state for row, state in zip(rows, states, strict=True)]
     if any(states):
         states = [state or "-" for state in states]
     lines = [("TYPE", "ID", "GROUP", "SESSION", "NAME", "STATE" if any(states) else "")]
     lines += [
-        (row["type"], str(row["id"] or "-"), str(row["group"] or "-"), row["zid"], row["name"] or "-", state)
+        (row["type"], str(row["id"] or "-"), str(row["group"] or "-"), row["zid"][:SHORT], row["name"] or "-", state)
         for row, state in zip(rows, states, strict=True)
     ]
     session, name = (max(len(line[column]) for line in lines) for column in (3, 4))
@@ -166,6 +204,30 @@ def _text(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], aw
         for robot, what in told.items():
             shown += ["", f"robot {robot}", *(f"  {line}" for line in _details(what))]
     return "\n".join(plain(line.rstrip()) for line in shown)
+
+
+def _nobody(elsewhere: Mapping[str, int]) -> str:
+    others = ", ".join(f"{count} in {name!r} (--namespace {name})" for name, count in sorted(elsewhere.items()))
+    return plain("nobody is online" + (f" here; {others}" if others else ""))
+
+
+def _shown_infrastructure(rows: list[dict[str, Any]]) -> list[str]:
+    """Gateways and routers in columns, below the agents."""
+    lines = []
+    for row in rows:
+        if row["type"] == "gateway":
+            where = row["address"] or "?"
+            what = f"{row['agents']} agents" if row["answers"] else f"{row['agents']} agents, does not answer"
+            version = f"macs {row['macs']}, Zenoh {row['zenoh']}" if row["macs"] else ""
+        else:
+            where, what = ", ".join(row["addresses"]) or "?", ""
+            version = f"Zenoh {row['zenoh']}" if row["zenoh"] else ""
+        lines.append((row["type"], row["zid"][:SHORT], where, what, version))
+    if not lines:
+        return []
+    widths = [max(len(line[column]) for line in lines) for column in range(5)]
+    shown = ("  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)) for line in lines)
+    return ["", *(plain(line).rstrip() for line in shown)]
 
 
 def _state(robot: Told | None) -> str:
@@ -182,7 +244,8 @@ def _details(robot: Told) -> list[str]:
     if status is None:
         silent = "is no `macs agent`: it tells nothing of itself"
         return [f"tells nothing: {robot.problem}" if robot.problem else silent]
-    lines = [f"ROS node        {status.ros_node}", f"emergency stop  {_stop(status)}"]
+    domain = "?" if status.ros_domain is None else status.ros_domain
+    lines = [f"ROS node        {status.ros_node}", f"ROS domain      {domain}", f"emergency stop  {_stop(status)}"]
     # the stop has a node of its own, which concerns people only when somebody has registered it
     nodes = [node for node in status.nodes if node.role != "emergency stop" or node.registrants]
     lines += _block("registered", [(node.role, node.name, node.type, _registrants(node)) for node in nodes])
@@ -190,7 +253,13 @@ def _details(robot: Told) -> list[str]:
     lines += _block("lost", [(name, str(count)) for name, count in sorted(status.drops.items())])
     if robot.offers is None:
         return [*lines, f"offers          ? {robot.problem}"]
-    return lines + _block("offers", list(_offered(robot.offers)))
+    return lines + (_block("offers", list(_offered(robot.offers))) or [f"offers          {_nothing(status)}"])
+
+
+def _nothing(status: Status) -> str:
+    """Why a robot may offer nothing, which most often is a mistake."""
+    graph = "its ROS graph" if status.ros_domain is None else f"the ROS graph of domain {status.ros_domain}"
+    return f"nothing: {graph} is empty, or hidden by its rules; is that the ROS_DOMAIN_ID of its nodes?"
 
 
 def _stop(status: Status) -> str:

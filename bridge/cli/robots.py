@@ -9,8 +9,9 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+from collections import Counter
 from collections.abc import AsyncIterator, Collection
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import msgspec
@@ -23,6 +24,7 @@ from macs_zenoh.errors import MacsError, Refused, Unreachable, UsageError
 from macs_zenoh.keyexpr import LEASE, NAME, PING, PRESENCE, type_name, type_number
 from macs_zenoh.messages import OPERATOR, ROS, Metadata
 from macs_zenoh.named import Named, Names
+from macs_zenoh.ping import Pong
 from macs_zenoh.routing import call
 from macs_zenoh.wire import Layout
 
@@ -100,6 +102,20 @@ class Status(Struct, frozen=True):
     stop: Stop
     nodes: list[Node]
     drops: dict[str, int] = {}
+    ros_domain: int | None = None
+
+
+class Router(Struct, frozen=True):
+    """A router, as its admin space has it."""
+
+    zid: str
+    version: str = ""
+    locators: list[str] = []
+
+    @property
+    def release(self) -> str:
+        """``1.10.2`` of ``v1.10.2-release built with rustc …``."""
+        return self.version.partition(" ")[0].partition("-")[0].removeprefix("v")
 
 
 class Offers(Struct, frozen=True):
@@ -167,17 +183,37 @@ class Operator:
         leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every(), timeout_s=self._timeout_s)]
         return {str(lease["zid"]) for lease in leases if lease is not None}
 
-    async def away(self, gateways: Collection[str], *, timeout_s: float) -> set[tuple[int, int]]:
-        """(type, id) of the agents of these gateways that are silent; of gateways that do not answer, none."""
-        asked = (self._away(zid, timeout_s) for zid in gateways)
-        return {agent for agents in await asyncio.gather(*asked) for agent in agents}
+    async def pongs(self, gateways: Collection[str], *, timeout_s: float) -> dict[str, Pong | None]:
+        """What each of these gateways says of itself, None for one that does not answer."""
+        said = await asyncio.gather(*(self._pong(zid, timeout_s) for zid in gateways))
+        return dict(zip(gateways, said, strict=True))
 
-    async def _away(self, zid: str, timeout_s: float) -> Collection[tuple[int, int]]:
+    async def _pong(self, zid: str, timeout_s: float) -> Pong | None:
         try:
-            answer = await self._mesh.query(PING.of(zid=zid), b"", timeout_s=timeout_s)
-            return ping.decode(answer)[0].away
+            return ping.decode(await self._mesh.query(PING.of(zid=zid), b"", timeout_s=timeout_s))[0]
         except MacsError:
-            return ()
+            return None
+
+    async def routers(self, *, timeout_s: float) -> list[Router]:
+        """The routers that let themselves be seen, or at least those that we are linked with."""
+        linked = [Router(zid) for zid in self._mesh.routers]
+        if self._mesh.settings.namespace:  # what they tell is in none
+            return linked
+        found = {router.zid: router for router in linked}
+        for _, answer in await self._mesh.ask_all("@/*/router", timeout_s=timeout_s):
+            with suppress(msgspec.MsgspecError):
+                router = msgspec.json.decode(answer, type=Router)
+                found[router.zid] = router
+        return sorted(found.values(), key=lambda router: router.zid)
+
+    async def elsewhere(self) -> Counter[str]:
+        """How many agents there are in other namespaces."""
+        found: Counter[str] = Counter()
+        for key in set(await self._mesh.tokens("**/" + PRESENCE.every(), timeout_s=self._timeout_s)):
+            namespace, here, _ = key.partition("/macs/live/")
+            if here:
+                found[namespace] += 1
+        return found
 
     async def why_silent(self, robot: AgentInfo, gateways: Collection[str], *, timeout_s: float) -> str:
         """Why a robot that is online does not serve a verb; empty when it need not: it is behind a gateway, or it

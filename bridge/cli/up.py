@@ -20,14 +20,13 @@ import asyncio
 import importlib.util
 import logging
 import os
-import socket
 from contextlib import suppress
 from dataclasses import dataclass
 
 from bridge.cli import children, options, output, running
 from bridge.cli.apart import Apart
 from bridge.cli.children import Child, stop_in_order
-from bridge.listening import bound
+from bridge.listening import bound, for_others
 from bridge.logs import prefix_logs
 from macs_zenoh.addresses import EVERYWHERE, joined, reachable
 from macs_zenoh.config import GatewaySettings, RobotSettings, Settings, changed
@@ -273,7 +272,11 @@ def what_next(plan: Plan) -> str:
         endpoint += f" --namespace {plan.apart.namespace}"
     seen_from_outside = plan.gateway.host in EVERYWHERE
     topic = "/pose geometry_msgs/PoseStamped" if plan.demo else "/TOPIC pkg/Type"
-    where = joined(_own_address(), plan.gateway.port) if seen_from_outside else f"{target}, from this machine only"
+    where = (
+        joined(for_others(plan.gateway.host), plan.gateway.port)
+        if seen_from_outside
+        else f"{target}, from this machine only"
+    )
     lines = [
         "",
         "It runs. Ctrl-C stops it; meanwhile, in another terminal:",
@@ -287,17 +290,6 @@ def what_next(plan: Plan) -> str:
     if plan.apart is not None:
         lines.append(f"Its ROS side: {plan.apart.shown} ros2 topic list")
     return "\n".join(lines)
-
-
-def _own_address() -> str:
-    """This machine's address in its network; connecting a UDP socket sends nothing."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))
-        except OSError:
-            return socket.gethostname()
-        address: str = probe.getsockname()[0]
-        return address
 
 
 def _say(text: str) -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 from msgspec import structs
 
-from bridge.listening import bound
+from bridge.listening import bound, for_others
 from macs_zenoh.addresses import joined
 from macs_zenoh.budget import Budget
 from macs_zenoh.config import GatewaySettings
@@ -210,6 +210,7 @@ class Gateway:
             except OSError as error:  # two gateways can hold a port, and one of them can listen
                 why = f"cannot listen there: {error.strerror or error}"
                 raise Unreachable(self.address, why) from error
+        self.mesh.address = joined(for_others(self.settings.host), self.port)
         log.info("listening on %s", self.address)
 
     def _turned_away(self, whom: str) -> None:

@@ -45,6 +45,8 @@ def judge(robot: int, topic: str, role: Role, offered: Functionality) -> str:
     name = topic if topic.startswith("/") else f"/{topic}"
     if name in there:
         return ""
+    if not (offered.publishers or offered.subscribers or offered.services):
+        return f"robot {robot} offers nothing at all; is its ROS_DOMAIN_ID that of its nodes?"
     nobody = f"robot {robot} offers no {'publisher of' if role == 'publishers' else 'subscriber to'} {name}"
     near = difflib.get_close_matches(name, there, n=1, cutoff=ALIKE)
     if near:

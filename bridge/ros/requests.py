@@ -73,6 +73,7 @@ def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int])
     stop = nodes.robot.stop
     state: dict[str, Any] = {
         "ros_node": ros_name,
+        "ros_domain": nodes.robot.session.domain,
         "stopped": stop.stopped,
         "stop": {
             "by": stop.by,

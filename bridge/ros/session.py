@@ -95,6 +95,11 @@ class RosSession:
         self.close()
 
     @property
+    def domain(self) -> int:
+        """The ROS domain that it is in."""
+        return int(self.context.get_domain_id())
+
+    @property
     def full_name(self) -> str:
         """Namespace and name of the node."""
         return str(self.node.get_fully_qualified_name())

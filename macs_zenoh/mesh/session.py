@@ -102,6 +102,8 @@ class Mesh:
         self.on_room = outgoing.on_room
         self.tells: Callable[[], dict[str, int]] = dict
         """What this program tells `macs doctor` of itself, by name: what is so now and should not be."""
+        self.address = ""
+        """Where headsets reach this program, if it is a gateway."""
         self.away: Callable[[], list[tuple[int, int]]] = list
         """(type, id) of a gateway's agents that are silent."""
         self._linked_with: set[str] = set()
@@ -460,7 +462,14 @@ class Mesh:
         async def answer(key: str, payload: bytes) -> bytes:
             drops, now = dict(self.drops), self.tells()
             said = ping.pong(
-                self.settings, now_s=time.time(), macs=macs, zenoh=wheel, drops=drops, now=now, away=self.away()
+                self.settings,
+                now_s=time.time(),
+                macs=macs,
+                zenoh=wheel,
+                drops=drops,
+                now=now,
+                away=self.away(),
+                address=self.address,
             )
             return ping.encode(said, payload)
 

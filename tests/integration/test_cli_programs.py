@@ -40,11 +40,25 @@ async def test_ls_lists_robots_and_headsets(endpoint: str) -> None:
         ]
         code, shown, _ = await ended("ls", "-e", endpoint)
         assert code == 0
-        assert [line.split()[:3] for line in shown.splitlines()] == [
+        agents, _, others = shown.partition("\n\n")
+        assert [line.split()[:3] for line in agents.splitlines()] == [
             ["TYPE", "ID", "GROUP"],
             ["ros", "7", "3"],
             ["unity", str(headset.id), "4"],
         ]
+        here, there = others.splitlines()
+        assert here.split()[0] == "gateway"
+        assert here.split()[2:5] == [f"127.0.0.1:{gateway.port}", "1", "agents"]
+        assert there.split()[0] == "router"
+        assert there.split()[2] == endpoint
+        everything = await macs("ls", "--json", "-v", "-e", endpoint)
+        (of_gateway,) = (row for row in everything if row["type"] == "gateway")
+        assert (of_gateway["address"], of_gateway["agents"]) == (f"127.0.0.1:{gateway.port}", 1)
+        assert of_gateway["macs"]
+        assert of_gateway["zid"] == next(row["zid"] for row in everything if row["type"] == "unity")
+        assert [row["addresses"] for row in everything if row["type"] == "router"] == [[endpoint]]
+        assert all(len(row["zid"]) > 24 for row in everything)
+        assert not [word for word in shown.split() if len(word) > 24 and word.isalnum()], "ids are short for people"
 
 
 async def test_ls_of_an_empty_mesh_is_an_empty_list(endpoint: str) -> None:
@@ -67,6 +81,8 @@ async def test_a_namespace_is_a_mesh_of_its_own(endpoint: str) -> None:
     async with Program("router", "-l", endpoint), macs_zenoh.join("ros", id=7, settings=site):
         assert await macs("ls", "--json", "-e", endpoint) == []
         assert [agent["id"] for agent in await macs("ls", "--json", "-e", endpoint, "--namespace", "site1")] == [7]
+        _, shown, _ = await ended("ls", "-e", endpoint)
+        assert shown.startswith("nobody is online here; 1 in 'site1' (--namespace site1)\n")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)

@@ -156,7 +156,7 @@ async def test_a_misspelled_topic_is_told(site: Site) -> None:
     code, _, log = await ended(
         "headset", site.headset.target, "pub", "/cmdvel", "geometry_msgs/Twist", "{}", "--settle", "3"
     )
-    assert code == 0
+    assert code == 1
     assert "robot 7 offers no subscriber to /cmdvel; did you mean /cmd_vel?" in log
 
 
@@ -168,3 +168,20 @@ async def test_nothing_is_told_of_topics_that_are_there(site: Site) -> None:
         "headset", site.headset.target, "pub", "/cmd_vel", "geometry_msgs/Twist", "{}", "--settle", "3"
     )
     assert "offers no" not in log
+
+
+async def test_an_agent_in_an_empty_domain_says_so(domain: int) -> None:
+    """A robot that offers nothing is most often in another domain than its nodes: `ls -v` and `sub` say which."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    async with (
+        Program("router", "-l", endpoint),
+        Program("gateway", "--port", "0", "-e", endpoint) as gateway,
+        Program("agent", "--id", "7", "-e", endpoint, env={"ROS_DOMAIN_ID": str(domain)}),
+    ):
+        _, shown, _ = await ended("ls", "-v", "-e", endpoint)
+        assert f"ROS domain      {domain}\n" in shown
+        assert f"nothing: the ROS graph of domain {domain} is empty" in shown
+        sub = ("sub", "/chatter", "std_msgs/String", "--agents", "7", "--timeout", "4")
+        code, _, log = await ended("headset", f"127.0.0.1:{gateway.port}", *sub)
+        assert code == 1
+        assert "robot 7 offers nothing at all; is its ROS_DOMAIN_ID that of its nodes?" in log

@@ -29,3 +29,11 @@ OFFERED = Functionality(
 )
 def test_hints(topic: str, role: Role, said: str) -> None:
     assert judge(1, topic, role, OFFERED) == said
+
+
+@pytest.mark.parametrize("role", ["publishers", "subscribers"])
+def test_a_robot_in_an_empty_graph(role: Role) -> None:
+    """Most often it is in the wrong domain."""
+    assert judge(1, "/chatter", role, Functionality()) == (
+        "robot 1 offers nothing at all; is its ROS_DOMAIN_ID that of its nodes?"
+    )
