@@ -18,6 +18,9 @@ from typing import IO, Any
 
 ROOT = Path(__file__).parents[1]
 
+UNLIMITED = Path(__file__).with_name("unlimited.toml")
+GATEWAY = ("-m", "bridge", "gateway", "--settings", str(UNLIMITED))
+
 START_S = 15.0
 """How long a program may take until it says that it is ready."""
 
@@ -157,7 +160,7 @@ class Stage:
             under = ["-m", "cProfile", "-o", str(self._profile_into / f"gateway-{self._gateways}.prof")]
         self._gateways += 1
         connect = f"tcp/127.0.0.1:{router_port}"
-        gateway = self._start("gateway", *under, "-m", "bridge", "gateway", "--port", "0", "-e", connect)
+        gateway = self._start("gateway", *under, *GATEWAY, "--port", "0", "-e", connect)
         return _port_in(gateway.line())
 
     def relay(self) -> int:

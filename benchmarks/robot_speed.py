@@ -19,7 +19,7 @@ from macs_zenoh.mesh.awake import Awake
 
 from .figures import Figure
 from .plan import KIB, Case, Plan, Run, in_turn
-from .processes import Program, ProgramFailed, Stage
+from .processes import UNLIMITED, Program, ProgramFailed, Stage
 from .robot_ends import stamped
 
 IMAGE = 900_000
@@ -56,7 +56,7 @@ class Site:
             settings.write("mesh.awake_us = 0" if awake else "")
             settings.flush()
             arguments = ("-m", "bridge", "agent", "--id", "1", "-e", f"tcp/127.0.0.1:{router}")
-            self.agent = stage._start("agent", *arguments, "--settings", settings.name)
+            self.agent = stage._start("agent", *arguments, "--settings", str(UNLIMITED), "--settings", settings.name)
             self.agent.line()
         self.publisher, _ = stage.worker("robot_ends", "ros")
         self.subscriber, _ = stage.worker("robot_ends", "ros")

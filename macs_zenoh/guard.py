@@ -34,12 +34,15 @@ class Allowances:
     """How many messages each sender may send, and all together."""
 
     SENDERS = 4096
-    TOGETHER = 8
+    TOGETHER = 4
     """So many senders at their limit are served. More would take the time that commands need."""
+    LITTLE = 0.75
+    """Who has as much of its credit left has sent little, and passes whatever others do."""
 
     def __init__(self, per_s: float) -> None:
         self._per_s = per_s
         self._most = max(1.0, per_s / 4)
+        self._little = self.LITTLE * per_s
         self._all = Credit(per_s * self.TOGETHER, -math.inf)
         self._senders: dict[str, Credit] = {}
 
@@ -51,7 +54,7 @@ class Allowances:
                 self._senders.clear()
             credit = self._senders[sender] = Credit(self._per_s, now)
         cost = 1.0 if size <= SINGLE_BYTES else min(self._most, size / RUN_BYTES)
-        return credit.take(cost, now) and self._all.take(cost, now)
+        return credit.take(cost, now) and (credit.left(now) >= self._little or self._all.take(cost, now))
 
 
 class Ages:

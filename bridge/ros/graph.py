@@ -35,6 +35,8 @@ PLUMBING_PACKAGES = ("rcl_interfaces/", "type_description_interfaces/", "lifecyc
 OFFERS_STREAM = "_offers"
 """Node of the robot's stream that carries `Offered` as JSON whenever it changes."""
 LOOK_S = 1.0
+FRESH_S = 0.05
+"""So long what the graph was read to be is given to others that ask."""
 SETTLE_LOOKS = 3
 """So many looks after a change read everything: ROS knows a topic before it knows whose it is."""
 
@@ -142,6 +144,8 @@ class Offers:
         self._followers: dict[Registrant, int] = {}
         self._graph: tuple[NamesAndTypes, NamesAndTypes] | None = None
         self._last = Offered()
+        self._read: asyncio.Task[Offered] | None = None
+        self._read_at = 0.0
         self._frame = StreamFraming(
             Metadata(ROS, robot.agent_id, node_name=OFFERS_STREAM, message_manager=FunctionalityRequest.manager),
             [],
@@ -150,9 +154,13 @@ class Offers:
         self._looking = asyncio.get_running_loop().create_task(self._look())
 
     async def now(self) -> Offered:
-        """What it offers now."""
-        session = self._robot.session
-        return await session.run(lambda: offers(session.node, self._robot.rules))
+        """What it offers now. Whoever asks while others do gets their answer: it takes the ROS thread some time."""
+        loop = asyncio.get_running_loop()
+        if self._read is None or (self._read.done() and loop.time() > self._read_at + FRESH_S):
+            session = self._robot.session
+            self._read = loop.create_task(session.run(lambda: offers(session.node, self._robot.rules)))
+            self._read_at = loop.time()
+        return await asyncio.shield(self._read)
 
     def follow(self, agent: Registrant, request: Message) -> None:
         """Tell this agent of every change from now on, if its request asks for that."""
@@ -167,6 +175,8 @@ class Offers:
     def close(self) -> None:
         """Stop looking."""
         self._looking.cancel()
+        if self._read is not None:
+            self._read.cancel()
 
     async def _look(self) -> None:
         node = self._robot.session.node
