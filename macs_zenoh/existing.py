@@ -27,8 +27,6 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple
 
-import msgspec
-
 from .least_bytes import ANSWERS, LEAST, is_whole
 from .messages import (
     FOR_NEWER,
@@ -41,6 +39,7 @@ from .messages import (
     NodeRefused,
     NodeType,
     Welcome,
+    is_json_object,
 )
 from .wire import Buffer, Frame, Header, encode_message
 
@@ -325,7 +324,7 @@ def _fitting(frame: Frame, data: Data, metadata: Metadata) -> Buffer | None:
         return frame.message if is_whole(frame.body, metadata.data_exchange_type) else None
     if data is Data.EMPTY_TOO and frame.body == CDR:
         return encode_message(frame.metadata, CDR + b"\x00")  # as ROS writes it, which is what ROS reads
-    if data in (Data.JSON, Data.FAILURE_TOO) and _is_json_object(frame.body):
+    if data in (Data.JSON, Data.FAILURE_TOO) and is_json_object(frame.body):
         return frame.message
     return None
 
@@ -333,13 +332,6 @@ def _fitting(frame: Frame, data: Data, metadata: Metadata) -> Buffer | None:
 def refuses(frame: Frame) -> bool:
     """Whether a plain answer is a `Refusal`."""
     return bytes(frame.body[:10]) == b'{"refused"'
-
-
-def _is_json_object(data: memoryview) -> bool:
-    try:
-        return isinstance(msgspec.json.decode(data), dict)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return False
 
 
 def _name_problem(manager: str) -> str:

@@ -22,6 +22,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from .errors import BadField, BadJson, TooLong, UnknownManager
 from .limits import (
     ANSWER_BYTES,
+    CONFIGURATION_BYTES,
     JSON_FIELDS,
     JSON_PARTS,
     MANAGEMENT_BYTES,
@@ -373,6 +374,15 @@ def decode_data(kind: type[StructT], data: bytes | bytearray | memoryview, max_b
     name = getattr(kind, "manager", "") or kind.__name__
     data = _judged(name, data, max_bytes)
     return _convert(name, _json_object(name, data), kind)
+
+
+def is_json_object(data: bytes | bytearray | memoryview, max_bytes: int = CONFIGURATION_BYTES) -> bool:
+    """Whether data is a JSON object, of a size that may be parsed."""
+    try:
+        _json("data", _judged("data", data, max_bytes))
+    except (TooLong, BadJson):
+        return False
+    return True
 
 
 def encode_data(value: Struct) -> bytes:

@@ -72,13 +72,13 @@ def encode(envelope: Envelope, data: bytes | bytearray | memoryview) -> bytes:
 
 
 def decode(payload: bytes) -> tuple[Envelope, bytes]:
-    """Take a message apart. Raises BadSizes, BadJson, BadField."""
+    """Take a message apart. Raises BadSizes, TooLong, BadJson, BadField."""
     text, data = split_message(payload)
     try:
         return _decoder.decode(text), bytes(data)
     except msgspec.ValidationError as error:
         raise BadField("envelope", str(error)) from None
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BadJson("envelope", str(error)) from None
 
 

@@ -76,5 +76,5 @@ def decode(answer: bytes) -> tuple[Pong, bytes]:
     metadata, echo = split_message(answer, REQUEST_BYTES)
     try:
         return msgspec.json.decode(metadata, type=Pong), bytes(echo)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise BadJson("the answer to a ping", str(error)) from None

@@ -20,8 +20,9 @@ from msgspec import Struct
 from macs_zenoh import ping
 from macs_zenoh.config import MeshSettings, OperatorSettings
 from macs_zenoh.directory import AgentInfo, Directory
-from macs_zenoh.errors import MacsError, Refused, Unreachable, UsageError
+from macs_zenoh.errors import MacsError, Refused, TooLong, Unreachable, UsageError
 from macs_zenoh.keyexpr import LEASE, NAME, PING, PRESENCE, type_name, type_number
+from macs_zenoh.limits import ANSWER_BYTES
 from macs_zenoh.messages import OPERATOR, ROS, Metadata
 from macs_zenoh.named import Named, Names
 from macs_zenoh.ping import Pong
@@ -298,7 +299,9 @@ async def _opened(opening: asyncio.Task[Mesh], settings: MeshSettings, patience_
 def read(answer: bytes, kind: type[_T]) -> tuple[dict[str, Any], _T]:
     """A robot's answer as it is, and as far as it is known here. Raises Unreachable: it makes no sense."""
     try:
+        if len(answer) > ANSWER_BYTES:
+            raise TooLong("an answer", len(answer), ANSWER_BYTES)
         document = json.loads(answer)
         return document, msgspec.convert(document, kind)
-    except (ValueError, RecursionError, msgspec.ValidationError) as error:
+    except (TooLong, ValueError, RecursionError, msgspec.ValidationError) as error:
         raise Unreachable("the robot", f"its answer makes no sense: {error}") from error

@@ -22,8 +22,8 @@ from bridge.ros import qos
 from bridge.ros.interface import PublishStream, Registrant, Robot
 from bridge.ros.rules import Rules
 from bridge.ros.stream import StreamFraming
-from macs_zenoh.errors import MacsError
-from macs_zenoh.messages import ROS, Functionality, FunctionalityRequest, Metadata, encode_data
+from macs_zenoh.errors import MacsError, WireError
+from macs_zenoh.messages import ROS, Functionality, FunctionalityRequest, Metadata, decode_data, encode_data
 from macs_zenoh.reading import Message
 
 log = logging.getLogger("macs.ros")
@@ -164,8 +164,8 @@ class Offers:
 
     def follow(self, agent: Registrant, request: Message) -> None:
         """Tell this agent of every change from now on, if its request asks for that."""
-        with suppress(msgspec.DecodeError):
-            if request.data and msgspec.json.decode(request.data, type=FollowRequest).follow:
+        with suppress(WireError):
+            if request.data and decode_data(FollowRequest, request.data).follow:
                 self._followers[agent] = request.metadata.request_id
 
     def forget(self, agent: Registrant) -> None:

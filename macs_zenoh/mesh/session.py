@@ -29,6 +29,7 @@ from macs_zenoh.errors import (
 )
 from macs_zenoh.guard import Gate
 from macs_zenoh.keyexpr import PING
+from macs_zenoh.limits import REASON_CHARACTERS, REQUEST_BYTES
 from macs_zenoh.shaping import Shaper
 from macs_zenoh.versions import installed
 
@@ -540,15 +541,15 @@ def _problem(key: str, payload: bytes, timeout_s: float) -> MacsError:
     if payload == b"Timeout":
         return CallTimeout(key, timeout_s)
     try:
-        answer = msgspec.json.decode(payload, type=dict[str, str])
-    except msgspec.DecodeError:
-        return Unreachable(key, payload.decode(errors="replace")[:200])
+        answer = msgspec.json.decode(payload[:REQUEST_BYTES], type=dict[str, str])
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return Unreachable(key, payload[:200].decode(errors="replace"))
     if "refused" in answer:
         holder = HOLDER.fullmatch(answer.get("holder", ""))
         if holder is None:
-            return Refused(answer["refused"])
-        return HeldByAnother(answer["refused"], (int(holder[1]), int(holder[2])))
-    return Unreachable(key, answer.get("failed", "unknown failure"))
+            return Refused(answer["refused"][:REASON_CHARACTERS])
+        return HeldByAnother(answer["refused"][:REASON_CHARACTERS], (int(holder[1]), int(holder[2])))
+    return Unreachable(key, answer.get("failed", "unknown failure")[:REASON_CHARACTERS])
 
 
 async def _open(config: zenoh.Config) -> zenoh.Session:

@@ -545,3 +545,17 @@ def test_names_of_nodes_are_plain(kind: Any, name: str) -> None:
         with pytest.raises(BadField):
             Metadata.decode(json.dumps({"nodeName": name}).encode())
     assert decode_data(kind, json.dumps(fields | {"nodeName": "nd_" + "x" * 252}).encode())
+
+
+def test_json_that_is_passed_on_is_judged_like_that_which_is_read() -> None:
+    """Data that goes to a program which parses it is an object, of a size and of parts that may be parsed."""
+    assert messages.is_json_object(b'{"subscribers":{}}')
+    for data in (
+        b"[]",
+        b"{",
+        b"",
+        b'{"a":' + b"[" * 2000 + b"]" * 2000 + b"}",
+        filled(b"[],", 200_000),
+        filled(b"0,", 31 << 20),
+    ):
+        assert not messages.is_json_object(memoryview(data))

@@ -187,3 +187,16 @@ def test_outcomes_have_counters() -> None:
     """Each outcome counts under a name of its own."""
     assert Outcome.NO_SUCH_AGENT.counter == "no_such_agent"
     assert len({outcome.counter for outcome in Outcome}) == len(Outcome)
+
+
+def test_an_envelope_is_small_and_flat() -> None:
+    """What is too long, nests without end or is no text is the sender's fault, told as that."""
+    deep = b'{"session":"s","number":1,"x":' + b"[" * 1900 + b"]" * 1900 + b"}"
+    for envelope in (
+        deep,
+        b'{"session":"s","number":1,"x":"\xff"',
+        b" " * 5000 + b"{}",
+        b'{"x":"' + b"y" * 10_000_000 + b'"}',
+    ):
+        with pytest.raises(WireError):
+            named.decode(encode_message(envelope, b"data"))

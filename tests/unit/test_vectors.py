@@ -102,6 +102,9 @@ def assert_says(value: msgspec.Struct, said: dict[str, Any]) -> None:
         if isinstance(found, msgspec.Struct):
             assert_says(found, said[field.name])
             continue
+        if found is msgspec.UNSET:
+            assert field.name not in said
+            continue
         found = msgspec.to_builtins(found)
         if field.name in said:
             assert found == said[field.name], field.name
