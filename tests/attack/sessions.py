@@ -297,16 +297,22 @@ def large_ping_queries(target: Target) -> None:
     queries(target, "ping", bytes(256 << 10))
 
 
-@attack(3, "operator")
-def stop_queries_of_an_operator(target: Target) -> None:
-    """The verb ``stop`` at full rate by an operator, asking for what is already so: not stopped."""
-    queries(target, "stop", b"false", caller="operator/9")
+@attack(3, "mesh")
+def release_queries(target: Target) -> None:
+    """The verb ``stop`` with ``false`` at full rate, by somebody who may not release."""
+    queries(target, "stop", b"false")
 
 
 @attack(3, "operator")
 def status_queries_of_an_operator(target: Target) -> None:
     """The verb ``status`` at full rate by an operator."""
     queries(target, "status", caller="operator/9")
+
+
+@attack(3, "operator")
+def ping_queries_of_an_operator(target: Target) -> None:
+    """The verb ``ping`` at full rate by an operator, with 64 KiB to send back."""
+    queries(target, "ping", bytes(64 << 10), caller="operator/9")
 
 
 @attack(3, "mesh")
