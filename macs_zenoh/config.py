@@ -314,6 +314,10 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     groups: dict[str, list[str]] = {}
     """Groups that not everybody here may choose, and the networks whose agents may: ``{9 = ["10.0.3.0/24"]}``. Who may
     not is in no group. For robots that give rights to a group (`RobotSettings.groups`). Other groups are free."""
+    robots: list[AgentId] | Literal["any"] = []
+    """Ids that agents who are no headsets may have here: existing robot programs. They get one of these, headsets do
+    not. Without it none may come, because whoever reaches the port could be a robot that is away just now. ``any``:
+    whatever id is free, as with the old router; for meshes on which no robot has a session of its own."""
     robot_packages: list[str] = []
     """Packages of ROS types that existing robot programs here have, besides the common ones and those of the topics
     and services that they name. A type of another package ends such a program's thread, so it is refused."""

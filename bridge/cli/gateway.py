@@ -6,6 +6,7 @@ examples:
   macs gateway                                             headsets on this machine, router on this machine
   macs gateway --host 0.0.0.0                              headsets from the network
   macs gateway --workers 4                                 four processes behind one port
+  macs gateway --robots 1,2                                existing robot programs too, as robots 1 and 2
   macs gateway --port 7001 -e tcp/10.0.0.1:7447 -e tcp/10.0.0.2:7447   two routers, for fail-over"""
 
 from __future__ import annotations
@@ -41,12 +42,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--allow", metavar="NETWORK", action="append", help="who may connect, as 192.168.1.0/24; repeat for more"
     )
+    parser.add_argument(
+        "--robots",
+        metavar="IDS",
+        type=_robots,
+        help="ids that existing robot programs may have here, as 1,2 or any (default: none may come)",
+    )
     parser.add_argument("--block", type=int, help="block of 256 agent ids to give out (default: the first free one)")
     parser.add_argument(
         "--workers", type=int, default=1, metavar="N", help="processes that share the port (default: 1)"
     )
     parser.add_argument(WORKER_ON, type=int, metavar="PORT", help=argparse.SUPPRESS)
     options.add_mesh_options(parser)
+
+
+def _robots(text: str) -> list[int] | str:
+    return text if text == "any" else [int(each) for each in text.split(",")]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -57,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
         port=args.port if args.be_worker_on_port is None else args.be_worker_on_port,
         allow=args.allow,
         block=args.block,
+        robots=args.robots,
         reuse_port=None if args.be_worker_on_port is None else True,
     )
     if args.workers < 1:

@@ -274,6 +274,8 @@ class Connection(asyncio.BufferedProtocol):
                         self._verdicts.clear()
                     self.owner.handle(self, event)
                     if isinstance(event, Joined):
+                        if self._transport.is_closing():
+                            return  # it was not let in, and nothing that it sent before counts
                         self._schedule()  # from now on silence counts, which may be less than what the handshake has
             except Exception:  # ours to mend; this agent goes on, and so do all others
                 if self._fails():

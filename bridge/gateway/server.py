@@ -67,6 +67,7 @@ from .listener import BACKLOG, Listener, descriptors
 from .memory import Memory
 from .own_keys import OwnKeys
 from .renumbering import Renumbering
+from .robot_ids import RobotIds
 from .robots import RobotCalls, StreamChanges
 from .routes import Route, Routes
 from .stead import Stead
@@ -145,6 +146,7 @@ class Gateway:
         mesh.on_room(self._brake.release)
         self.directory = self._presence.directory
         """Who is online."""
+        self._robot_ids = RobotIds(settings.robots)
         stead = Stead(mesh, self._layout)
         self._delivery = Delivery(self.agents, self.directory, self._layout, stead)
         self._own_keys = OwnKeys(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
@@ -286,7 +288,7 @@ class Gateway:
     def _greet_waiting(self) -> None:
         """Give waiting connections ids of our blocks that no agent of any type has."""
         while self._waiting:
-            agent_id = self._leases.take_id(self._is_elsewhere, wanting=len(self._waiting))
+            agent_id = self._leases.take_id(self._is_not_for_headsets, wanting=len(self._waiting))
             if agent_id is None:
                 if self._leases.exhausted:
                     for connection in self._waiting:
@@ -312,6 +314,9 @@ class Gateway:
 
     def _is_elsewhere(self, agent_id: int) -> bool:
         return self.directory.is_elsewhere(agent_id, self.mesh.zid)
+
+    def _is_not_for_headsets(self, agent_id: int) -> bool:
+        return agent_id in self._robot_ids or self._is_elsewhere(agent_id)
 
     def _no_id(self, connection: Connection) -> None:
         """There was no id for a connection in time. It cannot be told: agents give up when anything comes before their
@@ -537,10 +542,28 @@ class Gateway:
         if self.agents.find(*connection.key) is connection:
             self._regroup(connection)
             return
+        if event.agent_type != UNITY and not self._admit(connection):
+            return
         self._own_keys.declare(connection)
         self._enter_group(connection)
         self._renumbering.joined(connection)
         log.info("%s is online%s", connection, f" in group {event.group}" if event.group else "")
+
+    def _admit(self, connection: Connection) -> bool:
+        """Give an agent that is no headset an id that it may have; it is not told, and does not mind. False: there is
+        none, and its connection ends."""
+        before = connection.agent_id
+        agent_id = self._robot_ids.choose(before, lambda each: each in self.agents.ids or self._is_elsewhere(each))
+        if agent_id is None:
+            self._drops["robot_not_allowed"] += 1
+            connection.close(self._robot_ids.problem)
+            return False
+        if agent_id != before:
+            self._id_changes(connection)
+            self.agents.renumber(connection, agent_id)
+            self.agents.forget_former((connection.peer.agent_type, before), connection)
+            self._leases.give_back(before)
+        return True
 
     def _enter_group(self, connection: Connection) -> None:
         """Let others see an agent in the group that it has told."""

@@ -80,7 +80,7 @@ class Site:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         common = ("-e", self.endpoint, "--settings", str(settings))
         self.router = Router(listen=[self.endpoint])
-        self.gateway = Program("gateway", "--port", "0", *common)
+        self.gateway = Program("gateway", "--port", "0", "--robots", "any", *common)
         self.robot = Program("agent", "--id", str(ROBOT), *common, env={"ROS_DOMAIN_ID": str(domain)})
 
     @property

@@ -35,7 +35,7 @@ async def start_gateway(router: str) -> AsyncIterator[StartGateway]:
         async def start(endpoint: str = router, traffic: Sequence[TrafficRule] = (), **settings: object) -> Gateway:
             opening = Mesh.open(MeshSettings(connect=[endpoint]), traffic=traffic)
             mesh = await stack.enter_async_context(await opening)
-            gateway = Gateway(mesh, changed(GatewaySettings(port=0), **settings))
+            gateway = Gateway(mesh, changed(GatewaySettings(port=0, robots="any"), **settings))
             stack.push_async_callback(gateway.close)
             await gateway.start()
             return gateway

@@ -81,7 +81,7 @@ class Sites:
 
     async def gateway(self, site: str, zid: str = "", **settings: object) -> Gateway:
         mesh = await self._stack.enter_async_context(await Mesh.open(self.settings(site, zid)))
-        gateway = Gateway(mesh, changed(GatewaySettings(port=0), **settings))
+        gateway = Gateway(mesh, changed(GatewaySettings(port=0, robots="any"), **settings))
         self._stack.push_async_callback(gateway.close)
         await gateway.start()
         return gateway

@@ -332,3 +332,34 @@ async def test_a_registration_in_two_frames_is_refused(start_gateway: StartGatew
         assert "one frame, not two" in refused.reason
         headset.writer.write(registration(headset, [robot.id], node))
         assert (await robot.message())[0].message_manager == AddNode.manager
+
+
+async def test_robots_come_over_tcp_only_under_ids_set_aside(
+    router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """By default no TCP agent becomes a robot, so none takes the id of one that is away; where ids are set aside,
+    robots get those and headsets others."""
+    closed, opened = await start_gateway(robots=[]), await start_gateway(robots=[1, 9])
+    async with socket(closed) as thief:
+        thief.configure(agent_type=ROS)
+        thief.writer.write(
+            encode_frame(0, message=encode_message(Metadata(message_manager="Greeting").encode(), b"x"))
+        )
+        with pytest.raises(ConnectionError):
+            await thief.message()
+        assert closed.drops["robot_not_allowed"] == 1
+    async with macs_zenoh.join("ros", id=1, connect=[router]), socket(opened) as first, socket(opened) as second:
+        await until(lambda: (ROS, 1) in opened.directory)
+        first.configure(agent_type=ROS)
+        await until(lambda: opened.agents.find(ROS, 9))
+        headset = await connect(opened)
+        await headset.send(b"x", to=ROS, ids=[9], manager="Greeting")
+        node = await headset.advertise("/talk", "std_msgs/String", agents=[9])
+        assert (await first.message())[0].message_manager == AddNode.manager
+        await node.publish(TEXT)
+        assert (await first.message())[1] == TEXT
+        second.configure(agent_type=ROS)
+        with pytest.raises(ConnectionError):
+            await second.message()
+    await until(lambda: (ROS, 9) not in opened.directory)
+    assert headset.id not in (1, 9)
