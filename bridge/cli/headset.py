@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="DIR",
-        help="find .msg and .srv files here too (a package's folder or a workspace); may be repeated",
+        help="find .msg, .srv and .action files here too (a package's folder or a workspace); may be repeated",
     )
     subparsers = parser.add_subparsers(dest="headset_verb", metavar="VERB", required=True, title="verbs")
     verbs.add_verbs(subparsers)

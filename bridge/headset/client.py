@@ -23,7 +23,7 @@ import asyncio
 import contextlib
 import itertools
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -219,6 +219,23 @@ class Headset:
             return decode_data(OnlineReply, await asyncio.wait_for(answer, timeout_s), ANSWER_BYTES)
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"router {self.target}", timeout_s) from error
+        finally:
+            del self._open[request_id]
+
+    async def ask_gateway(self, manager: str, data: Mapping[str, object], *, timeout_s: float = 5.0) -> bytes:
+        """Ask the gateway something that a manager answers which somebody added there; its answer's data.
+
+        Raises CallTimeout, also when there is no such manager or it refuses, which the gateway's log says.
+        """
+        request_id = self._next_request
+        self._next_request = (request_id + 1) % REQUEST_IDS
+        answer = asyncio.get_running_loop().create_future()
+        self._open[request_id] = answer
+        try:
+            await self.send_frame(frames.management(self.id, request_id, manager, data))
+            return await asyncio.wait_for(answer, timeout_s)
+        except asyncio.TimeoutError as error:
+            raise CallTimeout(f"{manager} of gateway {self.target}", timeout_s) from error
         finally:
             del self._open[request_id]
 

@@ -8,7 +8,7 @@ gateway's users want exactly the bytes that a real headset sends, so they are sp
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import msgspec
@@ -82,6 +82,13 @@ def online_request(agent_id: int, request_id: int) -> bytes:
     """Who is online? The answer carries the same request id."""
     management = {"messageManager": OnlineRequest.manager, "agentType": UNITY, "agentId": agent_id}
     return _management_frame(management, encode_message(_metadata(agent_id, request_id=request_id)))
+
+
+def management(agent_id: int, request_id: int, manager: str, data: Mapping[str, object]) -> bytes:
+    """Management data of a manager that somebody added to the gateway (docs/managers.md)."""
+    return _management_frame(
+        {**data, "messageManager": manager}, encode_message(_metadata(agent_id, request_id=request_id))
+    )
 
 
 def registration(agent_id: int, node: NodeSpec, agents: Collection[int], groups: Collection[int]) -> bytes:

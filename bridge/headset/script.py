@@ -11,6 +11,7 @@ import argparse
 import asyncio
 import base64
 import contextlib
+import json
 import logging
 import shlex
 import sys
@@ -24,10 +25,11 @@ from typing import Any, NamedTuple
 from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError, WireError
 from macs_zenoh.keyexpr import type_name
 
+from .actions import ABORTED, CANCELED, SUCCEEDED, Goal
 from .client import Headset
 from .hints import Role, hints
 from .nodes import Incoming, Node, Service, ServiceRequest, Subscription
-from .typed import Types, request_of, response_of
+from .typed import Types, part_of_action, request_of, response_of
 from .verbs import MAX_BYTES, agent_type, json_object, script_parser
 
 log = logging.getLogger("macs.headset")
@@ -124,6 +126,10 @@ class Session:
             self.types.serialize(request_of(args.type), json_object(args.json))
         elif verb == "serve":
             self.types.serialize(response_of(args.type), json_object(args.json))
+        elif verb == "goal":
+            self.types.serialize(part_of_action(args.type, "Goal"), json_object(args.json))
+        elif verb == "ask":
+            json_object(args.json)
         elif verb == "send":
             _check_receivers(args)
 
@@ -136,6 +142,8 @@ class Session:
             "pub": self._pub,
             "call": self._call,
             "serve": self._serve,
+            "goal": self._goal,
+            "ask": self._ask,
             "send": self._send,
             "listen": self._listen,
         }
@@ -306,6 +314,56 @@ class Session:
             )
 
         return Job(work(), endless=not (args.count or args.timeout))
+
+    async def _goal(self, args: argparse.Namespace) -> Job:
+        goal_cdr = self.types.serialize(part_of_action(args.type, "Goal"), json_object(args.json))
+        agent = args.agent or await self._only_robot()
+        client = await self.headset.action(args.topic, args.type, agents=[agent])
+        line = {"action": args.topic, "from": agent}
+
+        async def steps(goal: Goal) -> None:
+            feedback = part_of_action(args.type, "Feedback")
+            async for cdr in goal:
+                self._emit({**line, "feedback": self.types.deserialize(feedback, cdr, max_bytes=MAX_BYTES)})
+
+        async def work() -> int:
+            if agent not in (await self.headset.online()).ros_agent_ids:
+                raise Unreachable(f"robot {agent}", "it is not online")
+            began = time.monotonic()
+            goal = await client.send_goal(agent, goal_cdr)
+            try:
+                await asyncio.wait_for(steps(goal), args.timeout)
+            except asyncio.TimeoutError:
+                await goal.cancel()
+            except asyncio.CancelledError:
+                with contextlib.suppress(MacsError):  # nobody looks after it any more
+                    await asyncio.shield(goal.cancel(timeout_s=1.0))
+                raise
+            status, cdr = await goal.result(timeout_s=5.0)
+            took_ms = round((time.monotonic() - began) * 1000, 2)
+            result = self.types.deserialize(part_of_action(args.type, "Result"), cdr, max_bytes=MAX_BYTES)
+            self._emit({**line, "status": GOAL_STATUS.get(status, str(status)), "result": result, "ms": took_ms})
+            return 0 if status == SUCCEEDED else 1
+
+        return Job(work())
+
+    async def _ask(self, args: argparse.Namespace) -> Job:
+        data = json_object(args.json)
+
+        async def work() -> int:
+            if args.agent is None:
+                answer = await self.headset.ask_gateway(args.manager, data, timeout_s=args.timeout)
+            else:
+                if args.agent not in (await self.headset.online()).ros_agent_ids:
+                    raise Unreachable(f"robot {args.agent}", "it is not online")
+                encoded = json.dumps(data).encode()
+                answer = await self.headset.ask(args.agent, args.manager, encoded, timeout_s=args.timeout)
+            shown = _json_or_text(answer)
+            self._emit({"manager": args.manager, "from": args.agent or "gateway", "answer": shown})
+            refused = isinstance(shown, dict) and (shown.get("done") is False or "refused" in shown)
+            return 1 if refused else 0
+
+        return Job(work())
 
     async def _send(self, args: argparse.Namespace) -> Job:
         async def work() -> int:
@@ -624,6 +682,16 @@ def _check_receivers(args: argparse.Namespace) -> None:
         raise UsageError("--to all goes to everybody: leave out --ids and --groups, or say --to ros or --to unity")
     if args.to != "all" and not named:
         raise UsageError(f"to which agents of type {args.to}? Give --ids or --groups (or --to all)")
+
+
+GOAL_STATUS = {SUCCEEDED: "succeeded", CANCELED: "canceled", ABORTED: "aborted"}
+
+
+def _json_or_text(data: bytes) -> Any:
+    try:
+        return json.loads(data)
+    except ValueError:
+        return data.decode(errors="replace")
 
 
 def _where(node: Subscription | Service) -> str:

@@ -9,8 +9,8 @@ the definition's defaults. Beyond plain JSON:
 * numbers that JSON lacks are the strings ``"NaN"``, ``"Infinity"`` and ``"-Infinity"``
 * ``"now"`` stands for the present time where a ``builtin_interfaces/Time`` is wanted
 
-Types that rosbags does not bring are read from ``.msg`` and ``.srv`` files: in the given folders, then in the
-installed ROS (``AMENT_PREFIX_PATH``, and this Python's own prefix).
+Types that rosbags does not bring are read from ``.msg``, ``.srv`` and ``.action`` files: in the given folders, then in
+the installed ROS (``AMENT_PREFIX_PATH``, and this Python's own prefix).
 """
 
 from __future__ import annotations
@@ -94,6 +94,16 @@ class BadCdr(WireError):
         self.problem = problem
 
 
+PARTS = {"srv": ("Request", "Response"), "action": ("Goal", "Result", "Feedback")}
+"""What the definitions of services and actions consist of, in their order."""
+
+
+def part_of_action(action: str, part: str) -> str:
+    """The type of an action's Goal, Result or Feedback: ``demo_msgs/Turn`` → ``demo_msgs/action/Turn_Goal``."""
+    package, name = _package_and_name(action)
+    return f"{package}/action/{name}_{part}"
+
+
 def request_of(service: str) -> str:
     """The type of a service's request: ``std_srvs/SetBool`` → ``std_srvs/srv/SetBool_Request``."""
     package, name = _package_and_name(service)
@@ -110,7 +120,10 @@ class Types:
     """A store of message definitions. Finding and compiling a type is done once; making a store takes 60 ms."""
 
     def __init__(self, definitions: Sequence[str | Path] = ()) -> None:
-        """``definitions``: folders to search for ``.msg`` and ``.srv`` files. Raises MissingRosbags, UnknownType."""
+        """``definitions``: folders to search for ``.msg``, ``.srv`` and ``.action`` files.
+
+        Raises MissingRosbags, UnknownType.
+        """
         try:
             self._typesys: Any = importlib.import_module("rosbags.typesys")
             self._serde_error: Any = importlib.import_module("rosbags.serde.errors").SerdeError
@@ -183,12 +196,12 @@ class Types:
 
     def _known(self, type_name: str) -> str:
         """The type's name in the store, its definition and those that it needs loaded."""
-        package, short, is_half = _parse(type_name)
+        package, short, part_of = _parse(type_name)
         name = f"{package}/msg/{short}"
         if name in self._store.fielddefs:
             return name
-        if is_half:
-            self._load_service(package, short.rpartition("_")[0])
+        if part_of:
+            self._load_parts(package, part_of, short.rpartition("_")[0])
         else:
             self._load_message(package, short)
         if name not in self._store.fielddefs:
@@ -201,21 +214,22 @@ class Types:
             raise UnknownType(f"{package}/{name}")
         self._register(f"{package}/msg/{name}", path.read_text(encoding="utf-8"))
 
-    def _load_service(self, package: str, name: str) -> None:
-        path = self._find(package, "srv", name)
+    def _load_parts(self, package: str, kind: str, name: str) -> None:
+        """The messages that a service or an action consists of."""
+        path = self._find(package, kind, name)
         text = path.read_text(encoding="utf-8") if path else _BUILT_IN_SERVICES.get(f"{package}/{name}")
         if text is None:
             raise UnknownType(f"{package}/{name}")
-        halves = [[]]  # type: list[list[str]]
+        parts = [[]]  # type: list[list[str]]
         for line in text.splitlines():
             if line.strip() == "---":
-                halves.append([])
+                parts.append([])
             else:
-                halves[-1].append(line)
-        if len(halves) != 2:
-            raise UnknownType(f"{package}/{name}", "its definition is no service")
-        for half, lines in zip(("Request", "Response"), halves, strict=True):
-            self._register(f"{package}/msg/{name}_{half}", "\n".join(lines))
+                parts[-1].append(line)
+        if len(parts) != len(PARTS[kind]):
+            raise UnknownType(f"{package}/{name}", f"its definition is no {'service' if kind == 'srv' else kind}")
+        for part, lines in zip(PARTS[kind], parts, strict=True):
+            self._register(f"{package}/msg/{name}_{part}", "\n".join(lines))
 
     def _register(self, name: str, text: str) -> None:
         try:
@@ -379,23 +393,21 @@ def _places(folder: Path, package: str, kind: str) -> list[Path]:
     return [*inside, folder]
 
 
-def _parse(type_name: str) -> tuple[str, str, bool]:
-    """Package, name, and whether it is half of a service. Raises UnknownType."""
-    parts = type_name.split("/")
-    if len(parts) == MESSAGE_TYPE_PARTS and parts[1] in ("msg", "srv"):
-        is_half = parts[1] == "srv" and parts[2].endswith(("_Request", "_Response"))
-        if parts[1] == "srv" and not is_half:
-            raise UnknownType(type_name, "a service is no message")
+def _parse(type_name: str) -> tuple[str, str, str]:
+    """Package, name, and of what it is a part: ``srv``, ``action`` or nothing. Raises UnknownType."""
+    parts, part_of = type_name.split("/"), ""
+    if len(parts) == MESSAGE_TYPE_PARTS and parts[1] in ("msg", *PARTS):
+        part_of = parts[1] if parts[1] in PARTS else ""
+        if part_of and not parts[2].endswith(tuple(f"_{part}" for part in PARTS[part_of])):
+            raise UnknownType(type_name, f"{'a service' if part_of == 'srv' else 'an action'} is no message")
         parts = [parts[0], parts[2]]
-    else:
-        is_half = False
     if len(parts) != 2 or not all(part.replace("_", "").isalnum() and part.isascii() for part in parts):
         raise UnknownType(type_name, "write it as pkg/Name")
-    return parts[0], parts[1], is_half
+    return parts[0], parts[1], part_of
 
 
 def _package_and_name(service: str) -> tuple[str, str]:
-    package, name, _ = _parse(service.replace("/srv/", "/"))
+    package, name, _ = _parse(service.replace("/srv/", "/").replace("/action/", "/"))
     return package, name
 
 

@@ -50,6 +50,8 @@ def add_verbs(verbs: Any) -> None:
     _add_pub(verbs)
     _add_call(verbs)
     _add_serve(verbs)
+    _add_goal(verbs)
+    _add_ask(verbs)
     _add_send(verbs)
     _add_listen(verbs)
 
@@ -179,6 +181,44 @@ def _add_serve(verbs: Any) -> None:
     serve.add_argument("json", metavar="JSON_RESPONSE", nargs="?", default="{}", help="the response (default: {})")
     _add_robots(serve)
     _add_end(serve)
+
+
+def _add_goal(verbs: Any) -> None:
+    goal = _verb(
+        verbs,
+        "goal",
+        "give a goal to an action that runs on a robot",
+        'Prints {"action": "/turn", "from": 1, "feedback": {...}} for each step, and in the end\n'
+        '{"action": "/turn", "from": 1, "status": "succeeded", "result": {...}, "ms": 2031.5}; exit code 1 for\n'
+        "another status. Ctrl-C cancels the goal. Where ROS is not installed --types names the folder of the type.\n\n"
+        "example:\n"
+        "  macs headset 127.0.0.1:7000 --types demo_msgs goal /turn demo_msgs/Turn '{\"angle\": 90}' --agent 1",
+    )
+    _add_topic(goal, "ACTION", "action")
+    goal.add_argument("json", metavar="JSON", nargs="?", default="{}", help="the goal (default: {})")
+    goal.add_argument("--agent", type=_agent_id, metavar="ID", help="which robot (default: the only one online)")
+    goal.add_argument("--timeout", type=_positive_number, metavar="S", help="cancel it after S seconds")
+
+
+def _add_ask(verbs: Any) -> None:
+    ask = _verb(
+        verbs,
+        "ask",
+        "ask a robot or the gateway something by the name of its manager",
+        "Robots answer RobotStatus, RobotControl and FunctionalityGetter (docs/robot.md) and their own managers,\n"
+        'a gateway its own (docs/managers.md). Prints {"manager": "RobotStatus", "from": 7, "answer": {...}};\n'
+        "exit code 1 when there is no answer, or one that says that it was refused or not done.\n\n"
+        "examples:\n"
+        "  macs headset 127.0.0.1:7000 ask RobotStatus --agent 7\n"
+        '  macs headset 127.0.0.1:7000 ask RobotControl \'{"action": "take", "topic": "/cmd_vel"}\' --agent 7\n'
+        "  macs headset 127.0.0.1:7000 ask ClockComparer '{\"sentAtS\": 1760000000.25}'",
+    )
+    ask.add_argument("manager", metavar="MANAGER", help="as RobotStatus")
+    ask.add_argument("json", metavar="JSON", nargs="?", default="{}", help="its data (default: {})")
+    ask.add_argument("--agent", type=_agent_id, metavar="ID", help="this robot (default: the gateway)")
+    ask.add_argument(
+        "--timeout", type=_positive_number, default=5.0, metavar="S", help="wait for the answer (default: 5)"
+    )
 
 
 def _add_send(verbs: Any) -> None:

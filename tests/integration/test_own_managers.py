@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import re
+import shlex
 import sys
 import time
 from collections.abc import AsyncIterator
@@ -27,7 +28,7 @@ from macs_zenoh.mesh import Mesh
 from macs_zenoh.messages import Metadata, decode_data, encode_data
 from macs_zenoh.wire import encode_frame, encode_message
 from tests.integration.test_gateway import Socket, socket
-from tests.programs import ROOT, Program, free_port
+from tests.programs import ROOT, Program, ended, free_port, macs
 
 EXAMPLES = ROOT / "examples"
 PAGE = (ROOT / "docs" / "managers.md").read_text(encoding="utf-8")
@@ -100,6 +101,26 @@ async def test_the_worked_example() -> None:
         assert (await ask(agent, '{"message_manager": "ClockComparer", "sent_at_s": 2}'))["sentAtS"] == 2
         for said in ("ClockComparer: -1.0 is not a time", "Expected `float`, got `str`"):
             assert any(said in line for line in program.log), program.log
+
+
+async def test_the_worked_example_from_the_command_line() -> None:
+    """The page's command prints the answer; what is refused or has no manager is exit code 1, and 2 what is no JSON."""
+    settings = str(EXAMPLES / "macs_clock" / "macs.toml")
+    (line,) = re.findall(r"^macs headset 127\.0\.0\.1:7000 (ask .*)$", PAGE, re.MULTILINE)
+    async with gateway_process("--settings", settings, env={"PYTHONPATH": str(EXAMPLES)}) as program:
+        where = f"127.0.0.1:{program.port}"
+        said = await macs("headset", where, *shlex.split(line))
+        assert (said["manager"], said["from"], said["answer"]["sentAtS"]) == (
+            "ClockComparer",
+            "gateway",
+            1760000000.25,
+        )
+        for words in (("ClockComparer", '{"sentAtS": -1}'), ("NobodysManager",)):
+            code, out, errors = await ended("headset", where, "ask", *words, "--timeout", "0.5")
+            assert (code, out) == (1, "")
+            assert f"{words[0]} of gateway {where} cannot be reached: no answer within 0.5 s" in errors
+        code, out, errors = await ended("headset", where, "ask", "ClockComparer", "{")
+        assert (code, out) == (2, "")
 
 
 async def test_an_installed_package_offers_its_manager(tmp_path: Path) -> None:

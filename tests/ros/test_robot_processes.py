@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import asyncio
+import json
 import signal
 import time
 from collections.abc import AsyncIterator
@@ -23,7 +24,7 @@ from std_srvs.srv import SetBool, Trigger
 from bridge.headset.actions import SUCCEEDED
 from bridge.headset.client import Headset
 from macs_zenoh.errors import Refused, Unreachable
-from tests.programs import Program, free_port
+from tests.programs import ROOT, Program, ended, free_port, macs
 from tests.ros.ros_peer import Peer, until
 
 SET = "std_srvs/SetBool"
@@ -165,7 +166,23 @@ async def test_an_action_over_the_wire(site: Site, peer: Peer, count_action: Any
     status, data = await again.result(10)
     assert status == SUCCEEDED
     assert deserialize_message(data, count_action.Result).text == "done"
+    where = site.headset.target
+    types = str(ROOT / "tests" / "ros" / "macs_test_msgs")
+    goal_of = ("headset", where, "--types", types, "goal", "/count", "macs_test_msgs/Count")
+    code, out, log = await ended(*goal_of, '{"to": 2}', "--agent", "1")
+    *steps, end = [json.loads(line) for line in out.splitlines()]
+    assert (code, [step["feedback"]["at"] for step in steps]) == (0, [0, 1]), log
+    assert (end["status"], end["result"]) == ("succeeded", {"reached": 2, "text": "done"})
+    code, out, log = await ended(*goal_of, '{"too": 2}', "--agent", "1")
+    assert (code, out) == (2, "")
+    assert "no such field (there is: to, step_s)" in log
     await peer.session.run(server.destroy)
+
+    status = await macs("headset", where, "ask", "RobotStatus", "--agent", "1")
+    assert (status["from"], status["answer"]["stopped"]) == (1, False)
+    taking = ("ask", "RobotControl", '{"action": "take", "topic": "/nothing"}', "--agent", "1")
+    code, out, log = await ended("headset", where, *taking)
+    assert (code, json.loads(out)["answer"]["done"]) == (1, False), log
 
 
 async def test_a_robot_that_restarts_streams_on(site: Site, peer: Peer, domain: int) -> None:
