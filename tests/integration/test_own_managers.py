@@ -104,7 +104,7 @@ async def test_the_worked_example() -> None:
 
 
 async def test_the_worked_example_from_the_command_line() -> None:
-    """The page's command prints the answer; what is refused or has no manager is exit code 1, and 2 what is no JSON."""
+    """The page's command prints the answer; what is refused or has no manager is exit code 1, no JSON is 2."""
     settings = str(EXAMPLES / "macs_clock" / "macs.toml")
     (line,) = re.findall(r"^macs headset 127\.0\.0\.1:7000 (ask .*)$", PAGE, re.MULTILINE)
     async with gateway_process("--settings", settings, env={"PYTHONPATH": str(EXAMPLES)}) as program:
