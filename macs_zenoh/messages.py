@@ -216,7 +216,7 @@ class AddNode(Management, frozen=True):
     node_name: NodeName
     tos_name: Name
     data_exchange_type: Name
-    buffer_size: Annotated[int, Meta(ge=0)] = 10
+    buffer_size: Annotated[int, Meta(ge=0, le=0x7FFFFFFF)] = 10
     drop_new: bool = False
     is_latched: bool = False
     unity_cdr: bool | UnsetType = UNSET
