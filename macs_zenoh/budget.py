@@ -62,8 +62,10 @@ class Budget:
 
 
 class Toll:
-    """Slows whoever asks for more work than ``per_s``: a second's worth is free at once, beyond that each piece is
-    paid for with time."""
+    """Slows whoever asks for more work than ``per_s``: a quarter of a second's worth is free at once, beyond that each
+    piece is paid for with time."""
+
+    FREE_S = 0.25
 
     LONGEST_S = 0.25
     """An existing headset freezes when nobody reads from it for long."""
@@ -74,7 +76,7 @@ class Toll:
 
     def pay(self, now: float) -> float:
         """A piece of work is done for it: for how many seconds nothing more should be taken from it."""
-        self._paid_until = max(now - 1.0, self._paid_until) + self._each_s
+        self._paid_until = max(now - self.FREE_S, self._paid_until) + self._each_s
         return min(self.LONGEST_S, max(0.0, self._paid_until - now))
 
 

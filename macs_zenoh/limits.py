@@ -51,7 +51,7 @@ UNFINISHED_FREE_BYTES = 64 << 10
 """So much of a frame that has begun is not counted."""
 
 REQUESTS_PER_S = 1000
-"""Management messages of one TCP agent, a second's worth at once; one that sends more is read from more slowly."""
+"""Management messages of one TCP agent, 250 at once; one that sends more is read from more slowly."""
 
 NODES_EACH = 1024
 """Interface nodes that one TCP agent may have registered; recorded programs have tens."""
