@@ -117,7 +117,6 @@ async def _settle(operator: Operator, robot: int, args: argparse.Namespace) -> O
     deadline = loop.time() + args.timeout
     wanted, patience_s, outcome, unserved = not args.release, FIRST_S, Outcome(robot, False), False
     while (left_s := deadline - loop.time()) > 0:
-        unserved = False
         try:
             answer = await operator.ask(
                 robot, "stop", b"true" if wanted else b"false", timeout_s=min(patience_s, left_s), urgent=True
@@ -126,7 +125,8 @@ async def _settle(operator: Operator, robot: int, args: argparse.Namespace) -> O
         except Refused as refusal:
             return Outcome(robot, False, problem=refusal.reason)
         except CallTimeout:
-            outcome = Outcome(robot, False, problem=f"no answer within {args.timeout:g} s")
+            if not unserved:  # the last attempt may be cut short
+                outcome = Outcome(robot, False, problem=f"no answer within {args.timeout:g} s")
             patience_s *= 2
             continue
         except Unreachable as error:
@@ -136,6 +136,7 @@ async def _settle(operator: Operator, robot: int, args: argparse.Namespace) -> O
             if status.stopped is wanted:
                 outcome = Outcome(robot, True, status.stopped, status.stop.by)
                 return await _look_again(operator, outcome, status.stop.times, args.timeout) if wanted else outcome
+            unserved = False
             outcome = Outcome(robot, False, status.stopped, status.stop.by, "it has not done what it was told")
         await asyncio.sleep(RETRY_S)
     return replace(outcome, problem=await _why_unserved(operator, robot) or outcome.problem) if unserved else outcome

@@ -840,7 +840,7 @@ async def test_an_operator_who_may_not_stop_hears_which_right_is_missing(tmp_pat
         settings = ("--settings", str(site.directory / "anna" / "macs.toml"))
         while not (await macs("ls", "--json", *settings))[0]["status"]:
             await asyncio.sleep(0.02)
-        code, out, _ = await ended("stop", "--timeout", "1", *settings)
+        code, out, _ = await ended("stop", "--timeout", "3", *settings)
         assert (code, out.partition(";")[0]) == (
             1,
             "robot 7 is NOT stopped: access rules do not let operator/0 call its verb stop",
