@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from hashlib import blake2b
 from typing import NamedTuple
 
 from .keyexpr import PRESENCE, type_name
@@ -16,10 +17,16 @@ EPOCH = "."
 """Between a Zenoh id and an epoch. No Zenoh id has one."""
 
 
+def published(zid: str) -> str:
+    """What a Zenoh id is in our keys. Whoever knows the id itself could open a session with it while a router starts
+    again, and so keep out whose it is."""
+    return blake2b(zid.encode(), digest_size=16, person=b"macs session").hexdigest()
+
+
 class AgentInfo(NamedTuple):
     """One agent as the mesh sees it. ``type`` is the number; ``group`` 0 means none; ``zid`` is the Zenoh
-    session that declared it (the agent's own, or its gateway's), and ``epoch`` which of all that had the id in that
-    session it is: what belongs to one of them is not the next one's."""
+    session that declared it (the agent's own, or its gateway's), as it is `published`, and ``epoch`` which of all
+    that had the id in that session it is: what belongs to one of them is not the next one's."""
 
     type: int
     id: int

@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
-from macs_zenoh.directory import AgentInfo
+from macs_zenoh.directory import AgentInfo, published
 from macs_zenoh.keyexpr import LEASE, NAME, block_of, type_name
 from macs_zenoh.messages import UNITY
 
@@ -201,7 +201,8 @@ def _sessions(facts: Facts) -> Iterator[Finding]:
 
 
 def _session_name(zid: str, address: str, names: dict[str, str]) -> str:
-    return f"{names.get(zid) or zid[:8]} at {address.partition('/')[2] or '?'}"
+    name = names.get(zid) or names.get(published(zid)) or published(zid)[:8]
+    return f"{name} at {address.partition('/')[2] or '?'}"
 
 
 def _all_routers(facts: Facts) -> list[RouterInfo]:

@@ -17,7 +17,7 @@ from bridge.ros.interface import Registrant, full_name
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.topics import PublisherNode
 from macs_zenoh.errors import Refused
-from macs_zenoh.messages import NodeType
+from macs_zenoh.messages import AgentId, AgentType, NodeType
 
 
 class ControlRequest(Struct, frozen=True, rename="camel"):
@@ -26,8 +26,8 @@ class ControlRequest(Struct, frozen=True, rename="camel"):
     manager: ClassVar[str] = "RobotControl"
     action: Literal["take", "release", "give"]
     topic: str
-    to: int = 0
-    to_type: int = 2
+    to: AgentId = 0
+    to_type: AgentType = 2
 
 
 class ControlReply(Struct, frozen=True, rename="camel", omit_defaults=True):

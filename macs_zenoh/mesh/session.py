@@ -17,6 +17,7 @@ import zenoh
 
 from macs_zenoh import ping
 from macs_zenoh.config import MeshSettings, TrafficRule
+from macs_zenoh.directory import published
 from macs_zenoh.errors import (
     CallTimeout,
     ConfigError,
@@ -77,7 +78,10 @@ class Mesh:
         self.settings = settings
         self.drops: Counter[str] = Counter()
         self.shaper = Shaper(traffic, self.drops)
-        self.zid = str(session.zid())
+        own = str(session.zid())
+        chosen = any(override.lstrip().startswith("id:") for override in settings.overrides)
+        self.zid = own if chosen else published(own)
+        """As whom others know this session. One that was chosen is no secret."""
         self._session = session = watched(session)
         self._loop = asyncio.get_running_loop()
         end_on_panics(self._loop)

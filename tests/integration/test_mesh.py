@@ -6,7 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
-from macs_zenoh.config import MeshSettings
+import macs_zenoh
+from bridge.gateway.server import Gateway
+from bridge.headset.client import Headset
+from macs_zenoh.config import GatewaySettings, MeshSettings
+from macs_zenoh.keyexpr import PING
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.mesh.outgoing import Outgoing
 from tests.integration.conftest import until
@@ -105,3 +109,25 @@ async def test_a_sample_that_fails_costs_itself(router: str, caplog: pytest.LogC
         assert found == [b"0", b"1", b"2", b"4", b"6", b"7"]
         assert mesh.drops["failed_sample"] == 2
         assert sum("counted as failed_sample" in record.getMessage() for record in caplog.records) == 1
+
+
+async def test_a_zenoh_id_is_its_owners_secret(router: str) -> None:
+    """Nothing that a session declares as its own has its Zenoh id in it, with which somebody else could keep it out;
+    all of it has the same other one. An id that was chosen is as it was chosen."""
+    async with (
+        macs_zenoh.join("ros", id=7, group=3, connect=[router]) as agent,
+        await Mesh.open(MeshSettings(connect=[router])) as watcher,
+        await Mesh.open(MeshSettings(connect=[router], overrides=['id:"abc"'])) as chosen,
+    ):
+        gateway = Gateway(agent.mesh, GatewaySettings(port=0))
+        await gateway.start()
+        async with await Headset.connect("127.0.0.1", gateway.port):
+            own = str(agent.mesh._session.zid())
+            keys: list[str] = []
+            while len(keys) < 3:
+                keys = await watcher.tokens("macs/**")
+            assert not [key for key in keys if own in key]
+            assert all(agent.mesh.zid in key for key in keys)
+            assert await watcher.query(PING.of(zid=agent.mesh.zid), b"", timeout_s=5)
+        await gateway.close()
+        assert chosen.zid == "abc"

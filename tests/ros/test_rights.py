@@ -220,8 +220,9 @@ async def test_who_may_not_act_is_heard_nowhere(session: RosSession, peer: Peer)
         for action in ("take", "give"):
             with pytest.raises(Refused, match="unity/6"):
                 control(nodes, Registrant(2, STRANGER), ControlRequest(action, "/cmd_vel", to=STRANGER), 0)  # type: ignore[arg-type]
-        with pytest.raises(Refused, match="unity/6"):  # nor be given it
-            control(nodes, Registrant(2, OPERATOR), ControlRequest("give", "/cmd_vel", to=STRANGER), 0)
+        for to_type, named in ((2, "unity/6"), (0, "0/6"), (99, "99/6")):  # nor be given it
+            with pytest.raises(Refused, match=named):
+                control(nodes, Registrant(2, OPERATOR), ControlRequest("give", "/cmd_vel", STRANGER, to_type), 0)
 
         assert nodes.drops == {"not_allowed": 9, "call_refused": 3}
         told = [
