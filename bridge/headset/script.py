@@ -27,10 +27,10 @@ from macs_zenoh.keyexpr import type_name
 
 from .actions import ABORTED, CANCELED, SUCCEEDED, Goal
 from .client import Headset
-from .hints import Role, hints
+from .hints import Role, hints, offered_type
 from .nodes import Incoming, Node, Service, ServiceRequest, Subscription
 from .typed import Types, part_of_action, request_of, response_of
-from .verbs import MAX_BYTES, agent_type, json_object, script_parser
+from .verbs import MAX_BYTES, TYPE_IS_OPTIONAL, agent_type, json_object, script_parser
 
 log = logging.getLogger("macs.headset")
 
@@ -118,7 +118,9 @@ class Session:
     def prepare(self, args: argparse.Namespace) -> None:
         """Find out before connecting what is wrong with a verb's types and values. Raises UsageError."""
         verb = args.headset_verb
-        if verb == "sub" and not args.raw:
+        if verb in TYPE_IS_OPTIONAL and not _type_is_given(args):
+            json_object(getattr(args, "json", "{}"))
+        elif verb == "sub" and not args.raw:
             self.types.serialize(args.type, {})
         elif verb == "pub":
             self._message(args, 0)
@@ -135,6 +137,8 @@ class Session:
 
     async def start(self, args: argparse.Namespace) -> Job:
         """Do the quick part of a verb and return the rest. Raises UsageError, Unreachable."""
+        if args.headset_verb in TYPE_IS_OPTIONAL and not _type_is_given(args):
+            await self._find_type(args)
         self.prepare(args)
         starts: dict[str, Callable[[argparse.Namespace], Awaitable[Job]]] = {
             "online": self._online,
@@ -449,6 +453,15 @@ class Session:
             raise Unreachable("any robot", "none is online (name robots that come later with --agents)")
         return online
 
+    async def _find_type(self, args: argparse.Namespace) -> None:
+        """Of what a verb names without its type."""
+        json_object(getattr(args, "json", "{}"))
+        robots = [args.agent] if getattr(args, "agent", None) else getattr(args, "agents", [])
+        online = (await self.headset.online()).ros_agent_ids
+        asked = [robot for robot in robots or online if robot in online]
+        args.type = await offered_type(self.headset, asked, args.topic, args.headset_verb)
+        log.info("%s has type %s", args.topic, args.type)
+
     async def _only_robot(self) -> int:
         online = (await self.headset.online()).ros_agent_ids
         if not online:
@@ -718,3 +731,12 @@ def _shown_message(message: Incoming, *, full: bool) -> dict[str, Any]:
         return {**line, "text": message.data.decode()}
     except UnicodeDecodeError:
         return {**line, "base64": base64.b64encode(message.data).decode("ascii")}
+
+
+def _type_is_given(args: argparse.Namespace) -> bool:
+    """Whether a verb names a type. What stands in its place may be the JSON behind it."""
+    if args.type is not None and args.type.lstrip().startswith("{"):
+        args.json, args.type = args.type, None
+    if getattr(args, "json", "{}") is None:
+        raise UsageError(f"what to publish to {args.topic} is missing: a JSON object, as '{{\"data\": 1}}'")
+    return args.type is not None

@@ -107,10 +107,10 @@ def _add_sub(verbs: Any) -> None:
         "print a robot's topic, a line per message",
         'Prints {"topic": "/chatter", "from": 1, "message": {"data": "hello"}} for each message.\n\n'
         "examples:\n"
-        "  macs headset 127.0.0.1:7000 sub /chatter std_msgs/String\n"
+        "  macs headset 127.0.0.1:7000 sub /chatter\n"
         "  macs headset 127.0.0.1:7000 sub /camera sensor_msgs/CompressedImage --agents 1,2 --raw --count 10",
     )
-    _add_topic(sub, "TOPIC", "topic")
+    _add_topic(sub, "TOPIC", "topic", type_is_optional=True)
     _add_robots(sub)
     _add_end(sub)
     sub.add_argument("--raw", action="store_true", help="sizes only; needs no definition of the type")
@@ -135,8 +135,11 @@ def _add_pub(verbs: Any) -> None:
         '  macs headset 127.0.0.1:7000 pub /cmd_vel geometry_msgs/Twist \'{"linear": {"x": 0.5}}\' --rate 10\n'
         '  macs headset 127.0.0.1:7000 pub /talk std_msgs/String \'{"data": "$i"}\' --agents 1 --count 3',
     )
-    _add_topic(pub, "TOPIC", "topic")
-    pub.add_argument("json", metavar="JSON", help="the message")
+    pub.add_argument("topic", metavar="TOPIC", help="name of the topic, as /topic")
+    # one that may be left out before one that may not is taken for left out when an option comes first
+    message = "the type as pkg/Name (default: as robots offer it), and the message"
+    pub.add_argument("type", metavar="[TYPE] JSON", help=message)
+    pub.add_argument("json", nargs="?", help=argparse.SUPPRESS)
     _add_robots(pub)
     pub.add_argument("--rate", type=_positive_number, metavar="HZ", help="messages per second")
     pub.add_argument("--count", type=_positive, metavar="N", help="stop after N messages")
@@ -160,7 +163,7 @@ def _add_call(verbs: Any) -> None:
         "example:\n"
         "  macs headset 127.0.0.1:7000 call /set std_srvs/SetBool '{\"data\": true}' --agent 1",
     )
-    _add_topic(call, "SERVICE", "service")
+    _add_topic(call, "SERVICE", "service", type_is_optional=True)
     call.add_argument("json", metavar="JSON", nargs="?", default="{}", help="the request (default: {})")
     call.add_argument("--agent", type=_agent_id, metavar="ID", help="which robot (default: the only one online)")
     call.add_argument(
@@ -275,9 +278,16 @@ def _verb(verbs: Any, name: str, summary: str, text: str) -> argparse.ArgumentPa
     return parser
 
 
-def _add_topic(parser: argparse.ArgumentParser, metavar: str, what: str) -> None:
+TYPE_IS_OPTIONAL = frozenset({"sub", "pub", "call"})
+"""Verbs that find the type of a topic or service by themselves, as the robots offer it."""
+
+
+def _add_topic(parser: argparse.ArgumentParser, metavar: str, what: str, *, type_is_optional: bool = False) -> None:
     parser.add_argument("topic", metavar=metavar, help=f"name of the {what}, as /{what}")
-    parser.add_argument("type", metavar="TYPE", help="as pkg/Name")
+    if type_is_optional:
+        parser.add_argument("type", metavar="TYPE", nargs="?", help="as pkg/Name (default: as robots offer it)")
+    else:
+        parser.add_argument("type", metavar="TYPE", help="as pkg/Name")
 
 
 def _add_robots(parser: argparse.ArgumentParser) -> None:

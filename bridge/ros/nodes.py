@@ -72,6 +72,8 @@ class InterfaceNodes:
         self._nodes: dict[Work, InterfaceNode] = {}
         self._places: Places[InterfaceNode] = Places()
         self._loop = asyncio.get_running_loop()
+        self._left: dict[tuple[NodeKey, Registrant], float] = {}
+        """When somebody left a node, a moment ago."""
         self._removed: dict[str, float] = {}
         """When a node on this topic was removed last."""
         self._early = EarlyMessages()
@@ -269,6 +271,10 @@ class InterfaceNodes:
         node.receive(message)
 
     def _keep_early(self, key: NodeKey, message: Message) -> None:
+        if self._has_just_left(key, message):
+            self.drops["after_leaving"] += 1
+            self._tell_unanswered(message, "its sender took this node back")
+            return
         for lost in self._early.hold(key, message, time.monotonic()):
             reason = "more data before the registration than can be kept"
             self.drops.note("held_full", key.node_name[:80], reason)
@@ -402,7 +408,19 @@ class InterfaceNodes:
         if (lingering := self._lingering.pop((node.key, registrant), None)) is not None:
             lingering.cancel()
 
+    def _note_left(self, node: InterfaceNode, registrant: Registrant) -> None:
+        now = self._loop.time()
+        for gone in [gone for gone, at in self._left.items() if at < now - GONE_S]:
+            del self._left[gone]
+        for key in {node.key, *self._places.names_of(node, registrant)}:
+            self._left[key, registrant] = now
+
+    def _has_just_left(self, key: NodeKey, message: Message) -> bool:
+        """Whether the sender has taken a node back that its message was for: a removal is a call, and overtakes."""
+        return self._left.get((key, Registrant.of(message)), -math.inf) > self._loop.time() - GONE_S
+
     def _deregister(self, node: InterfaceNode, registrant: Registrant) -> None:
+        self._note_left(node, registrant)
         self._end_lingering(node, registrant)
         node.deregister(registrant)
         self._places.unbind(node, registrant)

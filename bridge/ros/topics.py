@@ -472,7 +472,7 @@ class PublisherNode(TopicNode):
             if self.control is not None:
                 self.control.release(agent)
             if self.deadman is not None and self.deadman.left(agent):
-                self._publish_stop(self.deadman.why)
+                self._publish_stop(self.deadman.why, logging.INFO)  # as it does every day
 
     def cut_off(self) -> None:
         with self.lock:
@@ -501,10 +501,10 @@ class PublisherNode(TopicNode):
             elif (deadline := self.deadman.deadline()) is not None:
                 self._watch = self.robot.alarms.at(deadline, self._watch_silence)
 
-    def _publish_stop(self, why: str) -> None:
+    def _publish_stop(self, why: str, level: int = logging.WARNING) -> None:
         if self._publisher is not None and self._publish(self._stop_cdr):
             self._stopped_at = time.monotonic()
-            log.warning("%s: %s; published the stop message", self.topic, why)
+            log.log(level, "%s: %s; published the stop message", self.topic, why)
 
     def status(self) -> dict[str, Any]:
         status = super().status()

@@ -447,3 +447,48 @@ async def test_who_drives_nothing_is_told_once(start: Start, robot: EchoRobot) -
     code, _, log = await script.end()
     assert (code, robot.asked) == (1, 1)
     assert log.count("robot 1 offers no subscriber to /cmdvel; did you mean /cmd_vel?") == 1
+
+
+# --- types that robots know ---
+
+KNOWN = Functionality(
+    {"/cmd_vel": "geometry_msgs/msg/Twist", "/talk": "std_msgs/msg/String"},
+    {"/chatter": "std_msgs/msg/String", "/talk": "std_msgs/msg/String"},
+    {"/set": "std_srvs/srv/SetBool"},
+)
+
+
+async def test_a_type_that_robots_offer_need_not_be_named(start: Start, robot: EchoRobot) -> None:
+    """`sub`, `pub` and `call` take the type of a topic or service from the robots; options may stand anywhere."""
+    robot.offers = KNOWN
+    subscriber = await start("sub", "/talk", "--count", "2", "--timeout", "20")
+    await robot.registered(NodeType.SUBSCRIBER, "nd__talk")
+    for words in (["/talk", '{"data": "a"}', "--settle", "0.2"], ["/talk", "--settle", "0.2", '{"data": "a"}']):
+        code, lines, log = await (await start("pub", *words)).end()
+        assert (code, lines) == (0, [{"topic": "/talk", "published": 1}]), log
+    code, lines, log = await subscriber.end()
+    assert (code, lines) == (0, [{"topic": "/talk", "from": 1, "message": {"data": "a"}}] * 2), log
+    for words in (["/set", '{"data": true}'], ["set", '{"data": true}', "--agent", "1"]):
+        code, lines, log = await (await start("call", *words)).end()
+        assert (code, lines[0]["response"]["success"]) == (0, True), log
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "reason"),
+    [
+        (["sub", "/chater"], 1, "no robot offers it; did you mean /chatter?"),
+        (["call", "/other"], 1, "service /other cannot be reached: no robot offers it"),
+        (["pub", "/talk"], 2, "the following arguments are required: [TYPE] JSON"),
+        (["pub", "/talk", "std_msgs/String"], 2, "what to publish to /talk is missing"),
+        (["pub", "/talk", "{"], 2, "is not JSON"),
+        (["pub", "/talk", '{"data": 1}'], 2, "a string was expected"),
+    ],
+)
+async def test_what_cannot_be_known_is_told(
+    start: Start, robot: EchoRobot, words: list[str], code: int, reason: str
+) -> None:
+    """A name that no robot offers, and a message that is none, are told before anything is registered."""
+    robot.offers = KNOWN
+    ended, _, log = await (await start(*words)).end()
+    assert (ended, reason in log) == (code, True), log
+    assert not robot.nodes

@@ -267,6 +267,32 @@ async def test_commands_for_nothing_are_counted_and_logged_once(
     ]
 
 
+@pytest.mark.parametrize("vanishes", [True, False])
+async def test_who_leaves_as_usual_leaves_no_warning(
+    nodes: InterfaceNodes, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, vanishes: bool
+) -> None:
+    """Commands that its own removal has overtaken are counted, and nobody is alarmed; a stranger's are told."""
+    monkeypatch.setattr(EarlyMessages, "HOLD_S", 0.02)
+    await nodes.add(adding("/cmd", node_type=2))
+    nodes.deliver(command("/cmd", String(data="go")))
+    if vanishes:
+        nodes.forget(Registrant(2, 5))
+    else:
+        nodes.remove(removing("/cmd", node_type=2))
+    caplog.clear()
+    for _ in range(3):
+        nodes.deliver(command("/cmd", String(data="late")))
+    await asyncio.sleep(0.1)
+    assert nodes.drops == {"after_leaving": 3}
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    nodes.deliver(command("/cmd", String(data="who?"))._replace(sender_id=6))
+    await until(lambda: nodes.drops["no_node"] == 1)
+    await nodes.add(adding("/cmd", node_type=2))  # and who comes back is heard
+    node = nodes.get(2, "nd__cmd")
+    assert node is not None
+    assert node.is_open
+
+
 async def test_too_many_early_commands_lose_the_oldest(nodes: InterfaceNodes, peer: Peer) -> None:
     """What waits for a registration is bounded; the newest commands win."""
     received = await peer.subscription(String, "/orders", QoSProfile(depth=50))

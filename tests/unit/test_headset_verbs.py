@@ -50,7 +50,7 @@ def test_lists_of_robots_and_groups() -> None:
         [],
         ["h:1"],
         ["h:1", "fly"],
-        ["h:1", "sub", "/a"],
+        ["h:1", "sub"],
         ["h:1", "sub", "/a", "b/C", "--agents", "0"],
         ["h:1", "sub", "/a", "b/C", "--agents", "65536"],
         ["h:1", "sub", "/a", "b/C", "--groups", "256"],
