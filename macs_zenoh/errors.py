@@ -16,6 +16,7 @@
     │   ├── TooManyDestinations
     │   └── OutOfRange
     ├── ConfigError               the configuration
+    ├── MissingExtra              this installation
     ├── Refused                   the other end answered, and said no
     │   └── HeldByAnother
     └── Unreachable               the world
@@ -134,6 +135,15 @@ class ConfigError(MacsError):
         super().__init__(f"{path}: {problem}")
         self.path = path
         self.problem = problem
+
+
+class MissingExtra(MacsError):
+    """An optional package is not installed here."""
+
+    def __init__(self, what: str, package: str, extra: str) -> None:
+        super().__init__(f"{what} needs {package}: pip install 'macs-zenoh[{extra}]'")
+        self.package = package
+        self.extra = extra
 
 
 class Refused(MacsError):

@@ -20,6 +20,7 @@ from typing import Protocol, cast
 from macs_zenoh.addresses import joined, of_peer
 from macs_zenoh.budget import Toll
 from macs_zenoh.existing import Asked, Verdict, to_headset, to_newer, to_robot
+from macs_zenoh.keyexpr import type_name
 from macs_zenoh.limits import REQUESTS_PER_S, UNFINISHED_FREE_BYTES
 from macs_zenoh.messages import ROS, AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
 from macs_zenoh.pace import Pace
@@ -169,8 +170,8 @@ class Connection(asyncio.BufferedProtocol):
         return (self.peer.agent_type, self.peer.agent_id)
 
     def __str__(self) -> str:
-        kind = {0: "agent", 1: "robot", 2: "headset"}.get(self.peer.agent_type, f"type {self.peer.agent_type}")
-        return f"{kind} {self.peer.agent_id} at {self.address}"
+        kind = type_name(self.peer.agent_type) if self.peer.agent_type else "agent"
+        return f"{kind}/{self.peer.agent_id} at {self.address}"
 
     # -- asyncio -------------------------------------------------------------------------------------------------
 

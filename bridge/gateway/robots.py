@@ -18,6 +18,7 @@ from msgspec import structs
 
 from macs_zenoh.directory import Change, Directory
 from macs_zenoh.errors import HeldByAnother, OutOfRange, Refused, Unreachable
+from macs_zenoh.keyexpr import type_name
 from macs_zenoh.limits import NODE_AGENTS
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.messages import ROS, AddNode, Metadata, NodeRefused, NodeType, RemoveNode, encode_data, node_name
@@ -332,7 +333,8 @@ class _What:
 
     def __str__(self) -> str:
         robot_id, node = self._task
-        return f"headset {node.registrant_agent_id}: {_describe(node)} on robot {robot_id}"
+        who = f"{type_name(node.registrant_agent_type)}/{node.registrant_agent_id}"
+        return f"{who}: {_describe(node)} on ros/{robot_id}"
 
 
 def _describe(node: AddNode | RemoveNode) -> str:

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.headset import definitions
-from macs_zenoh.errors import UsageError, WireError
+from macs_zenoh.errors import MissingExtra, UsageError, WireError
 
 MESSAGE_TYPE_PARTS = 3  # pkg, msg, Name
 
@@ -59,11 +59,11 @@ _SLACK_BYTES = 4 + 3
 _NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
-class MissingRosbags(UsageError):
+class MissingRosbags(MissingExtra):
     """The optional package for typed messages is not installed."""
 
     def __init__(self) -> None:
-        super().__init__("typed messages need the package 'rosbags': pip install 'macs-zenoh[headset]'")
+        super().__init__("reading and writing messages", "rosbags", "headset")
 
 
 class UnknownType(UsageError):

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bridge.security.plan import Plan, Router
-from macs_zenoh.errors import ConfigError, UsageError
+from macs_zenoh.errors import ConfigError, MissingExtra, UsageError
 
 try:
     from cryptography import x509
@@ -24,9 +24,7 @@ try:
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 except ImportError as error:
-    raise ConfigError(
-        "macs security", "making certificates needs cryptography: pip install 'macs-zenoh[security]'"
-    ) from error
+    raise MissingExtra("making certificates", "cryptography", "security") from error
 
 CA_DIRECTORY = "ca"
 CERTIFICATE, KEY, AUTHORITY = "cert.pem", "key.pem", "ca.pem"

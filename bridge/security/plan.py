@@ -31,7 +31,7 @@ from msgspec import Meta
 
 from macs_zenoh.addresses import joined
 from macs_zenoh.config import AgentId, AgentName, GatewaySettings, GroupId, MeshSettings, TrafficRule
-from macs_zenoh.errors import ConfigError
+from macs_zenoh.errors import ConfigError, MissingExtra
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=63)]
 """Also the name in the certificate and of a directory, so: letters, digits, dot, dash and underscore."""
@@ -270,7 +270,7 @@ def _yaml(text: str, source: str) -> Any:
     try:
         import yaml
     except ImportError:
-        raise ConfigError(source, "reading a plan needs PyYAML: pip install 'macs-zenoh[security]'") from None
+        raise MissingExtra("reading a plan", "PyYAML", "security") from None
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
         """YAML, in which one name twice in a mapping is a mistake, not a replacement."""

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import socket
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -365,3 +368,41 @@ sys.exit(2 if len(marks.read_text()) == 3 else 1)
     assert failed.value.code == 2
     assert child.starts == 3
     assert child.ready.is_set()
+
+
+@pytest.mark.parametrize(
+    ("argv", "missing", "extra"),
+    [
+        (["headset", "127.0.0.1", "sub", "/t", "std_msgs/String"], "rosbags", "headset"),
+        (["security", "generate", "plan.yaml", "--into", "somewhere"], "yaml", "security"),
+        (["security", "generate", "plan.yaml", "--into", "somewhere"], "cryptography", "security"),
+    ],
+)
+def test_a_missing_extra_is_exit_code_1(argv: list[str], missing: str, extra: str, tmp_path: Path) -> None:
+    """What is not installed is told once, with what to install, by whichever verb needs it."""
+    (tmp_path / "plan.yaml").write_text("{}")
+    code = (
+        "import sys; from importlib.abc import MetaPathFinder\n"
+        "class Hidden(MetaPathFinder):\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        f"        if name.partition('.')[0] == {missing!r}: raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Hidden())\n"
+        f"from bridge.cli import main; sys.exit(main({argv!r}))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1, ended.stderr
+    (line,) = ended.stderr.splitlines()
+    assert line.startswith(f"macs {argv[0]}: ")
+    assert line.count("macs ") == 1
+    assert f"pip install 'macs-zenoh[{extra}]'" in line
+
+
+def test_help_of_awareness_names_the_node_that_there_is() -> None:
+    """What its example configures is what the program makes."""
+    node = re.search(r"^NODE_NAME = \"(\w+)\"", Path(awareness_node()).read_text(encoding="utf-8"), re.MULTILINE)
+    assert node is not None
+    assert f"ros2 lifecycle set /{node[1]} configure" in (VERBS["awareness"].__doc__ or "")
+
+
+def awareness_node() -> str:
+    return str(Path(__file__).parents[2] / "bridge" / "awareness" / "node.py")
