@@ -289,7 +289,7 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     """A larger declared frame closes its connection before a byte of it is stored."""
     max_frames_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0
     """Frames of every kind from one connection; the rest is dropped and counted. 0: no limit."""
-    max_commands_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 5000.0
+    max_commands_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
     """Of these, commands to robots; as a robot's own limit, before they fill the way to it. Stops are not counted."""
     max_requests_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
     """And all else that goes to robots."""
@@ -436,7 +436,7 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Who may release a stop, whoever pressed it; ``who_stopped`` takes back its own, as long as it is online."""
     register_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
     """Who may register to publish, to call, to serve and to give goals. Others may register for topics only."""
-    max_commands_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 5000.0
+    max_commands_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
     """Of each agent, to all topics together; the rest is dropped and counted. 0: no limit, and a flood of one can hold
     up the commands of others."""
     max_requests_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 500.0
