@@ -180,13 +180,22 @@ class Guard:
         """Type and id of the robot, kept by the agent."""
         self.on_command: OnCommand | None = None
         self.on_dropped: OnDropped = lambda name, sender, why: None
-        self.stop_name = ""
+        self._stop_name, self._stop_bytes = "", b""
         self._urgent = Allowances(limits.commands_per_s)
         self._requests = Allowances(limits.requests_per_s)
         self._fresh = Fresh(limits.max_command_age_s)
         self._reader = Reader(layout, self._found_bad)
         self._bad = False
         self._lock = threading.Lock()
+
+    @property
+    def stop_name(self) -> str:
+        """Node name of the emergency stop; empty: there is none."""
+        return self._stop_name
+
+    @stop_name.setter
+    def stop_name(self, name: str) -> None:
+        self._stop_name, self._stop_bytes = name, name.encode()
 
     def admits(self, key: str, size: int, urgent: bool, now: float) -> bool:
         """Whether a sample may be looked at."""
@@ -214,7 +223,7 @@ class Guard:
     def rescue(self, key: str, payload: Buffer, now: float) -> None:
         """Of a sample that is not admitted: whoever floods may still stop the robot."""
         command, name = self.on_command, self.stop_name
-        if command is None or not name or name.encode() not in payload:
+        if command is None or not name or self._stop_bytes not in payload:
             return
         with self._lock:
             for message in self._read(key, payload):
