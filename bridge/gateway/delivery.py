@@ -144,7 +144,7 @@ class Delivery:
                 continue  # the last registrant has just left
             for frame, metadata in self._read(key, payload, stream.robot):
                 registered = stream.registrants if stream.carries(metadata) else NOBODY
-                fits = frame.carries(CDR, least_bytes(metadata))
+                fits, messages = frame.carries(CDR, least_bytes(metadata)), frame.messages
                 for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
                     connection = self._agents.find(*registrant)
                     if connection is None:
@@ -153,7 +153,7 @@ class Delivery:
                         if connection.existing and not fits:
                             self._send_fitting(connection, frame, metadata, topic_data(metadata), stream.node)
                         else:
-                            connection.send_stream(stream.node, frame.messages)
+                            connection.send_stream(stream.node, messages)
                     else:
                         self._unregistered(connection, frame, metadata)
         self.flush()
