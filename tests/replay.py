@@ -195,9 +195,9 @@ class Ids:
         self._ids: dict[tuple[int, int], int] = {}
 
     def learn(self, agent_type: int, recorded: int, ours: int) -> None:
-        """An agent has its id. A recorded id that is used again must be used again here."""
-        known = self._ids.setdefault((agent_type, recorded), ours)
-        assert known == ours, f"recorded id {recorded} was {known} and is {ours} now"
+        """An agent has its id. One that is used again in a recording need not be used again here, as long as there are
+        others that were never given out."""
+        self._ids[agent_type, recorded] = ours
 
     def of(self, agent_type: int, recorded: int) -> int:
         """Our id for a recorded one; 0 stays 0."""
