@@ -65,6 +65,8 @@ class Arrivals:
     BATCH = 512
     BATCH_BYTES = 128 << 10
     """Handled without a pause in which the loop does other things: it can be thousands of small frames."""
+    TURN_S = 0.008
+    """After so long the loop does other things."""
     PATIENCE_S = 0.1
     AT_ONCE_BYTES = 128 << 10
     """Larger ones take too long for a thread that reads from the link."""
@@ -232,17 +234,27 @@ class Arrivals:
 
     def _deliver_batch(self) -> None:
         self._waiting = False
-        queue = self._queue
-        arrived, room = [], self.BATCH_BYTES
+        queue, until = self._queue, time.monotonic() + self.TURN_S
+        while True:  # a few large samples cost next to nothing, and who sends them must feel soon where they wait
+            self._handle(self._next())
+            if not queue or time.monotonic() > until:
+                break
+        if queue and not self._waiting:
+            self._waiting = True
+            self._loop.call_soon(self._deliver)
+
+    def _next(self) -> list[tuple[Callable[[list[Any]], None], tuple[Any, ...]]]:
+        """The next samples, as many as are handled without a look at the time."""
+        queue, arrived, room = self._queue, [], self.BATCH_BYTES
         for _ in range(min(len(queue), self.BATCH)):
             item = queue.popleft()
             arrived.append(item)
             room -= len(item[1][1])
             if room <= 0:
                 break
-        if queue and not self._waiting:
-            self._waiting = True
-            self._loop.call_soon(self._deliver)
+        return arrived
+
+    def _handle(self, arrived: list[tuple[Callable[[list[Any]], None], tuple[Any, ...]]]) -> None:
         freed = sum(len(item[1]) for _, item in arrived if len(item[1]) > self.LARGE_BYTES)
         if freed:
             with self._large_lock:
