@@ -19,6 +19,8 @@ from bridge.headset.verbs import json_object
 from bridge.ros.fields import filled
 from macs_zenoh.errors import Refused, UsageError
 
+pytestmark = pytest.mark.timeout(600)  # the first of them compiles its messages, on a busy machine for minutes
+
 KINDS = Path(__file__).parent / "macs_kinds_msgs"
 NAME = "macs_kinds_msgs/Kinds"
 

@@ -28,6 +28,8 @@ from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
 from macs_zenoh.messages import Metadata, NodeType, node_name
 from macs_zenoh.reading import Message
 
+pytestmark = pytest.mark.timeout(600)  # the first of them compiles its messages, on a busy machine for minutes
+
 POINT = JointTrajectoryPoint(positions=[1.0, 2.0, 3.0])
 POINT.time_from_start.sec = 5
 
