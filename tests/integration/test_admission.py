@@ -73,7 +73,7 @@ async def test_a_burst_is_admitted() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     async with (
         Program("router", "-l", endpoint),
-        Program("gateway", "--port", "0", "-e", endpoint) as gateway,
+        Program("gateway", "--port", "0", "-e", endpoint, "--robots", "any") as gateway,
         crowd(gateway.port, 10, ROS) as robots,
     ):
         for _ in range(3):
