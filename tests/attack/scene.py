@@ -33,6 +33,7 @@ from bridge.headset.nodes import Publisher
 from bridge.ros.session import RosSession
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
+from macs_zenoh.limits import UNFINISHED_IN_ALL_BYTES, WAITING_IN_ALL_BYTES
 from macs_zenoh.messages import OPERATOR
 from tests.attack.judge import Memory, Report, Window
 from tests.attack.table import Attack
@@ -51,15 +52,19 @@ HOLDS_S = 0.15
 ON_THE_WAY_S = 0.05
 """Lamp and wheels are two topics: a command published before the lamp was may be heard so long after it. Such a one
 counts as the moment of the effect; one that is later was carried out in spite of the stop."""
-RECOVERY_S = 15.0
-"""By when everything must be as before."""
+RECOVERY_S = 60.0
+"""By when everything must be as before. What a headset sent before it left is in the network still, up to 4 MB in its
+own kernel, and is worked off at the pace that a gateway allows: so long it is online."""
 BEGIN_S = 60.0
 """By when an attacker has made its frames and begins."""
 
-MEMORY_LIMITS = {"gateway": 128 * MIB, "robot": 128 * MIB, "router": 256 * MIB}
-"""What one attacker may cost a program. The router is Zenoh's, and its queues are per link."""
-KEPT_BYTES = 48 * MIB
-"""What may be left of it afterwards: allocators give back late."""
+SLACK_BYTES = 64 * MIB
+"""A frame of 32 MiB is there twice in the moment in which it is whole."""
+MEMORY_LIMITS = {
+    "gateway": max(WAITING_IN_ALL_BYTES, UNFINISHED_IN_ALL_BYTES) + SLACK_BYTES,
+    "robot": 2 * SLACK_BYTES,
+}
+"""What an attack may cost our programs at most. The router is Zenoh's, and its queues are per link."""
 
 SETTINGS = f"""
 [[robot.rules]]
@@ -313,7 +318,9 @@ class Scene:
                 memory[name].peak = status_bytes(program.pid, "VmHWM")
                 memory[name].after = status_bytes(program.pid, "VmRSS")
         broken += [
-            f"the {name} keeps {m.kept / MIB:.0f} MiB" for name, m in memory.items() if m.kept > KEPT_BYTES and m.after
+            f"the {name} keeps {m.kept / MIB:.0f} MiB"
+            for name, m in memory.items()
+            if m.kept > SLACK_BYTES and name in MEMORY_LIMITS
         ]
         return Report(attack.name, attack.single, calm, benign, under, memory, MEMORY_LIMITS, broken)
 
