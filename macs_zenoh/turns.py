@@ -21,7 +21,6 @@ class Turns(Generic[K, V]):
         self._each = each
         self._total = total
         self._waiting: dict[Caller, dict[K, V]] = {}
-        self._full: set[Caller] = set()
         self._open: Counter[Caller] = Counter()
         self.open = 0
 
