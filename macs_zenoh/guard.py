@@ -183,6 +183,7 @@ class Guard:
         self._stop_name, self._stop_bytes = "", b""
         self._urgent = Allowances(limits.commands_per_s)
         self._requests = Allowances(limits.requests_per_s)
+        self._rescued = Allowances(limits.commands_per_s)
         self._fresh = Fresh(limits.max_command_age_s)
         self._reader = Reader(layout, self._found_bad)
         self._bad = False
@@ -221,9 +222,12 @@ class Guard:
         return True
 
     def rescue(self, key: str, payload: Buffer, now: float) -> None:
-        """Of a sample that is not admitted: whoever floods may still stop the robot."""
+        """Of a sample that is not admitted: whoever floods may still stop the robot. What names the stop and does not
+        stop is a flood as well, so that this has an allowance of its own."""
         command, name = self.on_command, self.stop_name
         if command is None or not name or self._stop_bytes not in payload:
+            return
+        if not self._rescued.take(sender_of(key), len(payload), now):
             return
         with self._lock:
             for message in self._read(key, payload):

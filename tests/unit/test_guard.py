@@ -169,6 +169,16 @@ def test_a_stop_passes_however_old_and_however_many(guard: Guard, taken: list[Me
     assert dropped == ["too_old", "flooded"]
 
 
+def test_who_names_the_stop_without_end_does_not_take_a_robots_time(guard: Guard, taken: list[Message]) -> None:
+    """What is looked at for a stop, of all that is not admitted, is as much as may be admitted; another's is apart."""
+    for number in range(1000):
+        guard.rescue(KEY, frame(STOP) * 10, number / 1000)
+    assert 10 <= len(taken) <= 2500
+    taken.clear()
+    guard.rescue(unicast_key(1, 7, 2, 301), frame(STOP), 1.0)
+    assert len(taken) == 1
+
+
 def test_requests_do_not_use_up_what_commands_may(guard: Guard) -> None:
     """Urgent samples have an allowance of their own."""
     admitted = list(itertools.takewhile(bool, (guard.admits(KEY, 300, False, 0.0) for _ in range(100))))
