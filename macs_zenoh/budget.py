@@ -84,31 +84,43 @@ Holder = TypeVar("Holder", bound=Hashable)
 
 
 class Unfinished(Generic[Holder]):
-    """Bytes of frames that have begun, by who sends them. Beyond ``total`` the one that began first has to go: frames
-    of those who mean well end soon. Up to ``free`` of each are not counted."""
+    """Bytes of frames that have begun, by who sends them. Beyond ``total`` one has to go: of the address that has most
+    the one that began first, for frames of those who mean well end soon, and nobody is to cost others theirs. Up to
+    ``free`` of each are not counted."""
 
     def __init__(self, free: int, total: int) -> None:
         self._free = free
         self._total = total
-        self._of: dict[Holder, int] = {}
+        self._of: dict[Holder, tuple[str, int]] = {}
+        self._at: Counter[str] = Counter()
         self.used = 0
 
     def __contains__(self, holder: object) -> bool:
         return holder in self._of
 
-    def note(self, holder: Holder, amount: int) -> list[Holder]:
+    def note(self, holder: Holder, address: str, amount: int) -> list[Holder]:
         """So much of a frame is there; 0 when it has ended. Returns whose connections have to be closed."""
-        before = self._of.get(holder, 0)
+        _, before = self._of.get(holder, (address, 0))
         if amount < before or amount <= self._free:  # it has ended, and maybe the next one has begun
-            self._of.pop(holder, None)
-            self.used -= before
+            self._forget(holder)
             before = 0
         if amount > self._free:
-            self._of[holder] = amount
-            self.used += amount - before
+            self._of[holder] = (address, amount)
+            self._count(address, amount - before)
         gone = []
         while self.used > self._total:
-            oldest = next(iter(self._of))
-            self.used -= self._of.pop(oldest)
+            most = max(self._at, key=self._at.__getitem__)
+            oldest = next(each for each, (where, _) in self._of.items() if where == most)
+            self._forget(oldest)
             gone.append(oldest)
         return gone
+
+    def _forget(self, holder: Holder) -> None:
+        address, amount = self._of.pop(holder, ("", 0))
+        self._count(address, -amount)
+
+    def _count(self, address: str, change: int) -> None:
+        self.used += change
+        self._at[address] += change
+        if self._at[address] <= 0:
+            del self._at[address]

@@ -213,7 +213,7 @@ class Connection(asyncio.BufferedProtocol):
         self._unread -= nbytes
         self._events(self.peer.advance(nbytes, began))
         if (unfinished := self.peer.partial_bytes) > UNFINISHED_FREE_BYTES or self in self._memory.unfinished:
-            for connection in self._memory.unfinished.note(self, unfinished):
+            for connection in self._memory.unfinished.note(self, self.host, unfinished):
                 connection.cut_unfinished()
         took_s = time.monotonic() - began
         self._spent_s += took_s
@@ -254,7 +254,7 @@ class Connection(asyncio.BufferedProtocol):
         if self.greeted:
             self.peer.lost()
         self.brake.release()
-        self._memory.unfinished.note(self, 0)
+        self._memory.unfinished.note(self, self.host, 0)
         self._memory.waiting.set(self, self.host, 0)
         self.owner.closed(self)
 
@@ -482,7 +482,7 @@ class Connection(asyncio.BufferedProtocol):
         self.resume()
 
     def cut_unfinished(self) -> None:
-        """Its frame has begun before all others that have not ended, and there is too much of those."""
+        """There is too much of frames that have not ended, its address has most of it, and this one began first."""
         self.drops["unfinished_frame"] += 1
         self.close("its frame does not end, and others need the room")
 

@@ -65,16 +65,29 @@ def test_of_unfinished_frames_the_oldest_goes() -> None:
     """When frames that have begun take too much together, the one that began first is the one that has to go; those
     that end, and small ones, are no trouble."""
     unfinished: Unfinished[str] = Unfinished(free=10, total=100)
-    assert unfinished.note("slow", 50) == []
+    assert unfinished.note("slow", "here", 50) == []
     for _ in range(100):
-        assert unfinished.note("quick", 40) == []
-        assert unfinished.note("quick", 0) == []
-        assert unfinished.note("small", 10) == []
+        assert unfinished.note("quick", "here", 40) == []
+        assert unfinished.note("quick", "here", 0) == []
+        assert unfinished.note("small", "here", 10) == []
     assert unfinished.used == 50
-    assert unfinished.note("quick", 30) == []
-    assert unfinished.note("quick", 60) == ["slow"]
-    assert unfinished.note("other", 50) == ["quick"]
-    assert unfinished.note("other", 30) == []
-    assert unfinished.note("other", 101) == ["other"]
+    assert unfinished.note("quick", "here", 30) == []
+    assert unfinished.note("quick", "here", 60) == ["slow"]
+    assert unfinished.note("other", "here", 50) == ["quick"]
+    assert unfinished.note("other", "here", 30) == []
+    assert unfinished.note("other", "here", 101) == ["other"]
     assert unfinished.used == 0
     assert "other" not in unfinished
+
+
+def test_unfinished_frames_of_one_address_cost_nobody_elsewhere_his_own() -> None:
+    """One that began before all of them and comes slowly, from another address, goes on."""
+    unfinished: Unfinished[str] = Unfinished(free=10, total=100)
+    assert unfinished.note("slow", "there", 20) == []
+    gone = [each for number in range(50) for each in unfinished.note(f"flood {number}", "here", 30)]
+    assert gone == [f"flood {number}" for number in range(48)]
+    assert unfinished.note("slow", "there", 40) == []
+    assert unfinished.note("slow", "there", 50) == ["flood 48"]
+    assert unfinished.note("flood 49", "here", 0) == []
+    assert unfinished.note("slow", "there", 0) == []
+    assert unfinished.used == 0
