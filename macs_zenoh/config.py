@@ -441,7 +441,7 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     up the commands of others."""
     max_requests_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 500.0
     """The same of all else that an agent sends to this robot or asks it."""
-    max_command_age_s: Annotated[float, Meta(ge=0, le=3600)] = 0.5
+    max_command_age_s: Annotated[float, Meta(ge=0, le=3600)] = 1.0
     """A command that has waited longer than this on its way is not carried out, nor are those that waited with it. 0:
     all are."""
     max_frame_bytes: Bytes = 32 * 1024 * 1024

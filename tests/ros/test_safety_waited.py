@@ -51,7 +51,7 @@ async def test_a_link_that_stood_still_brings_no_old_commands(domain: int, peer:
             link.hold_down()
             await asyncio.sleep(0.1)
             before = len(heard.values)
-            for number in range(10):
+            for number in range(15):
                 send(driver, 1, 100.0 + number)
                 await asyncio.sleep(0.1)
             link.release()
