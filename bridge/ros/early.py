@@ -1,17 +1,21 @@
-"""Messages that come before the node they are for. Pure: the time is passed in."""
+"""Messages that come before the node they are for. Pure."""
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import NamedTuple
 
+from macs_zenoh.budget import may_have_one_more
 from macs_zenoh.keyexpr import type_number
 from macs_zenoh.messages import NodeType
 from macs_zenoh.reading import Message
 
 ASKING = (NodeType.CLIENT, NodeType.ACTION)
 """Node types whose messages wait for an answer."""
+
+Sender = tuple[int, int]
+"""Type and id."""
 
 
 class NodeKey(NamedTuple):
@@ -29,68 +33,90 @@ class EarlyMessage(NamedTuple):
 
 
 class EarlyMessages:
-    """Messages that wait for their node's registration, few and not for long. Pure: the time is passed in."""
+    """Messages that wait for their node's registration, few and not for long. Each sender has room of its own.
+
+    Pure: the time is passed in.
+    """
 
     HOLD_S = 1.0
     PER_NODE = 16
     CALLS_PER_NODE = 256
     """Of calls and goals, which wait for an answer each."""
-    NODES = 64
-    BYTES = 8 << 20
+    NODES, NODES_IN_ALL = 64, 1024
+    """Of one sender, and of all; `budget` says who may have the last of them."""
+    BYTES, BYTES_IN_ALL = 8 << 20, 32 << 20
 
     def __init__(self) -> None:
-        self._waiting: dict[NodeKey, deque[EarlyMessage]] = {}
-        self._bytes = 0
+        self._waiting: dict[tuple[Sender, NodeKey], deque[EarlyMessage]] = {}
+        self._nodes: Counter[Sender] = Counter()
+        self._bytes: Counter[Sender] = Counter()
 
     def hold(self, key: NodeKey, message: Message, now: float) -> list[Message]:
-        """Keep a message. Those that were lost for want of room: the node's oldest, or else this one."""
-        waiting = self._waiting.get(key)
-        if (waiting is None and len(self._waiting) >= self.NODES) or self._bytes + len(message.data) > self.BYTES:
+        """Keep a message. Those that were lost for want of room: the oldest of its sender and node, or else this."""
+        sender, size = _sender(message), len(message.data)
+        waiting = self._waiting.get((sender, key))
+        used, mine = self._bytes.total(), self._bytes[sender]
+        if not may_have_one_more(used, mine, each=self.BYTES, total=self.BYTES_IN_ALL, more=size):
             return [message]
-        waiting = self._waiting.setdefault(key, deque())
+        if waiting is None:
+            used, mine = len(self._waiting), self._nodes[sender]
+            if not may_have_one_more(used, mine, each=self.NODES, total=self.NODES_IN_ALL):
+                return [message]
+            waiting = self._waiting[sender, key] = deque()
+            self._nodes[sender] += 1
         waiting.append(EarlyMessage(now + self.HOLD_S, message))
-        self._bytes += len(message.data)
+        self._bytes[sender] += size
         if len(waiting) <= (self.CALLS_PER_NODE if key.node_type in ASKING else self.PER_NODE):
             return []
         lost = waiting.popleft().message
-        self._bytes -= len(lost.data)
+        self._bytes[sender] -= len(lost.data)
         return [lost]
 
     def take(self, key: NodeKey, belongs: Callable[[Message], bool] = lambda message: True) -> list[Message]:
         """The messages that wait for a node and belong to it, oldest first; others go on waiting."""
-        waiting = self._waiting.pop(key, deque())
-        taken = [early.message for early in waiting if belongs(early.message)]
-        self._bytes -= sum(len(message.data) for message in taken)
-        if len(taken) < len(waiting):
-            self._waiting[key] = deque(early for early in waiting if not any(early.message is t for t in taken))
-        return taken
+        taken: list[EarlyMessage] = []
+        for sender, own in list(self._waiting):
+            if own == key:
+                taken += self._take(sender, own, lambda early: belongs(early.message))
+        return [early.message for early in sorted(taken, key=lambda early: early.deadline)]
 
-    def of(self, sender: tuple[int, int]) -> list[tuple[NodeKey, Message]]:
+    def of(self, sender: Sender) -> list[tuple[NodeKey, Message]]:
         """What waits of one sender, with what it is for."""
-        return [
-            (key, early.message)
-            for key, waiting in self._waiting.items()
-            for early in waiting
-            if (type_number(early.message.sender_type), early.message.sender_id) == sender
-        ]
+        mine = ((key, waiting) for (who, key), waiting in self._waiting.items() if who == sender)
+        return [(key, early.message) for key, waiting in mine for early in waiting]
 
-    def drop(self, sender: tuple[int, int]) -> None:
+    def drop(self, sender: Sender) -> None:
         """Forget what somebody sent who has left: its id may be another one's by the time there is a node."""
-        for key in list(self._waiting):
-            self.take(key, lambda message: (type_number(message.sender_type), message.sender_id) == sender)
+        for who, key in list(self._waiting):
+            if who == sender:
+                self._take(who, key, lambda early: True)
 
     def expire(self, now: float) -> dict[NodeKey, list[Message]]:
         """Give up those that waited too long, and return them by node."""
         expired: dict[NodeKey, list[Message]] = {}
-        for key, waiting in list(self._waiting.items()):
-            while waiting and waiting[0].deadline <= now:
-                message = waiting.popleft().message
-                self._bytes -= len(message.data)
-                expired.setdefault(key, []).append(message)
-            if not waiting:
-                del self._waiting[key]
+        for sender, key in list(self._waiting):
+            if late := self._take(sender, key, lambda early: early.deadline <= now):
+                expired.setdefault(key, []).extend(early.message for early in late)
         return expired
 
     def next_deadline(self) -> float | None:
         """When `expire` has something to do; None while nothing waits."""
         return min((waiting[0].deadline for waiting in self._waiting.values()), default=None)
+
+    def _take(self, sender: Sender, key: NodeKey, wanted: Callable[[EarlyMessage], bool]) -> list[EarlyMessage]:
+        """Of one sender's messages for a node."""
+        waiting = self._waiting.pop((sender, key))
+        taken = [early for early in waiting if wanted(early)]
+        left = deque(early for early in waiting if not any(early is one for one in taken)) if taken else waiting
+        if left:
+            self._waiting[sender, key] = left
+        else:
+            self._nodes[sender] -= 1
+        self._bytes[sender] -= sum(len(early.message.data) for early in taken)
+        if not self._nodes[sender]:
+            del self._nodes[sender], self._bytes[sender]
+        return taken
+
+
+def _sender(message: Message) -> Sender:
+    return type_number(message.sender_type), message.sender_id

@@ -574,7 +574,23 @@ def test_waiting_messages_are_bounded_in_names_and_bytes() -> None:
     assert early.next_deadline() is None
     assert not early.hold(NodeKey(2, "0"), big, now=0.0)
     assert early.take(NodeKey(2, "0")) == [big]
-    assert early._bytes == 0
+    assert early._bytes.total() == 0
+
+
+def test_who_names_many_nodes_takes_nobodys_place() -> None:
+    """What one sender sends before its registration waits, however much others send for nodes that never come, under
+    the same names or others; and it comes in the order in which it was sent."""
+    early, key, early_message = EarlyMessages(), NodeKey(2, "0"), command("/t", b"\0\1\0\0")
+    for flooder in range(12):
+        flood = early_message._replace(sender_id=1000 + flooder, data=bytes(100_000))
+        for number in range(2 * EarlyMessages.NODES):
+            early.hold(NodeKey(2, str(number)), flood, now=0.0)
+    mine = [early_message._replace(data=bytes([number])) for number in range(3)]
+    for message in mine:
+        assert not early.hold(key, message, now=0.1)
+    assert [message for message in early.take(key) if message.sender_id == early_message.sender_id] == mine
+    early.expire(5.0)
+    assert (early.next_deadline(), early._bytes.total(), early._nodes.total()) == (None, 0, 0)
 
 
 async def _knows(nodes: InterfaceNodes, topic: str, *, publishers: int = 0, subscriptions: int = 0) -> None:
