@@ -1,4 +1,4 @@
-"""How many frames a TCP agent may send: credit that is earned with time and survives a reconnection. Pure."""
+"""How much somebody may send: credit that is earned with time, and what of it survives a reconnection. Pure."""
 
 from __future__ import annotations
 
