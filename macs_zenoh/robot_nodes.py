@@ -11,12 +11,16 @@ import re
 import sys
 from collections.abc import Collection, Iterable
 
+from .budget import may_have_one_more
 from .errors import HeldByAnother, Refused
 from .keyexpr import type_name
 from .messages import AddNode, Functionality, GoneAgent, NodeType, RemoveNode, node_name
 
 MAX_BUFFER = 65535
 """Larger depths of a queue are no number that ROS takes, or all of a robot's memory."""
+
+NODES = 1024
+"""Such a program makes a ROS node of each without end. Half of them are for one agent."""
 
 LONGEST_TOPIC = 247
 """As long as ROS 2 lets a topic's full name be."""
@@ -87,6 +91,7 @@ class RobotNodes:
         if there is None:
             if existing:
                 check(node, offered, self._packages)
+            self._check_room(agent)
         else:
             self._check_same(node, there, agent)
             if agent in self._registrants[key]:
@@ -120,6 +125,14 @@ class RobotNodes:
         if not registrants:
             del self._nodes[key], self._registrants[key]
         return True
+
+    def _check_room(self, agent: AgentKey) -> None:
+        if len(self._nodes) >= NODES:
+            raise Refused(f"this robot has {NODES} interface nodes, which is its limit")
+        mine = sum(agent in registrants for registrants in self._registrants.values())
+        if not may_have_one_more(len(self._nodes), mine, each=NODES // 2, total=NODES):
+            who = f"{type_name(agent[0])}/{agent[1]}"
+            raise Refused(f"{who} has {mine} interface nodes on this robot; the rest is for others")
 
     def _check_same(self, node: AddNode, there: AddNode, agent: AgentKey) -> None:
         if node.tos_name != there.tos_name:

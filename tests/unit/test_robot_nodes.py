@@ -8,7 +8,7 @@ import pytest
 
 from macs_zenoh.errors import Refused
 from macs_zenoh.messages import ROS, UNITY, AddNode, Functionality, GoneAgent, RemoveNode, node_name
-from macs_zenoh.robot_nodes import RobotNodes
+from macs_zenoh.robot_nodes import NODES, RobotNodes
 
 
 def node(topic: str = "/a", kind: int = 1, type_: str = "std_msgs/String", agent: int = 5, **fields: Any) -> AddNode:
@@ -37,6 +37,25 @@ def test_a_registration_is_told_once() -> None:
     assert nodes.registrants() == [GoneAgent(UNITY, 6)]
     nodes.gone([GoneAgent(UNITY, 6)])
     assert nodes.find(1, "nd__a") is None
+
+
+def test_nobody_takes_all_of_a_robots_nodes() -> None:
+    """One agent has half of them at most, many have all but what is left for those who have few."""
+    nodes = RobotNodes()
+    for number in range(NODES // 2):
+        nodes.add(node(f"/a{number}"))
+    with pytest.raises(Refused, match="unity/5 has 512 interface nodes on this robot; the rest is for others"):
+        nodes.add(node("/one_more"))
+    for number in range(NODES // 4):
+        nodes.add(node(f"/b{number}", agent=6))
+    with pytest.raises(Refused, match="the rest is for others"):
+        nodes.add(node("/one_more", agent=6))
+    for number in range(NODES // 4):
+        nodes.add(node(f"/c{number}", agent=1000 + number))
+    with pytest.raises(Refused, match="this robot has 1024 interface nodes"):
+        nodes.add(node("/one_more", agent=7))
+    nodes.gone([GoneAgent(UNITY, 5)])
+    assert nodes.add(node("/one_more", agent=7))
 
 
 def test_names_that_collide() -> None:
