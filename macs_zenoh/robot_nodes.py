@@ -14,13 +14,14 @@ from collections.abc import Collection, Iterable
 from .budget import may_have_one_more
 from .errors import HeldByAnother, Refused
 from .keyexpr import type_name
+from .limits import NODES_EACH
 from .messages import AddNode, Functionality, GoneAgent, NodeType, RemoveNode, node_name
 
 MAX_BUFFER = 65535
 """Larger depths of a queue are no number that ROS takes, or all of a robot's memory."""
 
-NODES = 1024
-"""Such a program makes a ROS node of each without end. Half of them are for one agent."""
+NODES = 4 * NODES_EACH
+"""Such a program makes a ROS node of each without end. One agent has as many as its gateway lets it have."""
 
 LONGEST_TOPIC = 247
 """As long as ROS 2 lets a topic's full name be."""
@@ -130,7 +131,7 @@ class RobotNodes:
         if len(self._nodes) >= NODES:
             raise Refused(f"this robot has {NODES} interface nodes, which is its limit")
         mine = sum(agent in registrants for registrants in self._registrants.values())
-        if not may_have_one_more(len(self._nodes), mine, each=NODES // 2, total=NODES):
+        if not may_have_one_more(len(self._nodes), mine, each=NODES_EACH, total=NODES):
             who = f"{type_name(agent[0])}/{agent[1]}"
             raise Refused(f"{who} has {mine} interface nodes on this robot; the rest is for others")
 

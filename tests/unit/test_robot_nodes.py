@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 
 from macs_zenoh.errors import Refused
+from macs_zenoh.limits import NODES_EACH
 from macs_zenoh.messages import ROS, UNITY, AddNode, Functionality, GoneAgent, RemoveNode, node_name
-from macs_zenoh.robot_nodes import NODES, RobotNodes
+from macs_zenoh.robot_nodes import RobotNodes
 
 
 def node(topic: str = "/a", kind: int = 1, type_: str = "std_msgs/String", agent: int = 5, **fields: Any) -> AddNode:
@@ -40,21 +41,18 @@ def test_a_registration_is_told_once() -> None:
 
 
 def test_nobody_takes_all_of_a_robots_nodes() -> None:
-    """One agent has half of them at most, many have all but what is left for those who have few."""
+    """One agent has no more than its gateway would let it have, and what is left last is for those who have few."""
     nodes = RobotNodes()
-    for number in range(NODES // 2):
-        nodes.add(node(f"/a{number}"))
-    with pytest.raises(Refused, match="unity/5 has 512 interface nodes on this robot; the rest is for others"):
-        nodes.add(node("/one_more"))
-    for number in range(NODES // 4):
-        nodes.add(node(f"/b{number}", agent=6))
-    with pytest.raises(Refused, match="the rest is for others"):
-        nodes.add(node("/one_more", agent=6))
-    for number in range(NODES // 4):
-        nodes.add(node(f"/c{number}", agent=1000 + number))
-    with pytest.raises(Refused, match="this robot has 1024 interface nodes"):
+    for agent in range(3):
+        for number in range(NODES_EACH):
+            nodes.add(node(f"/a{agent}_{number}", agent=agent))
+        with pytest.raises(Refused, match=f"unity/{agent} has 1024 interface nodes on this robot; the rest is for"):
+            nodes.add(node("/one_more", agent=agent))
+    for number in range(NODES_EACH):
+        nodes.add(node(f"/b{number}", agent=1000 + number))
+    with pytest.raises(Refused, match="this robot has 4096 interface nodes"):
         nodes.add(node("/one_more", agent=7))
-    nodes.gone([GoneAgent(UNITY, 5)])
+    nodes.gone([GoneAgent(UNITY, 1)])
     assert nodes.add(node("/one_more", agent=7))
 
 
