@@ -65,6 +65,15 @@ NODES_IN_ALL = 64 << 10
 NODE_AGENTS = 1024
 """Robots that one registration may name by id; groups are for more."""
 
+NAMED_EACH = 64 << 10
+"""Robots and groups that all registrations of one TCP agent name together: 64 nodes on 1 024 robots each."""
+
+NAMED_PER_ADDRESS = 512 << 10
+"""The same for all that come from one address."""
+
+NAMED_IN_ALL = 2 << 20
+"""The same for all of one gateway. Each costs about 130 bytes."""
+
 CHUNK_BYTES = 12 * NAME_BYTES
 """One part of a key between two slashes: a name of any script, escaped."""
 

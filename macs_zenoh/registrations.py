@@ -7,6 +7,7 @@ headset that comes or leaves costs its own registrations, a robot those that are
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -64,6 +65,7 @@ class Registrations:
         self._by_id: dict[int, dict[_Wish, None]] = {}
         self._by_group: dict[int, dict[_Wish, None]] = {}
         self._count = 0
+        self._named: Counter[AgentKey] = Counter()
         self._seen: Robots = {}
         self._members: dict[int, set[int]] = {}
         self._refused: set[_Wish] = set()
@@ -72,6 +74,16 @@ class Registrations:
 
     def __len__(self) -> int:
         return self._count
+
+    def named(self, agent: AgentKey) -> int:
+        """How many robots and groups an agent's registrations name, all together: what they cost here."""
+        return self._named.get(agent, 0)
+
+    def naming(self, node: AddNode, robot_ids: Iterable[int], groups: Iterable[int]) -> int:
+        """How many more that would be with this one."""
+        wish = self._find(node)
+        known_ids, known_groups = (wish.robot_ids, wish.groups) if wish is not None else (set[int](), set[int]())
+        return len(set(robot_ids) - known_ids) + len(set(groups) - known_groups)
 
     def add(self, node: AddNode, robot_ids: Iterable[int], groups: Iterable[int], robots: Robots) -> list[Task]:
         """Remember a registration and return what to tell now. Empty lists only repeat what is known."""
@@ -89,6 +101,7 @@ class Registrations:
             wish.node = node
             wish.held_by.clear()
             self._refused.discard(wish)
+        self._named[agent] += len(new_ids) + len(new_groups)
         for robot_id in new_ids:
             self._by_id.setdefault(robot_id, {})[wish] = None
         for group in new_groups:
@@ -107,6 +120,7 @@ class Registrations:
             return []
         before = _covered(wish, robots)
         gone_ids, gone_groups = wish.robot_ids.intersection(robot_ids), wish.groups.intersection(groups)
+        self._named[agent] -= len(gone_ids) + len(gone_groups)
         touched = self._seen_of(gone_ids, gone_groups)
         self._unindex(wish, gone_ids, gone_groups)
         wish.robot_ids -= gone_ids
@@ -120,6 +134,7 @@ class Registrations:
 
     def leave(self, agent: AgentKey) -> None:
         """Forget everything an agent registered. Robots notice its end by themselves."""
+        self._named.pop(agent, None)
         for key, wish in list(self._of_agent.get(agent, {}).items()):
             ids, groups = wish.robot_ids, wish.groups
             touched = self._seen_of(ids, groups)
@@ -133,6 +148,7 @@ class Registrations:
         """An agent has another id now: its registrations are those of the new one."""
         wishes = self._of_agent.pop(agent, {})
         after = (agent[0], agent_id)
+        self._named[after] = self._named.pop(agent, 0)
         if wishes:
             self._of_agent[after] = wishes
         for wish in wishes.values():

@@ -124,6 +124,14 @@ class RobotCalls:
         """Whether an agent registered a message's node on this robot."""
         return self._registrations.registered(agent, metadata.node_type, metadata.node_name, robot_id)
 
+    def named(self, agent: AgentKey) -> int:
+        """How many robots and groups an agent's registrations name."""
+        return self._registrations.named(agent)
+
+    def naming(self, node: AddNode, robot_ids: list[int], groups: list[int]) -> int:
+        """How many more that would be with this one."""
+        return self._registrations.naming(node, robot_ids, groups)
+
     def take_back_all(self, agent: AgentKey, node_type: int, node_name: str) -> None:
         """An agent has a node of another type under this name now: take its registrations of the former back."""
         where = self._registrations.where(agent, node_type, node_name)

@@ -25,7 +25,14 @@ from macs_zenoh.directory import Change
 from macs_zenoh.errors import Refused, Unreachable, UsageError
 from macs_zenoh.existing import asks
 from macs_zenoh.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
-from macs_zenoh.limits import NODES_EACH, NODES_IN_ALL, NODES_PER_ADDRESS
+from macs_zenoh.limits import (
+    NAMED_EACH,
+    NAMED_IN_ALL,
+    NAMED_PER_ADDRESS,
+    NODES_EACH,
+    NODES_IN_ALL,
+    NODES_PER_ADDRESS,
+)
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Payload, Subscription, Traffic
 from macs_zenoh.messages import (
@@ -130,6 +137,8 @@ class Gateway:
             settings.allow, settings.max_connections, settings.max_connections_per_address, settings.groups
         )
         self._nodes = Budget("interface nodes", each=NODES_EACH, per_address=NODES_PER_ADDRESS, total=NODES_IN_ALL)
+        named = "robots and groups named in registrations"
+        self._named = Budget(named, each=NAMED_EACH, per_address=NAMED_PER_ADDRESS, total=NAMED_IN_ALL)
         self._credits: Credits[str] = Credits(settings.max_frames_per_s)
         self._online_reply = b""
         """Who is online, as the answer to whoever asks; empty when that has changed."""
@@ -355,6 +364,7 @@ class Gateway:
         was_online, empty_group = self.agents.leave(connection)
         self._leases.give_back(connection.agent_id)
         self._nodes.set(connection, connection.host, 0)
+        self._named.set(connection, connection.host, 0)
         self._credits.leave(connection.host, connection.peer.credit, time.monotonic())
         self._group_emptied(empty_group)
         if was_online:
@@ -495,10 +505,12 @@ class Gateway:
         """An agent registers on a node of robots, or takes that back."""
         node = event.node
         if isinstance(node, AddNode):
-            if (
-                not connection.is_registered(node)
-                and (why := self._nodes.judge(connection, connection.host)) is not None
-            ):
+            why = None
+            if not connection.is_registered(node):
+                why = self._nodes.judge(connection, connection.host)
+            naming = self._robots.naming(node, event.robot_ids, event.groups)
+            why = why or self._named.judge(connection, connection.host, naming)
+            if why is not None:
                 connection.complain("too_many_nodes", why)
                 self._robots.refuse(node, next(iter(event.robot_ids), 0), why)
                 return
@@ -512,6 +524,7 @@ class Gateway:
         if not isinstance(node, AddNode) and self._robots.find(connection.key, node.node_type, node.node_name) is None:
             connection.unregistered(node.node_name, node.node_type)
         self._nodes.set(connection, connection.host, connection.node_count)
+        self._named.set(connection, connection.host, self._robots.named(connection.key))
 
     def _manage(self, connection: Connection, event: Asked) -> None:
         """A management message for a manager that somebody added."""

@@ -13,7 +13,7 @@ import macs_zenoh
 from bridge.gateway import Gateway
 from bridge.headset import frames
 from macs_zenoh.errors import HeldByAnother
-from macs_zenoh.limits import NODE_AGENTS, NODES_EACH
+from macs_zenoh.limits import NAMED_EACH, NODE_AGENTS, NODES_EACH
 from macs_zenoh.messages import (
     ROS,
     UNITY,
@@ -218,6 +218,28 @@ async def test_too_much_is_refused(start_gateway: StartGateway) -> None:
         connection = gateway.agents.find(UNITY, greedy.id)
         assert connection is not None
         assert connection.node_count == NODES_EACH
+
+
+async def test_who_names_robots_without_end_is_refused(start_gateway: StartGateway) -> None:
+    """All that one headset's registrations name is bounded, in many nodes or in one that is registered over and over;
+    what was named before may be named again, and a neighbour gets what it wants."""
+    gateway = await start_gateway()
+    async with agent(gateway) as greedy, agent(gateway) as neighbour, agent(gateway, ROS) as robot:
+        there = list(range(10_000, 10_000 + NODE_AGENTS))
+        for number in range(NAMED_EACH // NODE_AGENTS - 1):
+            greedy.register(1, f"/t{number}", there)
+        greedy.register(1, "/t0", [each + NODE_AGENTS for each in there])
+        greedy.register(1, "/t0", there)
+        for topic in ("/t0", "/one_more"):
+            greedy.register(1, topic, [each + 2 * NODE_AGENTS for each in there])
+        await until(lambda: len(greedy.bodies(NodeRefused.manager)) == 2, 60)
+        assert f"each may have {NAMED_EACH} robots and groups" in str(greedy.bodies(NodeRefused.manager)[0])
+        neighbour.register(1, "/mine", [robot.id])
+        await until(lambda: (neighbour.id, "nd__mine") in robot.nodes(), 30)
+        key, connection = (UNITY, greedy.id), gateway.agents.find(UNITY, greedy.id)
+        assert gateway._named.of(connection) == NAMED_EACH
+    await until(lambda: gateway.agents.find(*key) is None)
+    assert gateway._named.used == 0
 
 
 @pytest.mark.parametrize("count", [1000])

@@ -126,6 +126,9 @@ def test_robots_have_what_is_wanted_of_them(story_steps: list[tuple[str, tuple[o
             assert story.have[robot_id] == story.should_have(robot_id)
         wanted = [key for key, (ids, groups) in story.wanted.items() if ids or groups]
         assert len(story.registrations) == len(wanted)
+        for headset in range(20):
+            named = [len(ids) + len(groups) for key, (ids, groups) in story.wanted.items() if key[0] == (2, headset)]
+            assert story.registrations.named((2, headset)) == sum(named)
         for agent, node_type, name in wanted:
             assert story.registrations.find(agent, node_type, name) is not None
 
