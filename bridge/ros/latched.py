@@ -65,6 +65,9 @@ class Newcomers:
     QUIET_S = 3.0
     """A subscription for them ends so long after the last thing that it got: a big map takes its time."""
     LOOK_S = 0.5
+    AT_ONCE = 8
+    """Subscriptions for them that there are: who comes meanwhile waits for the end of one, together with others. A
+    headset can register and take that back without end."""
 
     def __init__(
         self,
@@ -97,10 +100,14 @@ class Newcomers:
 
     def close(self) -> None:
         """End the subscriptions."""
+        with self._lock:
+            self._waiting.clear()
         for catching in list(self._open):
             self._end(catching)
 
     def _catch_up(self) -> None:
+        if len(self._open) >= self.AT_ONCE:
+            return  # `_end` goes on
         with self._lock:
             waiting, self._waiting = frozenset(self._waiting), set()
         latching = [offered for offered in self._publishers() if qos.is_latched(offered)]
@@ -130,6 +137,8 @@ class Newcomers:
     def _end(self, catching: _Catching) -> None:
         self._open.remove(catching)
         self._session.intake.unsubscribe(catching.subscription)
+        if self._waiting:
+            self._session.submit(self._catch_up)
 
 
 class _Catching:

@@ -101,6 +101,24 @@ async def test_one_that_registers_later_gets_it_too(nodes: InterfaceNodes, got: 
     assert all(got.of(agent) == {"map": 1, "news": 1} for agent in range(5, 16))
 
 
+async def test_who_comes_and_goes_costs_few_subscriptions(nodes: InterfaceNodes, got: Got, peer: Peer) -> None:
+    """A headset that registers and takes that back without end makes the robot subscribe a few times more and no
+    oftener; others get what is held all the same."""
+    await publish(peer, "/map", "map")
+    await knows(nodes, "/map", 1)
+    await nodes.add(adding("/map"))
+    await until(lambda: got.of(5) == {"map": 1})
+    session, most = nodes.robot.session, 0
+    for _ in range(60):
+        await nodes.add(adding("/map", registrant=6))
+        nodes.remove(removing("/map", registrant=6))
+        most = max(most, await session.run(lambda: session.node.count_subscribers("/map")))
+    await nodes.add(adding("/map", registrant=7))
+    await until(lambda: got.of(7) == {"map": 1}, 20)
+    assert most <= 1 + Newcomers.AT_ONCE
+    assert got.of(5) == {"map": 1}
+
+
 @pytest.mark.parametrize("buffer_size", [1, 10])
 async def test_each_publisher_tells_a_late_one(nodes: InterfaceNodes, got: Got, peer: Peer, buffer_size: int) -> None:
     """Of three publishers on /tf_static each has its message told, whatever room the headset asks for."""
