@@ -27,7 +27,7 @@ PAGE = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
 
 STAYS = ("macs router", "macs gateway", "macs agent", "zenohd", "python")
 """What runs until it is stopped."""
-READY = re.compile("ready: |can be reached at|demo robot:")
+READY = {"macs": "ready: ", "zenohd": "can be reached at", "python": "demo robot:"}
 """How our programs, zenohd and the page's robot say that they do their work."""
 CTRL_C = "# Ctrl-C "
 """And where, as the comment behind a command that stays says it."""
@@ -109,13 +109,13 @@ class Reader:
         self._running[line] = process
         seen = len(self.log)
         self._reading += [asyncio.create_task(self._keep(stream)) for stream in (process.stdout, process.stderr)]
-        ready = asyncio.create_task(self._ready(seen))
+        ready = asyncio.create_task(self._ready(READY[program], seen))
         await asyncio.wait([ready, asyncio.create_task(process.wait())], timeout=30, return_when="FIRST_COMPLETED")
         assert ready.done(), f"{line}\n" + "\n".join(self.log[seen:])
         return ""
 
-    async def _ready(self, seen: int) -> None:
-        while not any(READY.search(text) for text in self.log[seen:]):
+    async def _ready(self, said: str, seen: int) -> None:
+        while not any(said in text for text in self.log[seen:]):
             await asyncio.sleep(0.01)
 
     async def sees_a_robot(self) -> None:
