@@ -25,6 +25,7 @@ def test_a_robot(tmp_path: Path) -> None:
     assert (settings.robot.id, settings.robot.group) == (7, 3)
     assert settings.mesh.connect == ["tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447"]
     assert settings.robot.rules[0].deadman_s == 0.5
+    assert "config/" not in (folder / "robot.toml").read_text(), "macs.toml is beside it"
 
 
 def test_a_router(tmp_path: Path) -> None:
