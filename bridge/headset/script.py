@@ -192,7 +192,8 @@ class Session:
         log.info("subscribed to %s of robots %s", args.topic, _where(subscription))
 
         async def work() -> int:
-            async with self._hint(args.topic, await self._there(subscription), "publishers", after_s=_SILENCE_S):
+            there = await self._there(subscription)
+            async with self._hint(args.topic, there, "publishers", groups=args.groups, after_s=_SILENCE_S):
                 return await self._take(
                     subscription, args.topic, args, lambda item: self._shown_topic(args, item), subscription
                 )
@@ -393,7 +394,7 @@ class Session:
 
     @contextlib.asynccontextmanager
     async def _hint(
-        self, topic: str, robots: Collection[int], role: Role, *, after_s: float = 0
+        self, topic: str, robots: Collection[int], role: Role, *, groups: Collection[int] = (), after_s: float = 0
     ) -> AsyncIterator[Hinted]:
         """Meanwhile, if nothing has been received by then, say what may be wrong."""
 
@@ -403,6 +404,9 @@ class Session:
                 hinted.said.update(await hints(self.headset, robots, topic, role))
                 for line in hinted.said.values():
                     log.warning("%s", line)
+                if groups:  # a headset is not told who is in which group
+                    named = ", ".join(map(str, groups))
+                    log.warning("nothing from group %s yet; is a robot in it? macs ls shows the groups", named)
 
         hinted = Hinted(hinting := asyncio.get_running_loop().create_task(hint()), {})
         try:

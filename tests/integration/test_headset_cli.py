@@ -430,6 +430,13 @@ async def test_who_hears_nothing_learns_why(
     assert robot.asked == 1
 
 
+async def test_a_group_without_robots_is_told(start: Start, robot: EchoRobot) -> None:
+    """Who subscribes by group and hears nothing is told that nobody may be in it."""
+    sub = await start("sub", "/chatter", STRING, "--groups", "9", "--timeout", "6")
+    code, _, log = await sub.end()
+    assert (code, "nothing from group 9 yet" in log) == (1, True), log
+
+
 async def test_who_hears_something_is_told_nothing(start: Start, robot: EchoRobot) -> None:
     robot.offers = OFFERED
     sub = await start("sub", "/talk", STRING, "--timeout", "3")
