@@ -45,6 +45,7 @@ from macs_zenoh.messages import (
     NodeRefused,
     NodeType,
     OnlineReply,
+    Refusal,
     encode_data,
 )
 from macs_zenoh.pace import Pace, Passing
@@ -534,6 +535,8 @@ class Gateway:
             data = encode_data(answer) if answer is not None else None
         except Refused as refusal:
             connection.complain("refused_by_manager", f"{event.manager}: {refusal.reason}")
+            if connection.peer.extensions:  # an existing program expects its manager's own answer, or none
+                self._reply(connection, Metadata(request_id=event.request_id), encode_data(Refusal(refusal.reason)))
             return
         except Exception:
             log.exception("%s failed on a message of %s", event.manager, connection)

@@ -225,7 +225,7 @@ class Headset:
     async def ask_gateway(self, manager: str, data: Mapping[str, object], *, timeout_s: float = 5.0) -> bytes:
         """Ask the gateway something that a manager answers which somebody added there; its answer's data.
 
-        Raises CallTimeout, also when there is no such manager or it refuses, which the gateway's log says.
+        Raises Refused with its reason, CallTimeout, also when there is no such manager, which the gateway's log says.
         """
         request_id = self._next_request
         self._next_request = (request_id + 1) % REQUEST_IDS
@@ -233,7 +233,7 @@ class Headset:
         self._open[request_id] = answer
         try:
             await self.send_frame(frames.management(self.id, request_id, manager, data))
-            return await asyncio.wait_for(answer, timeout_s)
+            return _not_refused(await asyncio.wait_for(answer, timeout_s))
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"{manager} of gateway {self.target}", timeout_s) from error
         finally:
@@ -385,9 +385,7 @@ class Headset:
         try:
             await self.send(data, to=ROS, ids=(robot,), manager=manager, request_id=request_id)
             answered: bytes = await asyncio.wait_for(answer, timeout_s)
-            if answered.startswith(b'{"refused"'):
-                raise Refused(decode_data(Refusal, answered).refused)
-            return answered
+            return _not_refused(answered)
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"{manager} of robot {robot}", timeout_s) from error
         finally:
@@ -669,6 +667,13 @@ class Headset:
             self._on_link(link)
         except Exception:  # our caller's code must not end our tasks
             log.exception("on_link failed")
+
+
+def _not_refused(answer: bytes) -> bytes:
+    """An answer to a plain request. Raises Refused when it says why there is none."""
+    if answer.startswith(b'{"refused"'):
+        raise Refused(decode_data(Refusal, answer).refused)
+    return answer
 
 
 def _is_final(refused: NodeRefused | DataRefused) -> bool:

@@ -115,10 +115,13 @@ async def test_the_worked_example_from_the_command_line() -> None:
             "gateway",
             1760000000.25,
         )
-        for words in (("ClockComparer", '{"sentAtS": -1}'), ("NobodysManager",)):
+        for words, why in (
+            (("ClockComparer", '{"sentAtS": -1}'), "-1.0 is not a time"),
+            (("NobodysManager",), f"NobodysManager of gateway {where} cannot be reached: no answer within 0.5 s"),
+        ):
             code, out, errors = await ended("headset", where, "ask", *words, "--timeout", "0.5")
             assert (code, out) == (1, "")
-            assert f"{words[0]} of gateway {where} cannot be reached: no answer within 0.5 s" in errors
+            assert why in errors
         code, out, errors = await ended("headset", where, "ask", "ClockComparer", "{")
         assert (code, out) == (2, "")
 
