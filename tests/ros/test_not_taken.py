@@ -15,6 +15,7 @@ from geometry_msgs.msg import Twist
 from ros_peer import Peer
 
 from bridge.headset.client import Headset
+from macs_zenoh.messages import Functionality, FunctionalityRequest, decode_data
 from tests.programs import Program, ended, free_port
 
 SETTINGS = """
@@ -76,6 +77,11 @@ async def site(domain: int, peer: Peer, tmp_path: Path) -> AsyncIterator[Site]:
         await stack.enter_async_context(robot)
         async with await Headset.connect("127.0.0.1", gateway.port) as headset:
             while (await headset.online()).ros_agent_ids != [7]:
+                await asyncio.sleep(0.02)
+            while (
+                "/cmd_vel"
+                not in decode_data(Functionality, await headset.ask(7, FunctionalityRequest.manager)).subscribers
+            ):
                 await asyncio.sleep(0.02)
         yield Site(endpoint, f"127.0.0.1:{gateway.port}")
 
