@@ -78,6 +78,7 @@ INBOX_MESSAGES = 1000
 """How many messages outside interface nodes are held for a taker."""
 
 _GOODBYE_S = 1.0
+_CANCEL_AGAIN_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -461,8 +462,12 @@ class Headset:
     async def _stop(self, *, say_goodbye: bool) -> None:
         if not self._ended.is_set():
             self._finish("closed here")
-        for task in self._tasks:
-            task.cancel()
+        going_on: Collection[asyncio.Task[None]] = self._tasks
+        while going_on:
+            for task in going_on:
+                task.cancel()
+            # more than once: before Python 3.12 wait_for may swallow a cancellation, when what it waits for ends then
+            _, going_on = await asyncio.wait(going_on, timeout=_CANCEL_AGAIN_S)
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self._tasks.clear()
         connection, self._connection = self._connection, None

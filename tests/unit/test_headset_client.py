@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import socket
 from collections.abc import AsyncIterator
@@ -532,3 +533,16 @@ async def test_closing_while_away_ends_at_once(router: ScriptedRouter) -> None:
     router.cut()
     await asyncio.wait_for(headset.close(), 5)
     assert await headset.wait_ended() == "closed here"
+
+
+async def test_closing_ends_what_swallows_a_cancellation(headset: Headset) -> None:
+    """A task that a first cancellation does not end, as asyncio's own wait_for can bring about, holds up no close."""
+
+    async def stubborn() -> None:
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.sleep(60)
+        await asyncio.sleep(60)
+
+    headset._tasks.append(asyncio.create_task(stubborn()))
+    await asyncio.sleep(0)
+    await asyncio.wait_for(headset.close(), 10)
