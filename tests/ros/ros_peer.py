@@ -10,6 +10,8 @@ from typing import Any
 from geometry_msgs.msg import Twist
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
 
 from bridge.ros.session import RosSession
 from macs_zenoh.messages import AddNode, Metadata, NodeType, RemoveNode, node_name
@@ -71,6 +73,19 @@ async def until(condition: Callable[[], Any], timeout_s: float = 10.0) -> None:
 async def get(queue: asyncio.Queue[Any], timeout_s: float = 10.0) -> Any:
     """The next item of a queue; fail when there is none."""
     return await asyncio.wait_for(queue.get(), timeout_s)
+
+
+def set_bool(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    """A service that answers with what it was asked."""
+    response.success, response.message = request.data, f"set to {request.data}"
+    return response
+
+
+async def say_hello(peer: Peer, publisher: Any) -> None:
+    """Publish a String ten times a second, until cancelled."""
+    while True:
+        await peer.session.run(lambda: publisher.publish(String(data="hello from ROS")))
+        await asyncio.sleep(0.1)
 
 
 def adding(

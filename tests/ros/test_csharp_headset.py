@@ -14,7 +14,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from tests.programs import ROOT, Program, free_port
-from tests.ros.ros_peer import Peer, get
+from tests.ros.ros_peer import Peer, get, say_hello, set_bool
 
 SOURCE = ROOT / "examples" / "unity" / "MacsHeadset.cs"
 
@@ -72,9 +72,9 @@ async def test_the_four_kinds_of_nodes(compiled: Path, domain: int, peer: Peer) 
     agent = Program("agent", "--id", "1", "-e", endpoint, env={"ROS_DOMAIN_ID": str(domain)})
     chatter = await peer.publisher(String, "/chatter")
     talk = await peer.subscription(String, "/talk")
-    await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/set", _set))
+    await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/set", set_bool))
     asking = await peer.session.run(lambda: peer.session.node.create_client(SetBool, "/ask"))
-    talking = asyncio.create_task(_chatter(peer, chatter))
+    talking = asyncio.create_task(say_hello(peer, chatter))
     try:
         async with Program("router", "-l", endpoint), agent, running(compiled, int(port)) as headset:
             for _ in range(2):
@@ -100,14 +100,3 @@ async def _all_four(headset: CSharp, talk: asyncio.Queue[String], peer: Peer, as
     call.add_done_callback(lambda done: loop.call_soon_threadsafe(answered.set_result, done.result()))
     response = await asyncio.wait_for(answered, 20)
     assert (response.success, response.message) == (True, "headset says True")
-
-
-def _set(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-    response.success, response.message = request.data, f"set to {request.data}"
-    return response
-
-
-async def _chatter(peer: Peer, publisher: object) -> None:
-    while True:
-        await peer.session.run(lambda: publisher.publish(String(data="hello from ROS")))  # type: ignore[attr-defined]
-        await asyncio.sleep(0.1)

@@ -13,7 +13,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from tests.programs import ROOT, Program, free_port, macs
-from tests.ros.ros_peer import Peer, get
+from tests.ros.ros_peer import Peer, get, say_hello, set_bool
 
 PAGE = (ROOT / "docs" / "headset.md").read_text(encoding="utf-8")
 
@@ -28,8 +28,8 @@ async def test_the_page(domain: int, peer: Peer, tmp_path: Path) -> None:
     agent = Program("agent", "--id", "1", "-e", endpoint, env={"ROS_DOMAIN_ID": str(domain)})
     chatter = await peer.publisher(String, "/chatter")
     talk = await peer.subscription(String, "/talk")
-    await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/set", _set))
-    talking = asyncio.create_task(_chatter(peer, chatter))
+    await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/set", set_bool))
+    talking = asyncio.create_task(say_hello(peer, chatter))
     (program,), (printed,) = blocks("python"), blocks("text")
     try:
         async with (
@@ -56,14 +56,3 @@ async def test_the_page(domain: int, peer: Peer, tmp_path: Path) -> None:
             assert (await get(talk)).data == "hello"
     finally:
         talking.cancel()
-
-
-def _set(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-    response.success, response.message = request.data, f"set to {request.data}"
-    return response
-
-
-async def _chatter(peer: Peer, publisher: object) -> None:
-    while True:
-        await peer.session.run(lambda: publisher.publish(String(data="hello from ROS")))  # type: ignore[attr-defined]
-        await asyncio.sleep(0.1)
