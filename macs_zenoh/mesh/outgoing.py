@@ -125,7 +125,7 @@ class Outgoing:
             if not self._sender.put(publisher, payload):
                 self.drops["backlog"] += 1
         else:
-            self._put_apart(self._apart.get(key) or self._declare_apart(key), payload)
+            self._put_apart(self._apart.get(key) or self._declare_apart(key, len(payload)), payload)
 
     def put_unasked(self, key: str, payload: Payload) -> None:
         """Put without having heard that anybody listens, past all traffic rules: it goes to the router in any case,
@@ -272,10 +272,10 @@ class Outgoing:
             sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=self.HEARTBEAT_S, sporadic_heartbeat=None),
         )
 
-    def _declare_apart(self, key: str) -> _Apart:
+    def _declare_apart(self, key: str, size: int) -> _Apart:
         places = (zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE)
         with self._outlets_lock:
-            if self._is_fresh(key, Traffic.CALL, apart=True):
+            if size <= self.LARGE_BYTES and self._is_fresh(key, Traffic.CALL, apart=True):
                 bare = [self._bare(key, Traffic.CALL, place) for place in places]
                 return _Apart(bare[0], bare[1], math.inf)
         priority, congestion, express = self.way(key, Traffic.CALL)
