@@ -26,7 +26,11 @@ METADATA_BYTES = 4 << 10
 """The JSON in front of a message's data; with three of the longest names it has 1 KiB."""
 
 SAMPLE_BYTES = 256 << 10
-"""Several frames in one sample, together: what one read of a socket brought is half of that."""
+"""Several frames in one sample, together."""
+
+RUN_BYTES = 128 << 10
+"""Frames of a TCP agent that begin alike and are handled as one, together: less than what a sample may have, and no
+more than what is sent without a thread of its own."""
 
 NAME_BYTES = 255
 """Characters of one name: interface node, topic, service, type, manager. ROS 2, where each is a byte, allows 247."""
@@ -47,8 +51,8 @@ behind what is being written to it: two messages of 32 MiB for one that does not
 UNFINISHED_IN_ALL_BYTES = 256 << 20
 """Frames of all agents of a gateway that have begun and not ended."""
 
-UNFINISHED_FREE_BYTES = 64 << 10
-"""So much of a frame that has begun is not counted."""
+UNFINISHED_FREE_BYTES = 128 << 10
+"""So much of a frame that has begun is not counted, so that usual frames cost nothing more."""
 
 REQUESTS_PER_S = 1000
 """Management messages of one TCP agent, 250 at once; one that sends more is read from more slowly."""

@@ -193,6 +193,8 @@ class Peer:
         self.state = GREETED
         self.drops: Counter[str] = Counter()
         self.corrected = 0
+        self.partial_bytes = 0
+        """How much memory a frame has that has begun and is not whole."""
         self._limits = limits
         self._custom = custom
         self.credit = credit or Credit(limits.frames_per_s, now)
@@ -226,11 +228,6 @@ class Peer:
         """Whether this is a Zenoh program that has come to the wrong port."""
         return greetings.begins_as_client(self._decoder.begun_header)
 
-    @property
-    def partial_bytes(self) -> int:
-        """How much memory a frame has that has begun and is not whole."""
-        return self._decoder.partial_bytes
-
     def renumber(self, agent_id: int) -> None:
         """From now on the agent has another id. `welcome` tells it; until it has read that it uses the former one."""
         self.former_ids.add(self.agent_id)
@@ -253,8 +250,8 @@ class Peer:
             return [again]
         self._heard_at = now
         events: list[Event] = []
-        limited = self._limits.frames_per_s
-        for frame in self._decoder.advance(size):
+        decoder, limited = self._decoder, self._limits.frames_per_s
+        for frame in decoder.advance(size):
             try:
                 frame.check()
                 if limited and not self._covered(frame, now):
@@ -268,14 +265,18 @@ class Peer:
                 self._reject(error, frame.count, events)
             if self._gone():
                 return events
-        if self._decoder.refused:
-            for refused in self._decoder.refused:
+        if decoder.refused:
+            for refused in decoder.refused:
                 self._reject(refused, 1, events)
-            self._decoder.refused.clear()
-        self._look_at_partial(now)
-        if self._decoder.error is not None:
+            decoder.refused.clear()
+        begun, self.partial_bytes = decoder.begun, decoder.partial_bytes
+        if not begun:
+            self._partial_since = None
+        elif self._partial_since is None or begun < self._partial_begun:  # a new one
+            self._partial_since, self._partial_begun = now, begun
+        if decoder.error is not None:
             self.drops["FrameTooLarge"] += 1
-            events += [Rejected(self._decoder.error), self._leave("its next frame cannot be found")]
+            events += [Rejected(decoder.error), self._leave("its next frame cannot be found")]
         elif len(events) == 1 and type(sent := events[0]) is Sent and len(sent.frame.data) == size:
             self._remember(sent)
         return events
@@ -329,13 +330,6 @@ class Peer:
         if now >= self._heard_at + self._limits.silence_s:
             return [self._leave(f"silent for {self._limits.silence_s:g} s")]
         return self._judge_partial(now)
-
-    def _look_at_partial(self, now: float) -> None:
-        begun = self._decoder.begun
-        if not begun:
-            self._partial_since = None
-        elif self._partial_since is None or begun < self._partial_begun:  # a new one
-            self._partial_since, self._partial_begun = now, begun
 
     def _judge_partial(self, now: float) -> list[Event]:
         """A frame had its time to come on."""

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from .errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations
-from .limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, SAMPLE_BYTES
+from .limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, RUN_BYTES, SAMPLE_BYTES
 
 MAX_FRAME_BYTES = 32 << 20
 """Default limit of a whole frame; camera frames of 20 MiB pass."""
@@ -391,7 +391,10 @@ class FrameDecoder:
     skipped as they come. `refused` has why; who reads it empties it.
     """
 
-    SMALL_BYTES = 64 << 10
+    SPACE_BYTES = 256 << 10
+    """The most that is received at once."""
+    PARTIAL_BYTES = 64 << 10
+    """So much is reserved at once for a frame that has begun; then as much again as has come."""
 
     def __init__(
         self,
@@ -409,7 +412,8 @@ class FrameDecoder:
         self.error: FrameTooLarge | None = None
         self.refused: list[TooLong] = []
         self.runs = runs
-        self._scratch = memoryview(scratch if scratch is not None else bytearray(self.SMALL_BYTES))
+        self._received = scratch if scratch is not None else bytearray(self.SPACE_BYTES)
+        self._scratch = memoryview(self._received)
         self._partial = bytearray()  # a frame that has begun; its length is what is reserved, not what has come
         self._filled = 0
         self._message_at = 0
@@ -454,7 +458,7 @@ class FrameDecoder:
             return self._scratch[: self._skip] if self._skip else self._scratch
         if self._filled == len(self._partial):
             self._partial.extend(bytes(min(self._wanted, 2 * self._filled) - self._filled))
-        return memoryview(self._partial)[self._filled : self._filled + self.SMALL_BYTES]
+        return memoryview(self._partial)[self._filled : self._filled + self.SPACE_BYTES]
 
     def advance(self, size: int) -> list[Frame]:
         """``size`` bytes were written to the start of `space`: return the frames that are now whole."""
@@ -471,20 +475,11 @@ class FrameDecoder:
             self._skip -= size
             self._filled = self._filled + size if self._skip else 0
             return []
-        received = self._scratch[:size]
-        if self._partial:
-            begun = bytes(self._partial) + received
+        if self._partial:  # of a header
+            begun = self._partial + self._scratch[:size]
             self._partial = bytearray()
-            return self._cut(begun)
-        if size >= self.layout.header_bytes:
-            management_bytes, message_bytes = _SIZES.unpack_from(received, self.layout.destination_bytes)
-            wanted = self.layout.header_bytes + management_bytes + message_bytes
-            if (
-                size < wanted <= self.max_frame_bytes and management_bytes <= CONFIGURATION_BYTES
-            ):  # the beginning of one large frame: copied once
-                self._begin(received, wanted, self.layout.header_bytes + management_bytes)
-                return []
-        return self._cut(bytes(received))
+            return self._cut(begun, len(begun))
+        return self._cut(self._received, size)
 
     def again(self, size: int, beginning: bytes) -> bytes | None:
         """`advance` for bytes that are a whole frame of this size with this `Frame.beginning`. None when they are
@@ -493,40 +488,43 @@ class FrameDecoder:
             return None
         return bytes(self._scratch[:size])
 
-    def _cut(self, data: bytes) -> list[Frame]:
-        """Cut whole frames off ``data`` and keep the rest as the beginning of the next one."""
+    def _cut(self, data: bytearray, end: int) -> list[Frame]:
+        """Cut whole frames off ``data`` up to ``end`` and keep the rest as the beginning of the next one. What is kept
+        is copied, once."""
         layout = self.layout
         header_bytes = layout.header_bytes
         sizes_at = layout.destination_bytes
         frames: list[Frame] = []
+        view = memoryview(data)
         start = 0
-        end = len(data)
         while end - start >= header_bytes:
             management_bytes, message_bytes = _SIZES.unpack_from(data, start + sizes_at)
-            size = header_bytes + management_bytes + message_bytes
+            message_at = header_bytes + management_bytes
+            size = message_at + message_bytes
             if size > self.max_frame_bytes:
                 self.error = FrameTooLarge(size, self.max_frame_bytes)
                 return frames
-            message_at = header_bytes + management_bytes
             if management_bytes > CONFIGURATION_BYTES:
                 self._refuse(TooLong("management data", management_bytes, CONFIGURATION_BYTES), size, end - start)
                 start = min(start + size, end)
                 continue
-            if size > end - start:
-                self._begin(memoryview(data)[start:], size, message_at)
-                return frames
             stop = start + size
+            if stop > end:
+                self._begin(view[start:end], size, message_at)
+                return frames
             if self.runs and stop != end and not management_bytes:
-                stop = _run_end(data, start, message_at, size, end)
-            frames.append(Frame(data[start:stop], layout, message_at, size))
+                stop = _run_end(data, start, message_at, size, min(end, start + RUN_BYTES))
+            frames.append(Frame(bytes(view[start:stop]), layout, message_at, size))
             start = stop
-        self._partial = bytearray(data[start:])
+        if start != end:
+            self._partial = bytearray(view[start:end])
         return frames
 
     def _begin(self, data: memoryview, wanted: int, message_at: int) -> None:
-        self._partial = bytearray(min(wanted, max(2 * len(data), self.SMALL_BYTES)))
-        self._partial[: len(data)] = data
-        self._filled = len(data)
+        begun = len(data)
+        self._partial = bytearray(min(wanted, max(2 * begun, self.PARTIAL_BYTES)))
+        self._partial[:begun] = data
+        self._filled = begun
         self._message_at = message_at
         self._wanted = wanted
         self._judged = False

@@ -63,7 +63,8 @@ TURN_S = 0.003
 """Work for one agent that takes longer lets all others have their turn before it goes on: an event loop may read from
 one socket many times before it looks at the next."""
 
-MOST_READ_BYTES = FrameDecoder.SMALL_BYTES
+MOST_READ_BYTES = FrameDecoder.SPACE_BYTES
+FIRST_READ_BYTES = 64 << 10
 LEAST_READ_BYTES = 1024
 
 
@@ -145,8 +146,10 @@ class Connection(asyncio.BufferedProtocol):
         self._refused = False
         self._pauses = 0
         self._spent_s = 0.0
-        self._read_bytes = MOST_READ_BYTES
-        """How much is read at once: less, when little of it makes much work."""
+        self._unfinished = 0
+        """What is counted for it of a frame that has begun."""
+        self._read_bytes = FIRST_READ_BYTES
+        """How much is read at once: less, when little of it makes much work, more when much makes little."""
         self._unread = 0
         """Of what waited in the socket when the agent's time had run out: how much is still to be read."""
         self._looked = False
@@ -211,20 +214,26 @@ class Connection(asyncio.BufferedProtocol):
     def buffer_updated(self, nbytes: int) -> None:
         began = time.monotonic()
         self._unread -= nbytes
-        self._events(self.peer.advance(nbytes, began))
-        if (unfinished := self.peer.partial_bytes) > UNFINISHED_FREE_BYTES or self in self._memory.unfinished:
-            for connection in self._memory.unfinished.note(self, self.host, unfinished):
-                connection.cut_unfinished()
+        if events := self.peer.advance(nbytes, began):
+            self._events(events)
+        unfinished = self.peer.partial_bytes
+        if unfinished != self._unfinished and (unfinished > UNFINISHED_FREE_BYTES or self._unfinished):
+            self._note_unfinished(unfinished)
         took_s = time.monotonic() - began
         self._spent_s += took_s
         if took_s > TURN_S:
             self._read_bytes = max(LEAST_READ_BYTES, int(self._read_bytes * TURN_S / took_s))
-        elif took_s < TURN_S / 4 and self._read_bytes < MOST_READ_BYTES:
+        elif took_s < TURN_S / 2 and self._read_bytes < MOST_READ_BYTES:
             self._read_bytes *= 2
         if self._spent_s > TURN_S and not self._transport.is_closing():
             self._spent_s = 0.0
             self.pause()
             self._loop.call_soon(self.resume)
+
+    def _note_unfinished(self, unfinished: int) -> None:
+        self._unfinished = unfinished if unfinished > UNFINISHED_FREE_BYTES else 0
+        for connection in self._memory.unfinished.note(self, self.host, unfinished):
+            connection.cut_unfinished()
 
     def pause_writing(self) -> None:
         self._paused_at = time.monotonic()

@@ -133,7 +133,7 @@ class Gateway:
             silence_s=settings.silence_s,
             frames_per_s=settings.max_frames_per_s,
         )
-        self._scratch = bytearray(FrameDecoder.SMALL_BYTES)  # sockets of one loop receive one after the other
+        self._scratch = bytearray(FrameDecoder.SPACE_BYTES)  # sockets of one loop receive one after the other
         self._door = Door(
             settings.allow, settings.max_connections, settings.max_connections_per_address, settings.groups
         )
