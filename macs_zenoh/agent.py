@@ -14,7 +14,7 @@ import asyncio
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
 from typing import NamedTuple
@@ -203,7 +203,7 @@ class Agent:
         self._inbox.append(message)
         self._arrived.set()
 
-    def _receive(self, batch: list[Sample], *, by_group: bool = False) -> None:
+    def _receive(self, batch: Iterator[Sample], *, by_group: bool = False) -> None:
         me = (self.type_number, self.id)
         for key, payload in batch:
             for message in self._reader.read(key, payload, me, by_group=by_group):

@@ -19,7 +19,7 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager
 from typing import NamedTuple
 
@@ -286,13 +286,13 @@ class Awareness:
             for declared in self._per_type.pop(registration.type, []):
                 declared.close()
 
-    def _receive(self, batch: list[Sample]) -> None:
+    def _receive(self, batch: Iterator[Sample]) -> None:
         for key, payload in batch:
             fields = NAMED.parse(key)
             if fields is not None:
                 self._take(str(fields["from_name"]), str(fields["message_type"]), bytes(payload), to_all=False)
 
-    def _receive_all(self, batch: list[Sample]) -> None:
+    def _receive_all(self, batch: Iterator[Sample]) -> None:
         for key, payload in batch:
             fields = NAMED_ALL.parse(key)
             if fields is not None and fields["from_name"] != self.name:

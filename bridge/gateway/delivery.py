@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Iterator
 from typing import NamedTuple
 
 from macs_zenoh.directory import Directory
@@ -87,7 +88,7 @@ class Delivery:
         self._seen: dict[tuple[str, int], Seen] = {}
         self._dirty: list[Connection] = []
 
-    def inbox(self, batch: list[Sample]) -> None:
+    def inbox(self, batch: Iterator[Sample]) -> None:
         """Frames sent to ids of ours."""
         for key, payload in batch:
             target = self._targets.get(key)
@@ -106,7 +107,7 @@ class Delivery:
                 self._hold_sender(sender, [connection])
         self.flush()
 
-    def group(self, batch: list[Sample]) -> None:
+    def group(self, batch: Iterator[Sample]) -> None:
         """Frames sent to groups that one of ours is in."""
         for key, payload in batch:
             fields = GROUP.parse(key)
@@ -122,7 +123,7 @@ class Delivery:
             self._hold_sender(sender, members)
         self.flush()
 
-    def broadcast(self, batch: list[Sample]) -> None:
+    def broadcast(self, batch: Iterator[Sample]) -> None:
         """Frames sent to everybody."""
         for key, payload in batch:
             fields = BROADCAST.parse(key)
@@ -136,7 +137,7 @@ class Delivery:
             self._hold_sender(sender, others)
         self.flush()
 
-    def stream(self, batch: list[Sample]) -> None:
+    def stream(self, batch: Iterator[Sample]) -> None:
         """A robot's topic data, for those of its registrants that are ours."""
         for key, payload in batch:
             stream = self.streams.get(key)

@@ -292,7 +292,7 @@ class _Way:
             keys.add(PING.of(zid=f"{MARK}-{client.name}"))
         return sorted(keys)
 
-    def _hear(self, name: str, batch: list[Sample]) -> None:
+    def _hear(self, name: str, batch: Iterator[Sample]) -> None:
         for _, payload in batch:
             if (attempt := self._by_payload.get(bytes(payload))) is not None:
                 attempt.heard.add(name)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import logging
-import operator
 import threading
 import time
 from collections import Counter, deque
@@ -17,7 +15,7 @@ import zenoh
 from macs_zenoh.guard import Ages, Gate
 
 from .panics import end_if_panic
-from .samples import AtOnce, OnBatch, OnNumbered, Outlet, Payload
+from .samples import AtOnce, OnBatch, OnNumbered, Outlet, Payload, Sample
 from .threads import keep_attached
 
 log = logging.getLogger("macs.mesh")
@@ -30,19 +28,6 @@ _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 def now_s() -> float:
     """The time on that clock."""
     return time.clock_gettime(_CLOCK)
-
-
-class _Batch(list[Any]):
-    """Samples, of which it is known how many have been looked at."""
-
-    def __init__(self, samples: list[Any]) -> None:
-        super().__init__(samples)
-        self.following: Iterator[Any] = iter(())
-        """Those after the one that is being handled."""
-
-    def __iter__(self) -> Iterator[Any]:
-        self.following = super().__iter__()
-        return self.following
 
 
 class Arrivals:
@@ -62,9 +47,12 @@ class Arrivals:
     LARGE_BYTES = 16 << 10
     LIMIT_BYTES = 128 << 20
     """Of payloads that are large; the others are bounded by their number."""
-    BATCH = 512
-    BATCH_BYTES = 128 << 10
-    """Handled without a pause in which the loop does other things: it can be thousands of small frames."""
+    UNWATCHED_BYTES = 128 << 10
+    """Handled without a look at the time: it can be thousands of small frames."""
+    SAMPLE_BYTES = 256
+    """What each sample counts as besides its payload."""
+    BATCH_S = 0.002
+    """After so long what a handler has gathered is written."""
     TURN_S = 0.008
     """After so long the loop does other things."""
     PATIENCE_S = 0.1
@@ -80,8 +68,10 @@ class Arrivals:
         self._loop = loop
         self._loop_thread = threading.get_ident()
         self._wake = wake
-        self._queue: deque[tuple[Callable[[list[Any]], None], tuple[Any, ...]]] = deque()
+        self._queue: deque[tuple[Callable[[Iterator[Any]], None], tuple[Any, ...]]] = deque()
         self._waiting = False
+        self._handled: tuple[Any, ...] | None = None
+        """The sample that is being handled."""
         self._large_bytes = 0
         self._large_lock = threading.Lock()
         self._turn = threading.Lock()
@@ -234,49 +224,65 @@ class Arrivals:
 
     def _deliver_batch(self) -> None:
         self._waiting = False
-        queue, until = self._queue, time.monotonic() + self.TURN_S
-        while True:  # a few large samples cost next to nothing, and who sends them must feel soon where they wait
-            self._handle(self._next())
-            if not queue or time.monotonic() > until:
-                break
+        queue, now = self._queue, time.monotonic()
+        until = now + self.TURN_S
+        while queue and now < until:  # who sends large samples must feel soon where they wait
+            on_batch = queue[0][0]
+            waiting = self._taken_out(on_batch, now + self.BATCH_S)
+            if not self._hand_over(on_batch, waiting):  # it did not look at them
+                next(waiting, None)
+            now = time.monotonic()
         if queue and not self._waiting:
             self._waiting = True
             self._loop.call_soon(self._deliver)
 
-    def _next(self) -> list[tuple[Callable[[list[Any]], None], tuple[Any, ...]]]:
-        """The next samples, as many as are handled without a look at the time."""
-        queue, arrived, room = self._queue, [], self.BATCH_BYTES
-        for _ in range(min(len(queue), self.BATCH)):
-            item = queue.popleft()
-            arrived.append(item)
-            room -= len(item[1][1])
-            if room <= 0:
-                break
-        return arrived
-
-    def _handle(self, arrived: list[tuple[Callable[[list[Any]], None], tuple[Any, ...]]]) -> None:
-        freed = sum(len(item[1]) for _, item in arrived if len(item[1]) > self.LARGE_BYTES)
-        if freed:
-            with self._large_lock:
-                self._large_bytes -= freed
-        for on_batch, group in itertools.groupby(arrived, key=operator.itemgetter(0)):
-            self.hand_over(on_batch, [sample for _, sample in group])
-
-    def hand_over(self, on_batch: Callable[[list[Any]], None], samples: list[Any]) -> None:
-        """Let a subscription have its samples. One that cannot be handled, for a reason that nobody thought of, costs
-        itself: those behind it are somebody else's."""
-        while samples:
-            batch = _Batch(samples)
-            try:
-                on_batch(batch)
+    def _taken_out(self, on_batch: Callable[[Iterator[Any]], None], until: float) -> Iterator[Any]:
+        """The samples in the queue as far as they are for this handler, which may have them for so long. Each is taken
+        out as it is handled."""
+        queue, unwatched = self._queue, self.UNWATCHED_BYTES
+        while queue:
+            handler, sample = queue[0]
+            if handler is not on_batch and handler != on_batch:
                 return
+            queue.popleft()
+            size = len(sample[1])
+            if size > self.LARGE_BYTES:
+                with self._large_lock:
+                    self._large_bytes -= size
+            self._handled = sample
+            yield sample
+            unwatched -= size + self.SAMPLE_BYTES
+            if unwatched <= 0:
+                if time.monotonic() > until:
+                    return
+                unwatched = self.UNWATCHED_BYTES
+
+    def pass_on(self, on_batch: OnBatch, samples: list[Sample]) -> None:
+        """Let a subscription have samples that another one has put in order."""
+        self._hand_over(on_batch, self._each(samples))
+
+    def _each(self, samples: list[Sample]) -> Iterator[Sample]:
+        for sample in samples:
+            self._handled = sample
+            yield sample
+
+    def _hand_over(self, on_batch: Callable[[Iterator[Any]], None], samples: Iterator[Any]) -> bool:
+        """Let a handler have samples; whether it asked for any. One that cannot be handled, for a reason that nobody
+        thought of, costs itself: those behind it are somebody else's."""
+        asked = False
+        while True:
+            self._handled = None
+            try:
+                on_batch(samples)
+                return asked or self._handled is not None
             except Exception:
-                rest = list(batch.following)
                 self._drops["failed_sample"] += 1
                 if self._drops["failed_sample"] == 1:
-                    key = samples[-len(rest) - 1][0]
-                    log.exception("a sample on %s failed (logged once, counted as failed_sample)", key)
-                samples = rest
+                    where = self._handled[0] if self._handled else "no key"
+                    log.exception("a sample on %s failed (logged once, counted as failed_sample)", where)
+                if self._handled is None:
+                    return asked
+                asked = True
 
     def _has_room(self) -> bool:
         return self._patiently(lambda: len(self._queue) < self.LIMIT)

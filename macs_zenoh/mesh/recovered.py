@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import zenoh
@@ -89,13 +89,13 @@ class Recovered:
         linked = self._linked
         dropped: list[bool] = []
 
-        def known(batch: list[Numbered]) -> None:
+        def known(batch: Iterator[Numbered]) -> None:
             freed: list[Sample] = []
             for key, _, source, number in batch:
                 freed += self._recovery.known(source, key, number, time.monotonic())
             self._go_on(freed)
 
-        def ended(_: list[Sample]) -> None:
+        def ended(_: Iterator[Sample]) -> None:
             if dropped and not self._closed:
                 self._loop.call_later(self.AGAIN_S, self._look_for_sources)
             elif linked and self._linked:  # else once there is a router
@@ -103,14 +103,14 @@ class Recovered:
 
         self._get(f"{self._key}/{SOURCES}?_max=1", known, ended, dropped)
 
-    def _numbered(self, batch: list[Numbered]) -> None:
+    def _numbered(self, batch: Iterator[Numbered]) -> None:
         now = time.monotonic()
         recovery, freed = self._recovery, []
         for key, payload, source, number in batch:
             freed += recovery.sample(source, number, (key, payload), now)
         self._go_on(freed)
 
-    def _heartbeat(self, batch: list[Sample]) -> None:
+    def _heartbeat(self, batch: Iterator[Sample]) -> None:
         now = time.monotonic()
         freed: list[Sample] = []
         for key, payload in batch:
@@ -135,12 +135,12 @@ class Recovered:
         if deadline < math.inf:
             self._timer = self._loop.call_later(max(0.0, deadline - now), self._go_on, [])
         if freed:
-            self._arrivals.hand_over(self._on_batch, freed)
+            self._arrivals.pass_on(self._on_batch, freed)
 
     def _ask(self, ask: Ask) -> None:
         dropped: list[bool] = []
 
-        def replied(batch: list[Numbered]) -> None:
+        def replied(batch: Iterator[Numbered]) -> None:
             now = time.monotonic()
             if dropped:
                 self._recovery.reply_dropped(ask)
@@ -149,7 +149,7 @@ class Recovered:
                 freed += self._recovery.reply(ask, number, (key, payload), now)
             self._go_on(freed)
 
-        def ended(_: list[Sample]) -> None:
+        def ended(_: Iterator[Sample]) -> None:
             if dropped:
                 self._recovery.reply_dropped(ask)
             self._go_on(self._recovery.ended(ask, time.monotonic()))
@@ -179,5 +179,5 @@ class Recovered:
             log.debug("get: %s", error)
 
 
-def _ignore(_: list[Sample]) -> None:
+def _ignore(_: Iterator[Sample]) -> None:
     """Replies that nobody has numbered."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from enum import Enum
 from typing import Any, Protocol
 
@@ -41,7 +41,8 @@ class Traffic(Enum):
 Sample = tuple[str, Payload]
 """What a subscription receives: key and payload. Not to be changed: others may have the same payload."""
 
-OnBatch = Callable[[list[Sample]], None]
+OnBatch = Callable[[Iterator[Sample]], None]
+"""Takes samples one after the other: each leaves the queue when it is asked for."""
 OnMiss = Callable[[str, int], None]
 AtOnce = Callable[[str, Payload], bool]
 """Takes one sample, by key and payload, in a thread of Zenoh's: soon, and without waiting for the loop. False: it has
@@ -51,7 +52,7 @@ Handler = Callable[[str, bytes], Awaitable[bytes | None]]
 
 Numbered = tuple[str, Payload, str, int]
 """Key, payload, source and number of a sample that its source keeps."""
-OnNumbered = Callable[[list[Numbered]], None]
+OnNumbered = Callable[[Iterator[Numbered]], None]
 
 
 class Subscription:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,7 @@ async def test_what_the_rules_allow_works(as_user: Callable[[str], MeshSettings]
 
         streamed: asyncio.Queue[bytes] = asyncio.Queue()
 
-        def take(batch: list[tuple[str, bytes]]) -> None:
+        def take(batch: Iterator[tuple[str, bytes]]) -> None:
             for _, payload in batch:
                 streamed.put_nowait(payload)
 

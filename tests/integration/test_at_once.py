@@ -6,7 +6,7 @@ import asyncio
 import random
 import threading
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import suppress
 
 import pytest
@@ -37,7 +37,7 @@ class Receiver:
         self.threads: set[int] = set()
         self.takes = lambda number: True
 
-    def batch(self, batch: list[Sample]) -> None:
+    def batch(self, batch: Iterator[Sample]) -> None:
         """On the loop."""
         self.batches.append(len(batch))
         self.numbers += [number(payload) for _, payload in batch]
@@ -125,7 +125,7 @@ async def test_nothing_overtakes_what_the_loop_is_handling(mesh: Mesh, sender: M
     receiver = Receiver()
     await listening(mesh, sender, receiver)
 
-    def slow(batch: list[Sample]) -> None:
+    def slow(batch: Iterator[Sample]) -> None:
         for i in range(10, 13):  # they arrive in Zenoh's thread while this goes on
             sender.put(KEY, i.to_bytes(4, "big"), Traffic.COMMAND)
             time.sleep(0.05)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -96,7 +96,7 @@ async def test_a_sample_that_fails_costs_itself(router: str, caplog: pytest.LogC
     async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
         found: list[bytes] = []
 
-        def handle(batch: list[Sample]) -> None:
+        def handle(batch: Iterator[Sample]) -> None:
             for _, payload in batch:
                 if payload in (b"3", b"5"):
                     raise ZeroDivisionError

@@ -7,7 +7,7 @@ import itertools
 import logging
 import signal
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -84,7 +84,7 @@ class Numbers:
         self.heard: list[int] = []
         self.missed: list[tuple[str, int]] = []
 
-    def take(self, batch: list[Sample]) -> None:
+    def take(self, batch: Iterator[Sample]) -> None:
         self.heard += [int.from_bytes(payload, "big") for _, payload in batch]
 
     def miss(self, key: str, count: int) -> None:

@@ -8,7 +8,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,7 +112,7 @@ def listening(mesh: Mesh, key: str) -> list[Sample]:
     """What arrives on an expression."""
     arrived: list[Sample] = []
 
-    def take(batch: list[Sample]) -> None:
+    def take(batch: Iterator[Sample]) -> None:
         arrived.extend((key, bytes(payload)) for key, payload in batch)
 
     mesh.subscribe(key, take)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 
 import pytest
 from geometry_msgs.msg import Twist
@@ -73,7 +73,7 @@ class Streams:
         self.frames: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue()
         self._subscription = agent.mesh.subscribe(STREAM.every(type=1, id=robot), self._take)
 
-    def _take(self, batch: list[Sample]) -> None:
+    def _take(self, batch: Iterator[Sample]) -> None:
         for key, payload in batch:
             self.frames.put_nowait((key, payload))
 

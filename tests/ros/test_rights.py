@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -357,7 +357,7 @@ class Lodging:
         self._reading = mesh.subscribe(inbox(2, self.ID), self._take)
         self._token: Token | None = None
 
-    def _take(self, batch: list[Sample]) -> None:
+    def _take(self, batch: Iterator[Sample]) -> None:
         for _, payload in batch:
             self.inbox.put_nowait(bytes(payload))
 
