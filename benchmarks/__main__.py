@@ -18,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from macs_zenoh.mesh.awake import Awake
+from macs_zenoh.mesh.cpu_latency import Awake
 
 from . import awareness, cases, robot_speed, scale
 from .figures import Figure, table

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from statistics import median
 from typing import NamedTuple
 
-from macs_zenoh.wire import MACS
+from macs_zenoh.protocol.wire import MACS
 
 from .figures import Figure
 from .link import CountingLink

@@ -16,8 +16,8 @@ from contextlib import suppress
 from typing import Any
 
 from bridge.headset import frames
-from macs_zenoh.messages import Metadata, NodeType, Welcome, encode_data
-from macs_zenoh.wire import MACS, FrameDecoder, MessageDecoder, encode_message, split_message
+from macs_zenoh.protocol.messages import Metadata, NodeType, Welcome, encode_data
+from macs_zenoh.protocol.wire import MACS, FrameDecoder, MessageDecoder, encode_message, split_message
 
 from .worker import serve
 

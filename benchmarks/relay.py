@@ -14,8 +14,8 @@ from typing import Any, cast
 
 import uvloop
 
-from macs_zenoh.messages import Configuration, Metadata, Welcome, decode_management, encode_data
-from macs_zenoh.wire import encode_message
+from macs_zenoh.protocol.messages import Configuration, Metadata, Welcome, decode_management, encode_data
+from macs_zenoh.protocol.wire import encode_message
 
 HEADER = struct.Struct("<B10H10BII")
 

@@ -13,9 +13,18 @@ from typing import Any
 import uvloop
 
 import macs_zenoh
-from macs_zenoh.existing import CDR
-from macs_zenoh.messages import ROS, UNITY, AddNode, Metadata, NodeType, StreamData, decode_data, encode_management
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.existing import CDR
+from macs_zenoh.protocol.messages import (
+    ROS,
+    UNITY,
+    AddNode,
+    Metadata,
+    NodeType,
+    StreamData,
+    decode_data,
+    encode_management,
+)
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 
 from .worker import say
 

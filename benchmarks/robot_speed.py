@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 
-from macs_zenoh.mesh.awake import Awake
+from macs_zenoh.mesh.cpu_latency import Awake
 
 from .figures import Figure
 from .plan import KIB, Case, Plan, Run, in_turn

@@ -14,7 +14,7 @@ from typing import Any
 import uvloop
 
 import macs_zenoh
-from macs_zenoh.messages import AddNode, RemoveNode, decode_data
+from macs_zenoh.protocol.messages import AddNode, RemoveNode, decode_data
 
 from .worker import say
 

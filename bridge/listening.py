@@ -6,8 +6,8 @@ import errno
 import socket
 from collections.abc import Iterator
 
-from macs_zenoh.addresses import EVERYWHERE, joined
 from macs_zenoh.errors import Unreachable
+from macs_zenoh.protocol.addresses import EVERYWHERE, joined
 
 BOTH_FAMILIES = ("", "::")
 NOT_HERE = (errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL)

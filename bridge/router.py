@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 from bridge.doctor.below import tls_settings
 from bridge.doctor.look import at, endpoints_of
-from macs_zenoh.addresses import is_local, of_endpoint
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import Mesh, configuration
+from macs_zenoh.protocol.addresses import is_local, of_endpoint
 
 log = logging.getLogger("macs.router")
 

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from .agent import join as join
     from .config import MeshSettings as MeshSettings
     from .config import TrafficRule as TrafficRule
-    from .directory import AgentInfo as AgentInfo
     from .errors import CallTimeout as CallTimeout
     from .errors import ConfigError as ConfigError
     from .errors import MacsError as MacsError
@@ -24,9 +23,10 @@ if TYPE_CHECKING:
     from .errors import TooManyDestinations as TooManyDestinations
     from .errors import Unreachable as Unreachable
     from .errors import UsageError as UsageError
-    from .messages import Metadata as Metadata
-    from .messages import NodeType as NodeType
-    from .reading import Message as Message
+    from .protocol.directory import AgentInfo as AgentInfo
+    from .protocol.messages import Metadata as Metadata
+    from .protocol.messages import NodeType as NodeType
+    from .protocol.reading import Message as Message
 
 _WHERE = {
     "agent": ("Agent", "Call", "join"),

@@ -20,18 +20,18 @@ from functools import partial
 from typing import NamedTuple
 
 from .config import MeshSettings, Priority, TrafficRule, changed
-from .directory import AgentInfo, Change, Directory
 from .errors import CallTimeout, OutOfRange, Unreachable, UsageError, WireError
-from .guard import Guard
 from .identity import Identity
-from .keyexpr import BROADCAST, CALL, GROUP, STREAM, type_name, type_number
 from .mesh import Mesh, Sample, Subscription, Traffic
-from .messages import BROADCAST as EVERYBODY
-from .messages import Metadata, NodeType
 from .presence import Presence
-from .reading import Message, Reader
-from .routing import call, inbox, keys_of
-from .wire import Layout, encode_frame, encode_message, parse_frame
+from .protocol.directory import AgentInfo, Change, Directory
+from .protocol.guard import Guard
+from .protocol.keyexpr import BROADCAST, CALL, GROUP, STREAM, type_name, type_number
+from .protocol.messages import BROADCAST as EVERYBODY
+from .protocol.messages import Metadata, NodeType
+from .protocol.reading import Message, Reader
+from .protocol.routing import call, inbox, keys_of
+from .protocol.wire import Layout, encode_frame, encode_message, parse_frame
 
 log = logging.getLogger("macs.agent")
 

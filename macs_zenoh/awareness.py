@@ -23,13 +23,14 @@ from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager
 from typing import NamedTuple
 
-from . import blocks, named
 from .agent import Agent
 from .errors import Refused, Unreachable, UsageError, WireError
-from .keyexpr import LAST, NAME, NAMED, NAMED_ALL, WANTED, type_name
 from .mesh import Mesh, Sample, Subscription, Token, Traffic
-from .named import Arrivals, Envelope, LastValues, Named, Names, Outcome, RateLimits, check_word
-from .wire import PROBE
+from .protocol import ids as blocks
+from .protocol import named
+from .protocol.keyexpr import LAST, NAME, NAMED, NAMED_ALL, WANTED, type_name
+from .protocol.named import Arrivals, Envelope, LastValues, Named, Names, Outcome, RateLimits, check_word
+from .protocol.wire import PROBE
 
 log = logging.getLogger("macs.awareness")
 

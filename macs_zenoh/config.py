@@ -40,9 +40,9 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, get_a
 import msgspec
 from msgspec import Meta
 
-from macs_zenoh import addresses
 from macs_zenoh.errors import ConfigError, UsageError
-from macs_zenoh.keyexpr import expression_problem, type_name, type_number
+from macs_zenoh.protocol import addresses
+from macs_zenoh.protocol.keyexpr import expression_problem, type_name, type_number
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -293,15 +293,15 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     """Of these, commands to robots; as a robot's own limit, before they fill the way to it. Stops are not counted."""
     max_requests_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
     """And all else that goes to robots."""
-    handshake_s: Seconds = 10.0
+    handshake_timeout_s: Seconds = 10.0
     """A connection that has not configured itself by then is closed."""
-    silence_s: Seconds = 60.0
+    idle_timeout_s: Seconds = 60.0
     """A connection silent for so long is closed. Agents send a heartbeat after 5 s without other output; but a headset
     that is taken off for a moment sends none, and existing ones never connect again. Hosts that died are noticed by
     TCP, within 20 s."""
     outbox_bytes: Annotated[int, Meta(ge=64 * 1024, le=4 * 1024**3)] = 8 * 1024 * 1024
     """Waiting for one connection, at most. One message may always wait, however large."""
-    stall_s: Seconds = 30.0
+    write_timeout_s: Seconds = 30.0
     """A connection that takes nothing for so long while something waits is closed."""
     block: GroupId | None = None
     """The block of 256 agent ids this gateway gives out first, 0 being 1..255; unset: lease the first free one."""
@@ -365,7 +365,7 @@ class TopicRule(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True)
     read_only: bool | None = None
     """Headsets may subscribe to the topic, not publish to it."""
 
-    call_s: Seconds | None = None
+    call_timeout_s: Seconds | None = None
     """How long a service may take, on either side; for actions, how long a goal may wait to be accepted."""
     error_response: dict[str, Any] | None = None
     """Fields of the response that a ROS caller gets when a headset does not answer."""
@@ -421,11 +421,11 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Topics, services and actions that headsets may use; existing programs name them freely, so all by default."""
     hide: list[NamePattern] = msgspec.field(default_factory=lambda: list(ROBOT_HIDES))
     """Except these."""
-    call_s: Seconds = 5.0
+    call_timeout_s: Seconds = 5.0
     """How long a service may take unless a rule says otherwise; existing headsets wait 5 s."""
     max_calls: Annotated[int, Meta(ge=1, le=100_000)] = 1024
     """Calls that may be open on one service at one time."""
-    result_s: Annotated[float, Meta(gt=0, le=604_800)] = 900.0
+    result_timeout_s: Annotated[float, Meta(gt=0, le=604_800)] = 900.0
     """How long the result of an action is kept for a headset that has lost its connection."""
     stop_topic: Annotated[str, Meta(pattern=_TOPIC_OR_NONE)] = "/emergency_stop"
     """The emergency stop: true on this topic (std_msgs/Bool) stops, false releases. Empty: there is none."""

@@ -12,12 +12,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
 
-from . import blocks
-from .blocks import Contests
 from .errors import MacsError, OutOfRange, Unreachable, UsageError
-from .keyexpr import LEASE, type_name
 from .mesh import Mesh, Subscription
 from .presence import Contested, Presence
+from .protocol import ids as blocks
+from .protocol.ids import Contests
+from .protocol.keyexpr import LEASE, type_name
 
 log = logging.getLogger("macs.agent")
 

@@ -25,7 +25,7 @@ from typing import Any, ClassVar, NamedTuple
 from msgspec import Struct
 
 from .errors import ConfigError
-from .messages import MANAGERS
+from .protocol.messages import MANAGERS
 
 GROUP = "macs.managers"
 """Entry-point group in which packages offer managers."""

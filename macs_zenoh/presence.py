@@ -11,9 +11,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 
-from .directory import AgentInfo, Change, Directory
-from .keyexpr import PRESENCE
 from .mesh import Mesh, Subscription, Token
+from .protocol.directory import AgentInfo, Change, Directory
+from .protocol.keyexpr import PRESENCE
 
 log = logging.getLogger("macs.presence")
 

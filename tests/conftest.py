@@ -20,7 +20,7 @@ ALONE = (
     "tests/network/",
     "tests/integration/test_at_once.py",
     "tests/integration/test_limits.py",
-    "tests/integration/test_shortcut.py",
+    "tests/integration/test_direct_writer.py",
     "tests/integration/test_traffic.py",
     "tests/ros/test_commands_at_once.py",
     "tests/ros/test_deadman.py",

@@ -23,7 +23,7 @@ from bridge.ros.session import RosSession
 from macs_zenoh.awareness import Received
 from macs_zenoh.config import Settings
 from macs_zenoh.errors import ConfigError, MacsError
-from macs_zenoh.named import Copies, Outcome
+from macs_zenoh.protocol.named import Copies, Outcome
 
 log = logging.getLogger("macs.awareness")
 

@@ -17,8 +17,8 @@ from macs_zenoh.awareness import Awareness, Received, Registration
 from macs_zenoh.config import Settings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import ROS
-from macs_zenoh.named import Outcome
+from macs_zenoh.protocol.messages import ROS
+from macs_zenoh.protocol.named import Outcome
 
 log = logging.getLogger("macs.awareness")
 

@@ -25,7 +25,7 @@ from bridge.awareness import cdr
 from bridge.ros.intake import Intake
 from macs_zenoh.config import AwarenessSettings
 from macs_zenoh.errors import ConfigError, UsageError
-from macs_zenoh.named import check_word
+from macs_zenoh.protocol.named import check_word
 
 log = logging.getLogger("macs.awareness")
 

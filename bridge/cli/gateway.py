@@ -22,9 +22,9 @@ from bridge import memory
 from bridge.cli import options, running
 from bridge.cli.children import Child, stop_in_order
 from bridge.listening import bound
-from macs_zenoh.addresses import is_local, joined
 from macs_zenoh.config import GatewaySettings, Settings, changed
 from macs_zenoh.errors import UsageError
+from macs_zenoh.protocol.addresses import is_local, joined
 
 log = logging.getLogger("macs.gateway")
 

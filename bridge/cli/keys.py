@@ -11,9 +11,9 @@ import argparse
 import json
 
 from bridge.cli import output
-from macs_zenoh import keyexpr
-from macs_zenoh.keyexpr import Key
 from macs_zenoh.plain import plain
+from macs_zenoh.protocol import keyexpr
+from macs_zenoh.protocol.keyexpr import Key
 
 SUMMARY = "the key map, or what one key means"
 

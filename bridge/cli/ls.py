@@ -3,7 +3,7 @@
 A headset's session is its gateway's, so headsets with one session share a gateway. Robots are asked for their state:
 STATE says which are stopped, who has control of which topic, and ? for a robot that should answer and does not: it
 hangs, or access rules do not let you ask it ([operator] in the settings, or --as, say who you are). A headset that
-nothing was heard of for 10 s is away: taken off, or out of reach; its gateway lets it go later (silence_s).
+nothing was heard of for 10 s is away: taken off, or out of reach; its gateway lets it go later (idle_timeout_s).
 Of a gateway the address is where headsets connect to it; routers may hide theirs.
 -v adds, for each robot: the emergency stop, who has registered what, control and dead-man of each topic, what was
 lost, and what it offers. Exit code 1 when no router answers, 130 after Ctrl-C.
@@ -28,12 +28,12 @@ from typing import Any
 
 from bridge.cli import options, output, robots, running
 from bridge.cli.robots import Node, Offers, Operator, Router, Status
-from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import MacsError, NotServed, Refused, Unreachable
-from macs_zenoh.messages import ROS
-from macs_zenoh.named import Named
-from macs_zenoh.ping import Pong
 from macs_zenoh.plain import plain
+from macs_zenoh.protocol.directory import AgentInfo
+from macs_zenoh.protocol.messages import ROS
+from macs_zenoh.protocol.named import Named
+from macs_zenoh.protocol.ping import Pong
 
 SUMMARY = "who is online, and what robots are doing"
 VERBOSE = "all about each robot"

@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import msgspec
 from msgspec import Struct
 
-from macs_zenoh import ping
 from macs_zenoh.config import MeshSettings, OperatorSettings
-from macs_zenoh.directory import AgentInfo, Directory
 from macs_zenoh.errors import MacsError, Refused, TooLong, Unreachable, UsageError
-from macs_zenoh.keyexpr import LEASE, NAME, PING, PRESENCE, type_name, type_number
-from macs_zenoh.limits import ANSWER_BYTES
-from macs_zenoh.messages import OPERATOR, ROS, Metadata
-from macs_zenoh.named import Named, Names
-from macs_zenoh.ping import Pong
-from macs_zenoh.routing import call
-from macs_zenoh.wire import Layout
+from macs_zenoh.protocol import ping
+from macs_zenoh.protocol.directory import AgentInfo, Directory
+from macs_zenoh.protocol.keyexpr import LEASE, NAME, PING, PRESENCE, type_name, type_number
+from macs_zenoh.protocol.limits import ANSWER_BYTES
+from macs_zenoh.protocol.messages import OPERATOR, ROS, Metadata
+from macs_zenoh.protocol.named import Named, Names
+from macs_zenoh.protocol.ping import Pong
+from macs_zenoh.protocol.routing import call
+from macs_zenoh.protocol.wire import Layout
 
 if TYPE_CHECKING:
     from macs_zenoh.mesh import Mesh

@@ -28,9 +28,9 @@ from bridge.cli.apart import Apart
 from bridge.cli.children import Child, stop_in_order
 from bridge.listening import bound, for_others
 from bridge.logs import prefix_logs
-from macs_zenoh.addresses import EVERYWHERE, joined, reachable
 from macs_zenoh.config import GatewaySettings, RobotSettings, Settings, changed
 from macs_zenoh.errors import MacsError, Unreachable, UsageError
+from macs_zenoh.protocol.addresses import EVERYWHERE, joined, reachable
 
 log = logging.getLogger("macs.up")
 

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from macs_zenoh import greetings
-from macs_zenoh.addresses import joined, of_endpoint
+from macs_zenoh.protocol import greetings
+from macs_zenoh.protocol.addresses import joined, of_endpoint
 
 from .facts import Certificate, Reach, Speaker, Tls, TlsProblem
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from macs_zenoh.ping import Pong
+from macs_zenoh.protocol.ping import Pong
 
 Reach = Literal["ok", "refused", "silent", "unknown_host", "unreachable", "untried"]
 """How an endpoint's host and port answer, below Zenoh; ``untried`` where there is no TCP to try (quic, udp)."""

@@ -11,9 +11,9 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
-from macs_zenoh.directory import AgentInfo, published
-from macs_zenoh.keyexpr import LEASE, NAME, block_of, type_name
-from macs_zenoh.messages import UNITY
+from macs_zenoh.protocol.directory import AgentInfo, published
+from macs_zenoh.protocol.keyexpr import LEASE, NAME, block_of, type_name
+from macs_zenoh.protocol.messages import UNITY
 
 from .facts import Certificate, Clock, Endpoint, Facts, Program, RouterInfo, Way
 from .kinds import ERROR, GROUPS, KINDS, NOTE, OK, WARNING, Severity

@@ -12,10 +12,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from macs_zenoh.addresses import of_endpoint
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import configuration
+from macs_zenoh.protocol.addresses import of_endpoint
 
 from . import below
 from .facts import Endpoint, Facts, Own

@@ -18,16 +18,26 @@ from typing import Any
 import msgspec
 from msgspec import structs
 
-from macs_zenoh import ping
-from macs_zenoh.addresses import of_endpoint
 from macs_zenoh.config import Settings
-from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import CallTimeout, ConfigError, MacsError, Refused, Unreachable, UsageError, WireError
-from macs_zenoh.keyexpr import BLOCK_SIZE, LEASE, NAME, PING, PRESENCE, UNICAST, block_of, type_name, type_number
 from macs_zenoh.mesh import Mesh, Subscription, Traffic, configuration
-from macs_zenoh.messages import NOBODY, ROS, UNITY, Metadata
-from macs_zenoh.routing import call, inbox
-from macs_zenoh.wire import PROBE
+from macs_zenoh.protocol import ping
+from macs_zenoh.protocol.addresses import of_endpoint
+from macs_zenoh.protocol.directory import AgentInfo
+from macs_zenoh.protocol.keyexpr import (
+    BLOCK_SIZE,
+    LEASE,
+    NAME,
+    PING,
+    PRESENCE,
+    UNICAST,
+    block_of,
+    type_name,
+    type_number,
+)
+from macs_zenoh.protocol.messages import NOBODY, ROS, UNITY, Metadata
+from macs_zenoh.protocol.routing import call, inbox
+from macs_zenoh.protocol.wire import PROBE
 
 from . import below
 from .facts import Clock, Echo, Endpoint, Facts, Own, Program, Rights, RouterInfo, Session, Way

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, KeysView
 
 from macs_zenoh.mesh import Token
-from macs_zenoh.messages import UNITY
-from macs_zenoh.registrations import AgentKey
+from macs_zenoh.protocol.messages import UNITY
+from macs_zenoh.protocol.registrations import AgentKey
 
 from .connection import Connection
 

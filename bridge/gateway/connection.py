@@ -1,4 +1,4 @@
-"""One socket: bytes between a TCP agent and its `Peer`, and the queue of an agent that reads too slowly."""
+"""One socket: bytes between a TCP agent and its `TcpAgent`, and the queue of an agent that reads too slowly."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from collections.abc import Collection, Sequence
 from contextlib import suppress
 from typing import Protocol, cast
 
-from macs_zenoh.addresses import joined, of_peer
-from macs_zenoh.budget import Toll
-from macs_zenoh.existing import Asked, Verdict, to_headset, to_newer, to_robot
-from macs_zenoh.keyexpr import type_name
-from macs_zenoh.limits import REQUESTS_PER_S, UNFINISHED_FREE_BYTES
-from macs_zenoh.messages import ROS, AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
-from macs_zenoh.pace import Pace
-from macs_zenoh.peer import Event, Joined, Left, Peer, Rejected, Sent, State
-from macs_zenoh.queues import Chunk, Outbox
-from macs_zenoh.robot_nodes import RobotNodes
-from macs_zenoh.wire import FrameDecoder, Header, encode_message
+from macs_zenoh.protocol.addresses import joined, of_peer
+from macs_zenoh.protocol.budget import Toll
+from macs_zenoh.protocol.existing import Asked, Verdict, to_headset, to_newer, to_robot
+from macs_zenoh.protocol.keyexpr import type_name
+from macs_zenoh.protocol.limits import REQUESTS_PER_S, UNFINISHED_FREE_BYTES
+from macs_zenoh.protocol.messages import ROS, AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
+from macs_zenoh.protocol.outbox import Chunk, Outbox
+from macs_zenoh.protocol.rate_limit import Pace
+from macs_zenoh.protocol.robot_nodes import RobotNodes
+from macs_zenoh.protocol.tcp_agent import Event, Joined, Left, Rejected, Sent, State, TcpAgent
+from macs_zenoh.protocol.wire import FrameDecoder, Header, encode_message
 
-from .brake import Brake
+from .backpressure import Backpressure
+from .direct_writer import DirectWriter
 from .memory import Memory
-from .shortcut import Shortcut
 
 log = logging.getLogger("macs.gateway")
 
@@ -100,7 +100,7 @@ class Owner(Protocol):
 
 
 class Connection(asyncio.BufferedProtocol):
-    """A TCP agent's socket. Everything it means is decided in `Peer` and by its gateway."""
+    """A TCP agent's socket. Everything it means is decided in `TcpAgent` and by its gateway."""
 
     def __init__(
         self,
@@ -108,23 +108,23 @@ class Connection(asyncio.BufferedProtocol):
         *,
         memory: Memory,
         outbox_bytes: int,
-        stall_s: float,
+        write_timeout_s: float,
         robot_packages: Collection[str] = (),
     ) -> None:
         self.owner = owner
-        self.peer: Peer
+        self.peer: TcpAgent
         self.pace: Pace
         self.greeted = False
         self.host = self.address = "?"
         self.drops: Counter[str] = Counter()
         self._outbox = Outbox(outbox_bytes)
         self._memory = memory
-        self._stall_s = stall_s
+        self._write_timeout_s = write_timeout_s
         self._transport: asyncio.Transport
         self._ready: list[Chunk] = []
         self._ready_bytes = 0
         self._loop = asyncio.get_running_loop()
-        self._shortcut: Shortcut | None = None
+        self._direct_writer: DirectWriter | None = None
         self._writing = threading.RLock()
         """Held by whoever writes, the loop or a thread of Zenoh's, as long as older messages are on their way."""
         self._rest = b""
@@ -155,7 +155,7 @@ class Connection(asyncio.BufferedProtocol):
         self._looked = False
         self.congested = False
         """Whether so much waits for this agent that its senders should slow down."""
-        self.brake = Brake()
+        self.backpressure = Backpressure()
         self._toll = Toll(REQUESTS_PER_S)
         self._tolled: asyncio.TimerHandle | None = None
         self.grouped_at = -math.inf
@@ -199,7 +199,7 @@ class Connection(asyncio.BufferedProtocol):
         if self._pauses and not self._transport.is_closing():
             self._transport.pause_reading()
 
-    def greet(self, peer: Peer) -> None:
+    def greet(self, peer: TcpAgent) -> None:
         """The agent has an id: tell it, and begin to listen."""
         self.peer = peer
         self.greeted = True
@@ -248,21 +248,21 @@ class Connection(asyncio.BufferedProtocol):
         self._account()
         if self.congested and not self._outbox:
             self.congested = False
-            self.brake.release()
+            self.backpressure.release()
 
     def connection_lost(self, exc: Exception | None) -> None:
         for timer in (self._timer, self._tolled, self.regrouping):
             if timer is not None:
                 timer.cancel()
         with self._writing:
-            shortcut, self._shortcut = self._shortcut, None
+            shortcut, self._direct_writer = self._direct_writer, None
             if shortcut is not None:
                 shortcut.close()
         if self._refused:
             return
         if self.greeted:
             self.peer.lost()
-        self.brake.release()
+        self.backpressure.release()
         self._memory.unfinished.note(self, self.host, 0)
         self._memory.waiting.set(self, self.host, 0)
         self.owner.closed(self)
@@ -349,7 +349,7 @@ class Connection(asyncio.BufferedProtocol):
     def free(self) -> bool:
         """Whether nothing waits to be sent, so that `send_now` can be tried. From any thread."""
         return (
-            self._shortcut is not None
+            self._direct_writer is not None
             and self._paused_at is None
             and not (self._ready or self._rest or self._transport.is_closing())
             and not self._transport.get_write_buffer_size()
@@ -359,7 +359,7 @@ class Connection(asyncio.BufferedProtocol):
         """Send topic data in a thread of Zenoh's, after seeing that the agent is `free`: into the socket, and what it
         does not take soon on the loop."""
         with self._writing:
-            sent = self._shortcut.send(message) if self.free and self._shortcut is not None else 0
+            sent = self._direct_writer.send(message) if self.free and self._direct_writer is not None else 0
             if sent == len(message):
                 return
             self._rest += message[sent:]
@@ -387,9 +387,9 @@ class Connection(asyncio.BufferedProtocol):
         if len(self._last_types) > LAST_TYPES:
             del self._last_types[next(iter(self._last_types))]
         self._verdicts.clear()
-        if node_type == NodeType.SUBSCRIBER and self._shortcut is None and not self._transport.is_closing():
+        if node_type == NodeType.SUBSCRIBER and self._direct_writer is None and not self._transport.is_closing():
             with suppress(OSError):  # without it topics take the usual way
-                self._shortcut = Shortcut(self._transport.get_extra_info("socket"))
+                self._direct_writer = DirectWriter(self._transport.get_extra_info("socket"))
 
     def is_registered(self, node: AddNode) -> bool:
         """Whether the agent has this interface node already."""
@@ -547,7 +547,7 @@ class Connection(asyncio.BufferedProtocol):
             self._timer.cancel()
         due = self.peer.next_deadline()
         if self._paused_at is not None:
-            due = min(due, self._paused_at + self._stall_s)
+            due = min(due, self._paused_at + self._write_timeout_s)
         now = time.monotonic()
         due = min(due, max(self.peer.heard_at + AWAY_S, now + LOOK_S))
         delay_s = max(0.0, due - now) + 0.001
@@ -559,8 +559,8 @@ class Connection(asyncio.BufferedProtocol):
         now = time.monotonic()
         if now < self.peer.next_deadline() or not self._must_be_read():
             self._events(self.peer.tick(now))
-        if self._paused_at is not None and now >= self._paused_at + self._stall_s:
-            self.close(f"it has not read for {self._stall_s:g} s")
+        if self._paused_at is not None and now >= self._paused_at + self._write_timeout_s:
+            self.close(f"it has not read for {self._write_timeout_s:g} s")
         elif self.is_away(now) and _is_gone(self._transport.get_extra_info("socket")):
             self.close("its host does not answer")
         if self.peer.state is not State.GONE:

@@ -1,7 +1,7 @@
 """From the mesh to TCP agents: who of ours gets a sample, and that nothing reaches them that would harm them.
 
-Existing programs go deaf for good on much that is legal (`macs_zenoh.existing`), and on metadata that is none and
-sizes that do not add up. So every sample is checked here again, whoever put it.
+Existing programs go deaf for good on much that is legal (`macs_zenoh.protocol.existing`), and on metadata that is none
+and sizes that do not add up. So every sample is checked here again, whoever put it.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from macs_zenoh.directory import Directory
 from macs_zenoh.errors import WireError
-from macs_zenoh.existing import CDR, PASS, Data, Verdict, fitting, least_bytes, readable, refuses, topic_data
-from macs_zenoh.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue, type_name
 from macs_zenoh.mesh import Payload, Sample
-from macs_zenoh.messages import ROS, Metadata, NodeType, StreamData, correct_sender, decode_management
-from macs_zenoh.registrations import AgentKey
-from macs_zenoh.routing import takes_group_copy
-from macs_zenoh.wire import Frame, Layout, is_probe, parse_frame, parse_frames
+from macs_zenoh.protocol.directory import Directory
+from macs_zenoh.protocol.existing import CDR, PASS, Data, Verdict, fitting, least_bytes, readable, refuses, topic_data
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue, type_name
+from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, correct_sender, decode_management
+from macs_zenoh.protocol.registrations import AgentKey
+from macs_zenoh.protocol.routing import takes_group_copy
+from macs_zenoh.protocol.wire import Frame, Layout, is_probe, parse_frame, parse_frames
 
 from .agents import Agents
 from .connection import Connection
@@ -297,7 +297,7 @@ class Delivery:
         """Slow down a sender on this gateway. Those elsewhere are slowed by nobody: the outbox's limit decides."""
         for receiver in receivers:
             if receiver.congested and (connection := self._agents.find(*sender)) is not None:
-                receiver.brake.hold(connection)
+                receiver.backpressure.hold(connection)
 
     def _read_registrants(self, key: str, frame: Frame) -> list[AgentKey]:
         """Each registrant, once. The list changes only with registrations, so each is read once."""

@@ -1,7 +1,7 @@
 """The blocks of agent ids that this gateway hands out: leased from the mesh, more of them before they run out.
 
 Two parts of a mesh that could not see each other may have leased the same block. When they meet, one of the gateways
-gives it up (`macs_zenoh.blocks.Contests`), unless it was configured.
+gives it up (`macs_zenoh.protocol.ids.Contests`), unless it was configured.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import logging
 import time
 from collections.abc import Callable, Collection, Iterable
 
-from macs_zenoh import blocks
-from macs_zenoh.blocks import Contests, FreeIds
 from macs_zenoh.errors import ConfigError, Unreachable
-from macs_zenoh.keyexpr import BLOCK_SIZE, LEASE
 from macs_zenoh.mesh import Mesh, Subscription, Token
+from macs_zenoh.protocol import ids as blocks
+from macs_zenoh.protocol.ids import Contests, FreeIds
+from macs_zenoh.protocol.keyexpr import BLOCK_SIZE, LEASE
 
 log = logging.getLogger("macs.gateway")
 

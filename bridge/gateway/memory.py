@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from macs_zenoh.budget import Budget, Unfinished
-from macs_zenoh.limits import UNFINISHED_FREE_BYTES, UNFINISHED_IN_ALL_BYTES, WAITING_IN_ALL_BYTES
+from macs_zenoh.protocol.budget import Budget, Unfinished
+from macs_zenoh.protocol.limits import UNFINISHED_FREE_BYTES, UNFINISHED_IN_ALL_BYTES, WAITING_IN_ALL_BYTES
 
 if TYPE_CHECKING:
     from .connection import Connection

@@ -14,17 +14,17 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 
-from macs_zenoh.blocks import Contests
-from macs_zenoh.keyexpr import block_of
-from macs_zenoh.messages import ROS
 from macs_zenoh.presence import Contested, Presence
-from macs_zenoh.registrations import AgentKey, Task
+from macs_zenoh.protocol.ids import Contests
+from macs_zenoh.protocol.keyexpr import block_of
+from macs_zenoh.protocol.messages import ROS
+from macs_zenoh.protocol.registrations import AgentKey, Task
 
 from .agents import Agents
 from .connection import Connection
+from .declarations import AgentDeclarations
 from .leases import Leases
-from .own_keys import OwnKeys
-from .robots import RobotCalls
+from .registration_calls import RobotCalls
 
 log = logging.getLogger("macs.gateway")
 
@@ -55,7 +55,7 @@ class Renumbering:
         agents: Agents,
         leases: Leases,
         robots: RobotCalls,
-        own_keys: OwnKeys,
+        declarations: AgentDeclarations,
         *,
         on_change: Callable[[Connection], None],
         on_block_left: Callable[[int], None],
@@ -65,7 +65,7 @@ class Renumbering:
         self._agents = agents
         self._leases = leases
         self._robots = robots
-        self._own_keys = own_keys
+        self._declarations = declarations
         self._on_change = on_change
         self._on_block_left = on_block_left
         self._contests: Contests[AgentKey] = Contests(zid, lambda agent: False, leases.has_lease)
@@ -203,7 +203,7 @@ class Renumbering:
         before = str(connection)
         self._on_change(connection)
         self._agents.renumber(connection, new_id)
-        self._own_keys.declare(connection)
+        self._declarations.declare(connection)
         number = connection.peer.connection_number
         token = self._presence.declare(old[0], new_id, self._agents.group_of(connection), number)
         old_token = self._agents.replace_token(connection, token)
@@ -216,7 +216,7 @@ class Renumbering:
             connection.send_call(connection.peer.welcome())
             connection.flush()
             await self._robots.rename(old, new_id, told, slow)
-        self._own_keys.undeclare(old)
+        self._declarations.undeclare(old)
         old_token.close()
 
     def _forget_former(self, old: AgentKey, connection: Connection) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Container
 from typing import NamedTuple
 
-from macs_zenoh.credit import Credit
-from macs_zenoh.messages import BROADCAST as EVERYBODY
-from macs_zenoh.messages import ROS
-from macs_zenoh.registrations import AgentKey
-from macs_zenoh.routing import keys_of
-from macs_zenoh.wire import Frame, Header
+from macs_zenoh.protocol.credit import Credit
+from macs_zenoh.protocol.messages import BROADCAST as EVERYBODY
+from macs_zenoh.protocol.messages import ROS
+from macs_zenoh.protocol.registrations import AgentKey
+from macs_zenoh.protocol.routing import keys_of
+from macs_zenoh.protocol.wire import Frame, Header
 
 KNOWN_ROUTES = 4096
 

@@ -1,6 +1,6 @@
 """The gateway: all sockets of one process, and their place on the mesh.
 
-A frame from a headset: socket → `Connection` → `Peer` (whole? allowed? from whom?) → `forward` → routing → mesh.
+A frame from a headset: socket → `Connection` → `TcpAgent` (whole? allowed? from whom?) → `forward` → routing → mesh.
 A frame to a headset: mesh → `Delivery` (for whom?) → `Connection` → socket. It never turns back: two headsets on one
 gateway talk through the mesh as well, inside this process's own Zenoh session.
 """
@@ -17,15 +17,18 @@ from dataclasses import dataclass, field
 from msgspec import structs
 
 from bridge.listening import bound, for_others
-from macs_zenoh.addresses import joined
-from macs_zenoh.budget import Budget
 from macs_zenoh.config import GatewaySettings
-from macs_zenoh.credit import Credits
-from macs_zenoh.directory import Change
 from macs_zenoh.errors import Refused, Unreachable, UsageError
-from macs_zenoh.existing import asks
-from macs_zenoh.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
-from macs_zenoh.limits import (
+from macs_zenoh.managers import Asker, Managers
+from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Payload, Subscription, Traffic
+from macs_zenoh.presence import Presence
+from macs_zenoh.protocol.addresses import joined
+from macs_zenoh.protocol.budget import Budget
+from macs_zenoh.protocol.credit import Credits
+from macs_zenoh.protocol.directory import Change
+from macs_zenoh.protocol.existing import asks
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
+from macs_zenoh.protocol.limits import (
     NAMED_EACH,
     NAMED_IN_ALL,
     NAMED_PER_ADDRESS,
@@ -33,9 +36,7 @@ from macs_zenoh.limits import (
     NODES_IN_ALL,
     NODES_PER_ADDRESS,
 )
-from macs_zenoh.managers import Asker, Managers
-from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Payload, Subscription, Traffic
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.messages import (
     ROS,
     UNITY,
     AddNode,
@@ -48,35 +49,34 @@ from macs_zenoh.messages import (
     Refusal,
     encode_data,
 )
-from macs_zenoh.pace import Pace, Passing
-from macs_zenoh.peer import (
+from macs_zenoh.protocol.rate_limit import Pace, Passing
+from macs_zenoh.protocol.registrations import AgentKey
+from macs_zenoh.protocol.tcp_agent import (
     Asked,
     AskedOnline,
     Event,
     Joined,
     Limits,
-    Peer,
     Registering,
     RegistrationRefused,
     Sent,
     Streamed,
+    TcpAgent,
 )
-from macs_zenoh.presence import Presence
-from macs_zenoh.registrations import AgentKey
-from macs_zenoh.wire import FrameDecoder, Layout, encode_message
+from macs_zenoh.protocol.wire import FrameDecoder, Layout, encode_message
 
+from .admission import Admission
 from .agents import Agents, Group
-from .brake import Brake
+from .backpressure import Backpressure
 from .connection import Connection
+from .declarations import AgentDeclarations
 from .delivery import Delivery, Stream
-from .door import Door
 from .leases import Leases
 from .listener import BACKLOG, Listener, descriptors
 from .memory import Memory
-from .own_keys import OwnKeys
+from .registration_calls import RobotCalls, StreamChanges
 from .renumbering import Renumbering
 from .robot_ids import RobotIds
-from .robots import RobotCalls, StreamChanges
 from .routes import Route, Routes
 from .stead import Stead
 from .waiting import NAMED_S, WaitingRoom
@@ -129,12 +129,12 @@ class Gateway:
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
         self._limits = Limits(
             max_frame_bytes=settings.max_frame_bytes,
-            handshake_s=settings.handshake_s,
-            silence_s=settings.silence_s,
+            handshake_timeout_s=settings.handshake_timeout_s,
+            idle_timeout_s=settings.idle_timeout_s,
             frames_per_s=settings.max_frames_per_s,
         )
         self._scratch = bytearray(FrameDecoder.SPACE_BYTES)  # sockets of one loop receive one after the other
-        self._door = Door(
+        self._admission = Admission(
             settings.allow, settings.max_connections, settings.max_connections_per_address, settings.groups
         )
         self._nodes = Budget("interface nodes", each=NODES_EACH, per_address=NODES_PER_ADDRESS, total=NODES_IN_ALL)
@@ -145,21 +145,21 @@ class Gateway:
         """Who is online, as the answer to whoever asks; empty when that has changed."""
         self._memory = Memory(settings.outbox_bytes, settings.max_frame_bytes)
         self._numbers = 0
-        self._waiting = WaitingRoom(settings.handshake_s, self._no_id)
+        self._waiting = WaitingRoom(settings.handshake_timeout_s, self._no_id)
         self._routes: dict[Connection, Routes] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._listeners: list[Listener | asyncio.AbstractServer] = []
         self._run = NO_RUN
         self._waited: dict[tuple[bytes, str], tuple[Route, bytes | bytearray]] = {}
         """Commands that have waited in their connection, the newest of each kind, until all that came is seen."""
-        self._brake = Brake()
-        mesh.on_room(self._brake.release)
+        self._backpressure = Backpressure()
+        mesh.on_room(self._backpressure.release)
         self.directory = self._presence.directory
         """Who is online."""
         self._robot_ids = RobotIds(settings.robots)
         stead = Stead(mesh, self._layout)
         self._delivery = Delivery(self.agents, self.directory, self._layout, stead)
-        self._own_keys = OwnKeys(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
+        self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
         self._leases = Leases(
             mesh,
             settings.block,
@@ -177,7 +177,7 @@ class Gateway:
             self.agents,
             self._leases,
             self._robots,
-            self._own_keys,
+            self._declarations,
             on_change=self._id_changes,
             on_block_left=lambda block: self._unsubscribe(UNICAST.every(type=UNITY, block=block)),
         )
@@ -262,7 +262,7 @@ class Gateway:
             for connection in connections:
                 connection.abort()
         self._leases.close()
-        self._own_keys.close()
+        self._declarations.close()
         self._presence.close()
         for subscription in self._subscriptions.values():
             subscription.close()
@@ -277,20 +277,20 @@ class Gateway:
             self,
             memory=self._memory,
             outbox_bytes=settings.outbox_bytes,
-            stall_s=settings.stall_s,
+            write_timeout_s=settings.write_timeout_s,
             robot_packages=settings.robot_packages,
         )
 
     def opened(self, connection: Connection) -> bool:
         """Let a connection in, or not. It is greeted at once, or as soon as there is an id for it."""
-        refusal = self._door.judge(connection.host)
+        refusal = self._admission.judge(connection.host)
         if refusal is not None:
             name, why = refusal
             self._drops[name] += 1
             if self._drops[name] == 1:
                 log.warning("%s is refused: %s (logged once, counted as %s)", connection.address, why, name)
             return False
-        self._door.enter(connection.host)
+        self._admission.enter(connection.host)
         self._waiting.enter(connection)
         self._greet_waiting()
         return True
@@ -307,7 +307,7 @@ class Gateway:
             connection = self._waiting.next()
             self._numbers += 1
             now = time.monotonic()
-            peer = Peer(
+            peer = TcpAgent(
                 agent_id,
                 self._numbers,
                 now,
@@ -316,7 +316,7 @@ class Gateway:
                 custom=self._custom,
                 layout=self._layout,
                 scratch=self._scratch,
-                closed_groups=self._door.closed_groups(connection.host),
+                closed_groups=self._admission.closed_groups(connection.host),
             )
             self.agents.enter(agent_id, connection)
             self._routes[connection] = Routes(self.directory, self.mesh.limited, time.monotonic())
@@ -349,7 +349,7 @@ class Gateway:
 
     def closed(self, connection: Connection) -> None:
         """Forget a connection; its presence ends at once."""
-        self._door.leave(connection.host)
+        self._admission.leave(connection.host)
         if not connection.greeted:
             self._waiting.leave(connection)
             return
@@ -369,7 +369,7 @@ class Gateway:
         self._credits.leave(connection.host, connection.peer.credit, time.monotonic())
         self._group_emptied(empty_group)
         if was_online:
-            self._own_keys.undeclare(connection.key)
+            self._declarations.undeclare(connection.key)
             self._robots.leave(connection.key)
             log.debug("%s is offline", connection)
         if not self.agents:
@@ -468,7 +468,7 @@ class Gateway:
                 self._put(route.keys, newest, COMMAND)
             self._waited.clear()
         if self.mesh.backlogged:
-            self._brake.hold(connection)
+            self._backpressure.hold(connection)
 
     def _put_run(self) -> None:
         """Put frames that go the same way as one sample: a put costs more than a frame."""
@@ -560,7 +560,7 @@ class Gateway:
             return
         if event.agent_type != UNITY and not self._admit(connection):
             return
-        self._own_keys.declare(connection)
+        self._declarations.declare(connection)
         self._enter_group(connection)
         self._renumbering.joined(connection)
         log.info("%s is online%s", connection, f" in group {event.group}" if event.group else "")

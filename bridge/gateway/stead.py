@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from macs_zenoh.errors import Refused
 from macs_zenoh.mesh import Mesh, Traffic
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.messages import (
     ROS,
     CallFailure,
     Functionality,
@@ -18,8 +18,8 @@ from macs_zenoh.messages import (
     Refusal,
     encode_data,
 )
-from macs_zenoh.routing import unicast_key
-from macs_zenoh.wire import Layout, encode_frame, encode_message
+from macs_zenoh.protocol.routing import unicast_key
+from macs_zenoh.protocol.wire import Layout, encode_frame, encode_message
 
 from .connection import Connection
 

@@ -20,7 +20,7 @@ import os
 from typing import Any, NamedTuple
 
 from macs_zenoh.errors import CallTimeout, Refused, Unreachable, WireError
-from macs_zenoh.messages import ActionVerb
+from macs_zenoh.protocol.messages import ActionVerb
 
 from . import frames
 from .frames import NodeSpec

@@ -29,10 +29,10 @@ from types import TracebackType
 
 import msgspec
 
-from macs_zenoh.addresses import joined
 from macs_zenoh.errors import CallTimeout, Refused, Unreachable, UsageError, WireError
-from macs_zenoh.limits import ANSWER_BYTES
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.addresses import joined
+from macs_zenoh.protocol.limits import ANSWER_BYTES
+from macs_zenoh.protocol.messages import (
     BROADCAST,
     EXTENSIONS,
     OTHER_TYPE,
@@ -47,7 +47,7 @@ from macs_zenoh.messages import (
     decode_data,
     node_name,
 )
-from macs_zenoh.wire import MAX_FRAME_BYTES, split_message
+from macs_zenoh.protocol.wire import MAX_FRAME_BYTES, split_message
 
 from . import frames
 from .actions import ActionClient
@@ -100,7 +100,7 @@ class Headset:
         *,
         group: int = 0,
         reconnect: bool = False,
-        handshake_s: float = HANDSHAKE_S,
+        handshake_timeout_s: float = HANDSHAKE_S,
         heartbeat_s: float = HEARTBEAT_S,
         max_message_bytes: int = MAX_FRAME_BYTES,
         extensions: int = EXTENSIONS,
@@ -112,7 +112,7 @@ class Headset:
         self.id = 0
         self.bad_messages = 0
         self._reconnect = reconnect
-        self._handshake_s = handshake_s
+        self._handshake_s = handshake_timeout_s
         self._heartbeat_s = heartbeat_s
         self._max_message_bytes = max_message_bytes
         self._extensions = extensions
@@ -138,7 +138,7 @@ class Headset:
         *,
         group: int = 0,
         reconnect: bool = False,
-        handshake_s: float = HANDSHAKE_S,
+        handshake_timeout_s: float = HANDSHAKE_S,
         heartbeat_s: float = HEARTBEAT_S,
         max_message_bytes: int = MAX_FRAME_BYTES,
         extensions: int = EXTENSIONS,
@@ -151,14 +151,14 @@ class Headset:
         of the protocol that it says it understands; with 0 it is an existing program to its gateway. ``on_link`` hears
         every start and end.
 
-        Raises Unreachable when there is no connection, or no id as its first message within ``handshake_s``.
+        Raises Unreachable when there is no connection, or no id as its first message within ``handshake_timeout_s``.
         """
         headset = cls(
             host,
             port,
             group=group,
             reconnect=reconnect,
-            handshake_s=handshake_s,
+            handshake_timeout_s=handshake_timeout_s,
             heartbeat_s=heartbeat_s,
             max_message_bytes=max_message_bytes,
             extensions=extensions,

@@ -8,10 +8,10 @@ import logging
 import socket
 from collections import deque
 
-from macs_zenoh import greetings
-from macs_zenoh.addresses import joined
 from macs_zenoh.errors import Unreachable
-from macs_zenoh.wire import MessageDecoder
+from macs_zenoh.protocol import greetings
+from macs_zenoh.protocol.addresses import joined
+from macs_zenoh.protocol.wire import MessageDecoder
 
 log = logging.getLogger("macs.headset")
 

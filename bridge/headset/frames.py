@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.messages import (
     BROADCAST,
     ROS,
     UNITY,
@@ -28,7 +28,7 @@ from macs_zenoh.messages import (
     encode_data,
     node_name,
 )
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 
 DEFAULT_BUFFER_SIZE = 10
 """Messages that robot and gateway hold for one node, unless asked otherwise; the C# program's default."""
@@ -127,7 +127,7 @@ def node_data(
 ) -> bytes:
     """Data of an interface node to robots: a topic's message (type 2), a request (3) or a response (4), as CDR.
 
-    ``manager`` is empty in what the C# program sends; see `macs_zenoh.messages.CallFailure` and docs/actions.md.
+    ``manager`` is empty in what the C# program sends; see `protocol.messages.CallFailure` and docs/actions.md.
     Raises TooManyDestinations above 10 agents or 10 groups.
     """
     metadata = _metadata(

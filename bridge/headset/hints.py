@@ -8,8 +8,8 @@ from collections.abc import Collection
 from typing import Literal
 
 from macs_zenoh.errors import MacsError, Unreachable, UsageError
-from macs_zenoh.limits import ANSWER_BYTES
-from macs_zenoh.messages import Functionality, FunctionalityRequest, decode_data
+from macs_zenoh.protocol.limits import ANSWER_BYTES
+from macs_zenoh.protocol.messages import Functionality, FunctionalityRequest, decode_data
 
 from .client import Headset
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError
-from macs_zenoh.messages import CallFailure, Metadata, NodeType, decode_data, encode_data
+from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, encode_data
 
 from . import frames
 from .frames import NodeSpec

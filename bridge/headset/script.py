@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError, WireError
-from macs_zenoh.keyexpr import type_name
+from macs_zenoh.protocol.keyexpr import type_name
 
 from .actions import ABORTED, CANCELED, SUCCEEDED, Goal
 from .client import Headset

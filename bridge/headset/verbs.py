@@ -7,8 +7,8 @@ import json
 import math
 from typing import Any, NoReturn
 
-from macs_zenoh import addresses
 from macs_zenoh.errors import UsageError
+from macs_zenoh.protocol import addresses
 
 SETTLE_S = 0.5
 """How long `pub` waits between registering and its first message, unless told otherwise."""

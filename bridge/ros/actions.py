@@ -24,8 +24,8 @@ from bridge.ros.stream import cdr_problem
 from bridge.ros.types import resolve
 from bridge.ros.unity_cdr import UnityCdr, to_ros
 from macs_zenoh.errors import Refused
-from macs_zenoh.messages import ROS, ActionVerb, AddNode, NodeType
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.messages import ROS, ActionVerb, AddNode, NodeType
+from macs_zenoh.protocol.reading import Message
 
 log = logging.getLogger("macs.ros")
 
@@ -78,7 +78,7 @@ class ActionNode(InterfaceNode):
         self._watching: asyncio.TimerHandle | None = None
         self._search = Search(lambda: self._client is not None and self._client.server_is_ready())
         self._seen_at = 0.0
-        self._accept_s = robot.rules.call_s(self.topic)
+        self._accept_s = robot.rules.call_timeout_s(self.topic)
         self._loop = asyncio.get_running_loop()
 
     @property
@@ -311,7 +311,7 @@ class ActionNode(InterfaceNode):
         self._watching = None
         if self._client is None:
             return
-        kept_s = self.robot.rules.settings.result_s
+        kept_s = self.robot.rules.settings.result_timeout_s
         now = self._loop.time()
         if self._client.server_is_ready():
             self._seen_at = now

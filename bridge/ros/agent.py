@@ -27,15 +27,15 @@ from bridge.ros.session import RosSession
 from macs_zenoh import managers
 from macs_zenoh.agent import Agent, Call
 from macs_zenoh.config import RobotSettings, Settings
-from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import MacsError, Refused, WireError
-from macs_zenoh.guard import Guard, Limits
-from macs_zenoh.keyexpr import type_name, type_number
 from macs_zenoh.managers import Asker, Managers
-from macs_zenoh.messages import AddNode, FunctionalityRequest, Metadata, RemoveNode, decode_data, encode_data
-from macs_zenoh.reading import Message
-from macs_zenoh.registrations import check_own
-from macs_zenoh.wire import Layout
+from macs_zenoh.protocol.directory import AgentInfo
+from macs_zenoh.protocol.guard import Guard, Limits
+from macs_zenoh.protocol.keyexpr import type_name, type_number
+from macs_zenoh.protocol.messages import AddNode, FunctionalityRequest, Metadata, RemoveNode, decode_data, encode_data
+from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.registrations import check_own
+from macs_zenoh.protocol.wire import Layout
 
 log = logging.getLogger("macs.ros")
 

@@ -6,10 +6,10 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from macs_zenoh.budget import may_have_one_more
-from macs_zenoh.keyexpr import type_number
-from macs_zenoh.messages import NodeType
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.budget import may_have_one_more
+from macs_zenoh.protocol.keyexpr import type_number
+from macs_zenoh.protocol.messages import NodeType
+from macs_zenoh.protocol.reading import Message
 
 ASKING = (NodeType.CLIENT, NodeType.ACTION)
 """Node types whose messages wait for an answer."""

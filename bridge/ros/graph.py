@@ -23,8 +23,8 @@ from bridge.ros.interface import PublishStream, Registrant, Robot
 from bridge.ros.rules import Rules
 from bridge.ros.stream import StreamFraming
 from macs_zenoh.errors import MacsError, WireError
-from macs_zenoh.messages import ROS, Functionality, FunctionalityRequest, Metadata, decode_data, encode_data
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.messages import ROS, Functionality, FunctionalityRequest, Metadata, decode_data, encode_data
+from macs_zenoh.protocol.reading import Message
 
 log = logging.getLogger("macs.ros")
 

@@ -23,10 +23,10 @@ from bridge.ros.session import RosSession
 from bridge.ros.types import InterfaceName
 from macs_zenoh.config import Priority
 from macs_zenoh.errors import HeldByAnother, Refused
-from macs_zenoh.keyexpr import type_name, type_number
-from macs_zenoh.messages import ROS, AddNode, Metadata, NodeType, RemoveNode, encode_data
-from macs_zenoh.reading import Message
-from macs_zenoh.wire import MACS, Layout
+from macs_zenoh.protocol.keyexpr import type_name, type_number
+from macs_zenoh.protocol.messages import ROS, AddNode, Metadata, NodeType, RemoveNode, encode_data
+from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.wire import MACS, Layout
 
 log = logging.getLogger("macs.ros")
 

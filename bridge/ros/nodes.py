@@ -1,7 +1,7 @@
 """The interface nodes of a robot: what headsets have registered, by node type and topic.
 
 `InterfaceNodes` belongs to the event loop; rclpy's entities are made and destroyed in the ROS thread. Commands come in
-Zenoh's threads (`macs_zenoh.guard`), so that nothing that the loop is busy with can hold them up, nor a stop.
+Zenoh's threads (`macs_zenoh.protocol.guard`), so that nothing that the loop is busy with can hold them up, nor a stop.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from bridge.ros.services import ClientNode, ServiceNode, first_line, tell_failur
 from bridge.ros.stop import StopNode
 from bridge.ros.topics import PublisherNode, SubscriberNode
 from bridge.ros.types import InterfaceName
-from macs_zenoh.budget import may_have_one_more
 from macs_zenoh.errors import MacsError, Refused
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.budget import may_have_one_more
+from macs_zenoh.protocol.messages import (
     OTHER_TYPE,
     ROS,
     AddNode,
@@ -38,7 +38,7 @@ from macs_zenoh.messages import (
     encode_data,
     node_name,
 )
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.reading import Message
 
 log = logging.getLogger("macs.ros")
 

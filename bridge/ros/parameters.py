@@ -12,9 +12,9 @@ from typing import Any
 from rclpy.exceptions import InvalidParameterTypeException, ParameterUninitializedException
 from rclpy.parameter import Parameter
 
-from macs_zenoh.addresses import bare, joined
 from macs_zenoh.config import Settings, changed
 from macs_zenoh.errors import ConfigError
+from macs_zenoh.protocol.addresses import bare, joined
 
 ADDRESS, PORT = "127.0.0.1", 7447
 TYPES = {

@@ -11,8 +11,8 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 
-from macs_zenoh.messages import DataRefused
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.messages import DataRefused
+from macs_zenoh.protocol.reading import Message
 
 AGAIN_S = 1.0
 """After so long the same is told again."""

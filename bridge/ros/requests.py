@@ -17,7 +17,7 @@ from bridge.ros.interface import Registrant, full_name
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.topics import PublisherNode
 from macs_zenoh.errors import Refused
-from macs_zenoh.messages import AgentId, AgentType, NodeType
+from macs_zenoh.protocol.messages import AgentId, AgentType, NodeType
 
 
 class ControlRequest(Struct, frozen=True, rename="camel"):

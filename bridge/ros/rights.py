@@ -13,7 +13,7 @@ from bridge.ros.interface import Registrant
 from bridge.ros.rules import names_agent
 from macs_zenoh.config import RobotSettings
 from macs_zenoh.errors import Refused
-from macs_zenoh.keyexpr import type_name, type_number
+from macs_zenoh.protocol.keyexpr import type_name, type_number
 
 EVERYBODY = "*"
 

@@ -14,8 +14,8 @@ from msgspec import structs
 
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
-from macs_zenoh.keyexpr import block_of, type_name
-from macs_zenoh.messages import UNITY
+from macs_zenoh.protocol.keyexpr import block_of, type_name
+from macs_zenoh.protocol.messages import UNITY
 
 DEFAULT_HOLD_S = 3.0
 
@@ -72,9 +72,9 @@ class Rules:
             rule = self._merged[name] = _merged(rule for rule in self.settings.rules if matches(rule.match, name))
         return rule
 
-    def call_s(self, name: str) -> float:
+    def call_timeout_s(self, name: str) -> float:
         """How long a service may take."""
-        return self.of(name).call_s or self.settings.call_s
+        return self.of(name).call_timeout_s or self.settings.call_timeout_s
 
 
 def _merged(rules: Iterable[TopicRule]) -> TopicRule:

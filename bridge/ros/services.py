@@ -24,8 +24,8 @@ from bridge.ros.stream import cdr_problem
 from bridge.ros.types import InterfaceName, resolve
 from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
 from macs_zenoh.errors import Refused, WireError
-from macs_zenoh.messages import ROS, AddNode, CallFailure, Metadata, NodeType, decode_data, encode_data
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.messages import ROS, AddNode, CallFailure, Metadata, NodeType, decode_data, encode_data
+from macs_zenoh.protocol.reading import Message
 
 log = logging.getLogger("macs.ros")
 
@@ -118,7 +118,7 @@ class ClientNode(InterfaceNode):
         self._request_cdr: UnityCdr | None = None
         self._response_cdr: UnityCdr | None = None
         self._exists = False
-        self._deadline_s = robot.rules.call_s(self.topic)
+        self._deadline_s = robot.rules.call_timeout_s(self.topic)
         self._calls: dict[asyncio.Task[None], Message] = {}
         self._search = Search(lambda: self._client is not None and self._client.service_is_ready())
         self._room = asyncio.Semaphore(BURST)
@@ -312,7 +312,7 @@ class ServiceNode(InterfaceNode):
         self._request_cdr: UnityCdr | None = None
         self._response_cdr: UnityCdr | None = None
         self._respond: Callable[[Any, Any], None]
-        self._deadline_s = robot.rules.call_s(self.topic)
+        self._deadline_s = robot.rules.call_timeout_s(self.topic)
         self._open_calls: dict[int, OpenCall] = {}
         self._next_request = 0
         self._failed: deque[tuple[Any, str]] = deque()

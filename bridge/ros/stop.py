@@ -24,9 +24,9 @@ from bridge.ros.topics import check_topic_type
 from bridge.ros.types import resolve
 from macs_zenoh.config import WHO_STOPPED
 from macs_zenoh.errors import Refused
-from macs_zenoh.keyexpr import type_name
-from macs_zenoh.messages import ROS, AddNode, NodeType, node_name
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.keyexpr import type_name
+from macs_zenoh.protocol.messages import ROS, AddNode, NodeType, node_name
+from macs_zenoh.protocol.reading import Message
 
 log = logging.getLogger("macs.ros")
 

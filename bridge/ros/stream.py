@@ -5,8 +5,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Collection, Iterable
 
-from macs_zenoh.messages import ROS, Metadata, StreamData, encode_management
-from macs_zenoh.wire import MACS, Layout, encode_frame, encode_message
+from macs_zenoh.protocol.messages import ROS, Metadata, StreamData, encode_management
+from macs_zenoh.protocol.wire import MACS, Layout, encode_frame, encode_message
 
 _U32 = struct.Struct("<I")
 

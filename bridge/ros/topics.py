@@ -30,9 +30,9 @@ from bridge.ros.stream import Fanout, cdr_problem
 from bridge.ros.types import InterfaceName, least_cdr_bytes, resolve
 from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
 from macs_zenoh.errors import MacsError, Refused
-from macs_zenoh.messages import AddNode, NodeType, StreamData
-from macs_zenoh.reading import Message
-from macs_zenoh.recovery import SILENT_S
+from macs_zenoh.protocol.messages import AddNode, NodeType, StreamData
+from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.recovery import SILENT_S
 
 log = logging.getLogger("macs.ros")
 

@@ -9,7 +9,7 @@ Zenoh allows a message when its key is included in the key expression of a rule,
   listed, so that a message reaches only those of the receivers that its sender may reach;
 * whom it may see: the presence of those with whom it has to do.
 
-Every key is made by `macs_zenoh.keyexpr`.
+Every key is made by `macs_zenoh.protocol.keyexpr`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from bridge.security.plan import Client, Gateway, Operator, Plan, Robot, Router, kind_of
-from macs_zenoh.keyexpr import (
+from macs_zenoh.protocol.keyexpr import (
     BLOCK_SIZE,
     BROADCAST,
     CALL,
@@ -38,7 +38,7 @@ from macs_zenoh.keyexpr import (
     Key,
     block_of,
 )
-from macs_zenoh.messages import NOBODY, OPERATOR, ROS, UNITY
+from macs_zenoh.protocol.messages import NOBODY, OPERATOR, ROS, UNITY
 
 TYPES = {"robots": ROS, "gateways": UNITY, "operators": OPERATOR}
 

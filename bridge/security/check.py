@@ -29,10 +29,11 @@ from bridge.security import access, certificates
 from bridge.security.expected import Expected, agent_of, inbox_of, presence_of, sender_of
 from bridge.security.files import client_overrides
 from bridge.security.plan import Client, Gateway, Operator, Plan, Robot
-from macs_zenoh.addresses import of_endpoint
 from macs_zenoh.config import MeshSettings, changed
 from macs_zenoh.errors import ConfigError, Refused, Unreachable
-from macs_zenoh.keyexpr import (
+from macs_zenoh.mesh import Mesh, Sample, Subscription
+from macs_zenoh.protocol.addresses import of_endpoint
+from macs_zenoh.protocol.keyexpr import (
     BROADCAST,
     CALL,
     GROUP,
@@ -47,9 +48,8 @@ from macs_zenoh.keyexpr import (
     UNICAST,
     WANTED,
 )
-from macs_zenoh.mesh import Mesh, Sample, Subscription
-from macs_zenoh.messages import ROS, UNITY
-from macs_zenoh.wire import PROBE
+from macs_zenoh.protocol.messages import ROS, UNITY
+from macs_zenoh.protocol.wire import PROBE
 
 MARK = "macs_check"
 """A topic, a verb and a message type of the check's own."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bridge.security import access
 from bridge.security.plan import Client, Gateway, Operator, Plan, Robot
-from macs_zenoh.keyexpr import FieldValue, block_of
+from macs_zenoh.protocol.keyexpr import FieldValue, block_of
 
 
 class Expected:

@@ -12,8 +12,8 @@ from bridge.security import access
 from bridge.security.access import Rule
 from bridge.security.plan import Client, Gateway, Operator, Plan, Robot, Router
 from macs_zenoh.config import MeshSettings, TrafficRule, changed
-from macs_zenoh.keyexpr import STREAM, type_name
-from macs_zenoh.messages import UNITY
+from macs_zenoh.protocol.keyexpr import STREAM, type_name
+from macs_zenoh.protocol.messages import UNITY
 
 WIDTH = 119
 

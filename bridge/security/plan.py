@@ -29,9 +29,9 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
-from macs_zenoh.addresses import joined
 from macs_zenoh.config import AgentId, AgentName, GatewaySettings, GroupId, MeshSettings, TrafficRule
 from macs_zenoh.errors import ConfigError, MissingExtra
+from macs_zenoh.protocol.addresses import joined
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=63)]
 """Also the name in the certificate and of a directory, so: letters, digits, dot, dash and underscore."""

@@ -10,9 +10,9 @@ switch less is what a single message feels, and one queue of ours keeps the orde
 the words that all of them use, `opening` Zenoh's configuration, `threads` how Zenoh and Python share a processor.
 """
 
-from .opening import configuration
-from .samples import AtOnce, Handler, OnBatch, OnMiss, Payload, Sample, Subscription, Token, Traffic
+from .declared import AtOnce, Handler, OnBatch, OnMiss, Payload, Sample, Subscription, Token, Traffic
 from .session import Mesh
+from .zenoh_config import configuration
 
 __all__ = [
     "AtOnce",

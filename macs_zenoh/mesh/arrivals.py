@@ -12,10 +12,10 @@ from typing import Any
 
 import zenoh
 
-from macs_zenoh.guard import Ages, Gate
+from macs_zenoh.protocol.guard import Ages, Gate
 
+from .declared import AtOnce, OnBatch, OnNumbered, Outlet, Payload, Sample
 from .panics import end_if_panic
-from .samples import AtOnce, OnBatch, OnNumbered, Outlet, Payload, Sample
 from .threads import keep_attached
 
 log = logging.getLogger("macs.mesh")

@@ -14,12 +14,12 @@ import zenoh
 import zenoh.ext
 
 from macs_zenoh.config import Priority
-from macs_zenoh.keyexpr import NAMED_ALL, STREAM
-from macs_zenoh.shaping import Shape, Shaper
+from macs_zenoh.protocol.keyexpr import NAMED_ALL, STREAM
+from macs_zenoh.protocol.policing import Policer, Policy
 
 from .arrivals import Arrivals
+from .declared import Outlet, Payload, Traffic
 from .panics import call, unwatched
-from .samples import Outlet, Payload, Traffic
 
 log = logging.getLogger("macs.mesh")
 
@@ -43,7 +43,7 @@ class _Outlet(NamedTuple):
     """Where puts with one key go."""
 
     publisher: Outlet
-    shape: Shape | None
+    shape: Policy | None
     """The limits on this key, if there are any."""
     kept: bool = False
     """Whether it keeps messages for those that miss some."""
@@ -75,14 +75,14 @@ class Outgoing:
         self,
         session: zenoh.Session,
         arrivals: Arrivals,
-        shaper: Shaper,
+        policer: Policer,
         drops: Counter[str],
         *,
         linked: bool,
         backlog_bytes: int,
         from_thread: Callable[[Callable[[], None]], None],
     ) -> None:
-        self.shaper = shaper
+        self.policer = policer
         self.linked = linked
         self.drops = drops
         self._session = session
@@ -135,7 +135,7 @@ class Outgoing:
 
     def limited(self, key: str) -> bool:
         """Whether a traffic rule may drop some of what is put with this key, so that messages count one by one."""
-        shape = self.shaper.of(key)
+        shape = self.policer.of(key)
         return shape is not None and shape.limited
 
     def prioritise(self, key: str, priority: Priority | None) -> None:
@@ -168,12 +168,12 @@ class Outgoing:
                         del self._kept[next(iter(self._kept))]
                 for outlets in self._outlets.values():
                     outlets.pop(key, None)
-        return self._keeps(key, self.shaper.of(key)) > 0
+        return self._keeps(key, self.policer.of(key)) > 0
 
     def way(self, key: str, traffic: Traffic) -> tuple[zenoh.Priority, zenoh.CongestionControl, bool]:
         """How samples with this key travel."""
         usual, congestion, express = traffic.value
-        shape = self.shaper.of(key)
+        shape = self.policer.of(key)
         wanted = self._priorities.get(key) or (shape.priority if shape is not None else None)
         return getattr(zenoh.Priority, wanted.upper()) if wanted else usual, congestion, express
 
@@ -190,7 +190,7 @@ class Outgoing:
         for callback in self._on_room:
             callback()
 
-    def _passes(self, shape: Shape, size: int) -> bool:
+    def _passes(self, shape: Policy, size: int) -> bool:
         overrun = shape.judge(size, time.monotonic())
         if overrun is not None and overrun.first:
             text = "%s is dropped by a traffic rule: above %s %g of %s (logged once for the rule, counted as %s)"
@@ -208,7 +208,7 @@ class Outgoing:
     def _declare(self, key: str, traffic: Traffic) -> _Outlet:
         """A publisher for a key: unlike a bare put, it sends nothing over the link while nobody there listens."""
         outlets = self._outlets[traffic]
-        shape = self.shaper.of(key)
+        shape = self.policer.of(key)
         limits = shape if shape is not None and shape.limited else None
         with self._outlets_lock:
             if key in outlets:  # of two threads the other was faster: one source must number all
@@ -250,7 +250,7 @@ class Outgoing:
         priority, congestion, express = self.way(key, traffic)
         return self._session.declare_publisher(key, priority=priority, congestion_control=congestion, express=express)
 
-    def _keeps(self, key: str, shape: Shape | None) -> int:
+    def _keeps(self, key: str, shape: Policy | None) -> int:
         """How many samples to keep of a key; of those that nobody recovers, none."""
         if STREAM.parse(key) is None and NAMED_ALL.parse(key) is None:
             return 0

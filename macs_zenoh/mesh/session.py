@@ -15,9 +15,7 @@ from types import TracebackType
 import msgspec
 import zenoh
 
-from macs_zenoh import ping
 from macs_zenoh.config import MeshSettings, TrafficRule
-from macs_zenoh.directory import published
 from macs_zenoh.errors import (
     CallTimeout,
     ConfigError,
@@ -28,20 +26,22 @@ from macs_zenoh.errors import (
     Refused,
     Unreachable,
 )
-from macs_zenoh.guard import Gate
-from macs_zenoh.keyexpr import PING
-from macs_zenoh.limits import REASON_CHARACTERS, REQUEST_BYTES
-from macs_zenoh.shaping import Shaper
+from macs_zenoh.protocol import ping
+from macs_zenoh.protocol.directory import published
+from macs_zenoh.protocol.guard import Gate
+from macs_zenoh.protocol.keyexpr import PING
+from macs_zenoh.protocol.limits import REASON_CHARACTERS, REQUEST_BYTES
+from macs_zenoh.protocol.policing import Policer
 from macs_zenoh.versions import installed
 
 from .arrivals import Arrivals, now_s
-from .awake import Awake
-from .opening import check_files, first_line, insert, zenoh_config
+from .cpu_latency import Awake
+from .declared import AtOnce, Handler, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
 from .outgoing import Outgoing
 from .panics import call, end_if_panic, end_on_panics, last_words, watched
-from .recovered import Recovered
-from .samples import AtOnce, Handler, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
+from .reliable import Recovered
 from .threads import keep_attached, shared_threads
+from .zenoh_config import check_files, first_line, insert, zenoh_config
 
 log = logging.getLogger("macs.mesh")
 
@@ -77,7 +77,7 @@ class Mesh:
     ) -> None:
         self.settings = settings
         self.drops: Counter[str] = Counter()
-        self.shaper = Shaper(traffic, self.drops)
+        self.policer = Policer(traffic, self.drops)
         own = str(session.zid())
         chosen = any(override.lstrip().startswith("id:") for override in settings.overrides)
         self.zid = own if chosen else published(own)
@@ -95,7 +95,7 @@ class Mesh:
         self._outgoing = outgoing = Outgoing(
             session,
             self._arrivals,
-            self.shaper,
+            self.policer,
             self.drops,
             linked=self.linked,
             backlog_bytes=backlog_bytes,
@@ -225,7 +225,7 @@ class Mesh:
         self._session.close()  # type: ignore[no-untyped-call]
         if self.drops:
             log.info("lost in all: %s", ", ".join(f"{name} {count}" for name, count in sorted(self.drops.items())))
-        for line in self.shaper.report():
+        for line in self.policer.report():
             log.info("%s", line)
 
     # -- links ---------------------------------------------------------------------------------------------------
@@ -334,7 +334,7 @@ class Mesh:
         Raises Refused when the answer is a refusal, NotServed, Unreachable, CallTimeout; OutOfRange when
         it is larger than a traffic rule allows: of what a rule limits, only the size holds for queries.
         """
-        shape = self.shaper.of(key)
+        shape = self.policer.of(key)
         if shape is not None and (overrun := shape.too_large(len(payload))) is not None:
             raise OutOfRange(f"size of {key}", len(payload), 0, int(overrun.limit))
         done: asyncio.Future[bytes] = self._loop.create_future()

@@ -38,7 +38,7 @@ from bridge.headset.nodes import Subscription
 from bridge.ros.session import RosSession
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
-from macs_zenoh.messages import OPERATOR, ROS
+from macs_zenoh.protocol.messages import OPERATOR, ROS
 from tests.links import Link, counted
 from tests.programs import ROOT, Program, free_port
 from tests.routers import Router

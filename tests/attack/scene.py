@@ -33,8 +33,8 @@ from bridge.headset.nodes import Publisher
 from bridge.ros.session import RosSession
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
-from macs_zenoh.limits import UNFINISHED_IN_ALL_BYTES, WAITING_IN_ALL_BYTES
-from macs_zenoh.messages import OPERATOR
+from macs_zenoh.protocol.limits import UNFINISHED_IN_ALL_BYTES, WAITING_IN_ALL_BYTES
+from macs_zenoh.protocol.messages import OPERATOR
 from tests.attack.judge import Memory, Report, Window
 from tests.attack.table import Attack
 from tests.programs import ROOT, Program, free_port

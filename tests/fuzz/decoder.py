@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from macs_zenoh.errors import BadSizes, FrameTooLarge, TooLong, WireError
-from macs_zenoh.messages import Metadata, decode_management
-from macs_zenoh.peer import Event, Left, Limits, Peer, Rejected, Sent, State, Streamed
-from macs_zenoh.wire import (
+from macs_zenoh.protocol.messages import Metadata, decode_management
+from macs_zenoh.protocol.tcp_agent import Event, Left, Limits, Rejected, Sent, State, Streamed, TcpAgent
+from macs_zenoh.protocol.wire import (
     Frame,
     FrameDecoder,
     MessageDecoder,
@@ -110,7 +110,7 @@ def _check_messages(data: bytes, pieces: list[bytes]) -> None:
 
 
 def _events(agent_type: int, pieces: list[bytes]) -> list[Event]:
-    peer = Peer(AGENT_ID, 1, 0.0, limits=Limits(max_frame_bytes=LIMIT))
+    peer = TcpAgent(AGENT_ID, 1, 0.0, limits=Limits(max_frame_bytes=LIMIT))
     if agent_type:
         raw = b'{"agentType":%d,"agentId":7,"messageManager":"AgentclientConfigurer"}' % agent_type
         peer.receive(encode_frame(management=raw), 0.0)

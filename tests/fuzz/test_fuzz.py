@@ -5,7 +5,7 @@ from __future__ import annotations
 import decoder
 import pytest
 
-from macs_zenoh.messages import Metadata
+from macs_zenoh.protocol.messages import Metadata
 
 
 @pytest.mark.parametrize("seed", range(2))

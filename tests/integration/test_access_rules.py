@@ -13,12 +13,13 @@ import pytest
 
 import macs_zenoh
 from bridge.cli.robots import Caller, operator
-from macs_zenoh import awareness, named
+from macs_zenoh import awareness
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Unreachable
-from macs_zenoh.keyexpr import NAMED, PRESENCE, STREAM
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import OPERATOR
+from macs_zenoh.protocol import named
+from macs_zenoh.protocol.keyexpr import NAMED, PRESENCE, STREAM
+from macs_zenoh.protocol.messages import OPERATOR
 
 RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
 USERS = ("robot-7", "gateway-1", "observer")

@@ -15,12 +15,12 @@ import pytest
 from bridge.gateway import Gateway
 from bridge.gateway.leases import Leases
 from bridge.headset import frames
-from macs_zenoh import ping
-from macs_zenoh.keyexpr import LEASE, PING
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import ROS, UNITY, Configuration, Welcome, decode_data, encode_management
 from macs_zenoh.presence import Presence
-from macs_zenoh.wire import MessageDecoder, encode_frame, split_message
+from macs_zenoh.protocol import ping
+from macs_zenoh.protocol.keyexpr import LEASE, PING
+from macs_zenoh.protocol.messages import ROS, UNITY, Configuration, Welcome, decode_data, encode_management
+from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, split_message
 from tests.integration.conftest import StartGateway, until
 from tests.programs import Program, free_port
 
@@ -131,7 +131,7 @@ async def test_who_waits_for_an_id_may_speak_and_leave(
 
 async def test_when_there_are_no_ids_a_newcomer_is_closed(start_gateway: StartGateway) -> None:
     """A gateway whose blocks are used up closes who comes, and counts it; when somebody leaves, the next is let in."""
-    gateway: Gateway = await start_gateway(blocks=[5], handshake_s=2.0)
+    gateway: Gateway = await start_gateway(blocks=[5], handshake_timeout_s=2.0)
     async with crowd(gateway.port, 256) as agents:
         assert {agent.id for agent in agents} == set(range(5 * 256, 6 * 256))
         reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port)

@@ -13,9 +13,9 @@ import pytest
 
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import NotServed
-from macs_zenoh.keyexpr import CALL
 from macs_zenoh.mesh import Mesh, Payload, Sample, Traffic
 from macs_zenoh.mesh.arrivals import Arrivals
+from macs_zenoh.protocol.keyexpr import CALL
 from tests.integration.conftest import until
 
 KEY, OTHER_KEY = "macs/to/ros/7/from/unity/256", "macs/to/ros/7/from/unity/257"

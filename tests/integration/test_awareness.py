@@ -12,8 +12,8 @@ import macs_zenoh
 from macs_zenoh import awareness
 from macs_zenoh.awareness import Awareness, Received
 from macs_zenoh.errors import Unreachable, UsageError
-from macs_zenoh.keyexpr import NAME, NAMED, NAMED_ALL
-from macs_zenoh.named import Outcome
+from macs_zenoh.protocol.keyexpr import NAME, NAMED, NAMED_ALL
+from macs_zenoh.protocol.named import Outcome
 from tests.integration.conftest import until
 from tests.programs import Program, free_port, macs
 

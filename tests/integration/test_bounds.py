@@ -11,7 +11,7 @@ import pytest
 
 import macs_zenoh
 from bridge.headset.client import Headset
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.messages import (
     AddNode,
     Configuration,
     Metadata,
@@ -21,7 +21,7 @@ from macs_zenoh.messages import (
     encode_data,
     encode_management,
 )
-from macs_zenoh.wire import MACS, MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.protocol.wire import MACS, MessageDecoder, encode_frame, encode_message, split_message
 from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_limits import answers, memory_bytes, site
 
@@ -138,7 +138,7 @@ async def test_topic_data_of_a_robot_under_any_name(start_gateway: StartGateway,
 async def test_what_waits_is_read_before_silence_is_judged(start_gateway: StartGateway) -> None:
     """A loop that was held up for longer than the silence that ends a connection cuts nobody who has spoken; who
     really is silent is cut."""
-    gateway = await start_gateway(silence_s=0.5, handshake_s=0.6)
+    gateway = await start_gateway(idle_timeout_s=0.5, handshake_timeout_s=0.6)
     with ExitStack() as stack:
         agents = [Raw(gateway.port) for _ in range(20)]
         late = [socket.create_connection(("127.0.0.1", gateway.port)) for _ in range(20)]
@@ -208,7 +208,7 @@ async def test_a_fault_of_ours_is_contained(
         real(connection, request_id)  # type: ignore[arg-type]
 
     monkeypatch.setattr(gateway, "_answer_online", broken)
-    question = encode_management(macs_zenoh.messages.OnlineRequest(2, 1))
+    question = encode_management(macs_zenoh.protocol.messages.OnlineRequest(2, 1))
     raw = encode_frame(management=question, message=encode_message(Metadata(request_id=666).encode()))
     await attacker.send(raw * 3 + raw.replace(b"666", b"667"))
     await until(lambda: any(said.request_id == 667 for said, _ in attacker.read()))

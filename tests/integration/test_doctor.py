@@ -13,8 +13,8 @@ import pytest
 
 import macs_zenoh
 from macs_zenoh.config import MeshSettings
-from macs_zenoh.keyexpr import LEASE, NAME, PRESENCE
 from macs_zenoh.mesh import Mesh
+from macs_zenoh.protocol.keyexpr import LEASE, NAME, PRESENCE
 from tests.certificates import Authority
 from tests.integration.test_access_rules import RULES, USERS, credentials
 from tests.programs import ROOT, Program, free_port

@@ -18,9 +18,9 @@ import macs_zenoh
 from bridge.gateway import Gateway
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Refused, WireError
-from macs_zenoh.keyexpr import BROADCAST, GROUP, STREAM
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM
+from macs_zenoh.protocol.messages import (
     MANAGERS,
     ROS,
     UNITY,
@@ -31,8 +31,8 @@ from macs_zenoh.messages import (
     encode_data,
     encode_management,
 )
-from macs_zenoh.routing import call, unicast_key
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.routing import call, unicast_key
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.conftest import Connect, StartGateway, until
 
 TYPES = {"nd__chatter": "std_msgs/String", "nd__cmd": "std_msgs/String", "nd__set": "std_srvs/SetBool"}

@@ -8,8 +8,8 @@ from contextlib import AsyncExitStack, suppress
 
 import macs_zenoh
 from bridge.headset.client import Headset
-from macs_zenoh.messages import Metadata, NodeType, StreamData, encode_management
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.programs import Program, free_port
 
 

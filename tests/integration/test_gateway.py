@@ -13,7 +13,7 @@ import pytest
 import macs_zenoh
 from bridge.gateway import Gateway
 from macs_zenoh.errors import ConfigError
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.messages import (
     AddNode,
     AgentsGone,
     Configuration,
@@ -24,7 +24,7 @@ from macs_zenoh.messages import (
     decode_data,
     encode_management,
 )
-from macs_zenoh.wire import MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, encode_message, split_message
 from tests.integration.conftest import Connect, StartGateway, until
 
 METADATA = Metadata(message_manager="Greeting").encode()
@@ -171,7 +171,7 @@ async def test_nothing_comes_before_the_first_message(start_gateway: StartGatewa
 
 async def test_silence_ends_a_connection(start_gateway: StartGateway, connect: Connect) -> None:
     """Who does not answer the handshake, or is silent afterwards, is disconnected; the others are told at once."""
-    gateway = await start_gateway(handshake_s=0.3, silence_s=0.5)
+    gateway = await start_gateway(handshake_timeout_s=0.3, idle_timeout_s=0.5)
     async with socket(gateway) as mute, socket(gateway) as silent, socket(gateway) as watcher:
         silent.configure()
         watcher.configure()
@@ -260,7 +260,7 @@ async def test_registrations_reach_robots_that_come_later(
 
 async def test_a_stalled_headset_is_let_go(router: str, start_gateway: StartGateway, connect: Connect) -> None:
     """A headset that stops reading is disconnected after its time; its neighbour gets everything in order."""
-    gateway = await start_gateway(stall_s=0.5, outbox_bytes=1 << 20)
+    gateway = await start_gateway(write_timeout_s=0.5, outbox_bytes=1 << 20)
     neighbour, stalled = await connect(gateway), await connect(gateway)
     stalled.pause()
     async with macs_zenoh.join("ros", id=1, connect=[router]) as robot:

@@ -20,7 +20,7 @@ from bridge.gateway import Gateway
 from bridge.headset.typed import Types, request_of, response_of
 from macs_zenoh.config import GatewaySettings, MeshSettings
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.messages import (
     AddNode,
     Functionality,
     FunctionalityRequest,
@@ -33,7 +33,7 @@ from macs_zenoh.messages import (
     encode_management,
     node_name,
 )
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 
 ROOT = Path(__file__).parents[2]
 SET_BOOL = "std_srvs/SetBool"

@@ -11,9 +11,9 @@ import macs_zenoh
 from bridge.gateway import Gateway
 from bridge.headset.client import Headset
 from macs_zenoh.agent import Agent
-from macs_zenoh.messages import Metadata
-from macs_zenoh.reading import Message
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.messages import Metadata
+from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_gateway import Socket, socket
 

@@ -11,13 +11,13 @@ import pytest
 
 import macs_zenoh
 from bridge.headset.client import Headset
-from macs_zenoh import ping
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Refused
-from macs_zenoh.keyexpr import NAME, PING
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import Metadata
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol import ping
+from macs_zenoh.protocol.keyexpr import NAME, PING
+from macs_zenoh.protocol.messages import Metadata
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.test_bounds import Raw
 from tests.programs import Program, ended, free_port
 

@@ -16,7 +16,7 @@ import macs_zenoh
 from bridge.headset.client import Headset
 from bridge.headset.frames import NodeSpec, registration
 from macs_zenoh.errors import Refused, Unreachable
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.messages import (
     Configuration,
     Metadata,
     NodeRefused,
@@ -25,7 +25,7 @@ from macs_zenoh.messages import (
     decode_data,
     encode_management,
 )
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.conftest import Connect, StartGateway, until
 from tests.programs import Program, free_port
 
@@ -138,7 +138,7 @@ async def test_large_frames_leave_nothing() -> None:
 
 async def test_silent_connections_are_closed(start_gateway: StartGateway) -> None:
     """Five hundred connections that say nothing are closed by the handshake limit, and leave nothing behind."""
-    gateway = await start_gateway(handshake_s=1.0)
+    gateway = await start_gateway(handshake_timeout_s=1.0)
     connections = [await asyncio.open_connection("127.0.0.1", gateway.port) for _ in range(500)]
     for reader, writer in connections:
         assert await asyncio.wait_for(reader.read(), 10)  # the greeting, then FIN

@@ -17,15 +17,15 @@ import pytest
 import macs_zenoh
 from bridge.gateway import Gateway, renumbering
 from bridge.gateway.leases import Leases
-from bridge.gateway.robots import RobotCalls
+from bridge.gateway.registration_calls import RobotCalls
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Incoming, Subscription
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import GatewaySettings, MeshSettings, TrafficRule, changed
-from macs_zenoh.directory import Directory
-from macs_zenoh.existing import CDR
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.directory import Directory
+from macs_zenoh.protocol.existing import CDR
+from macs_zenoh.protocol.messages import (
     ROS,
     UNITY,
     AddNode,
@@ -40,8 +40,8 @@ from macs_zenoh.messages import (
     decode_data,
     encode_management,
 )
-from macs_zenoh.registrations import AgentKey, Task
-from macs_zenoh.wire import Layout, MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.protocol.registrations import AgentKey, Task
+from macs_zenoh.protocol.wire import Layout, MessageDecoder, encode_frame, encode_message, split_message
 from tests.integration.conftest import until
 from tests.links import Link, counted
 from tests.programs import Program, macs

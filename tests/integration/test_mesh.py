@@ -10,9 +10,9 @@ import macs_zenoh
 from bridge.gateway.server import Gateway
 from bridge.headset.client import Headset
 from macs_zenoh.config import GatewaySettings, MeshSettings
-from macs_zenoh.keyexpr import PING
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.mesh.outgoing import Outgoing
+from macs_zenoh.protocol.keyexpr import PING
 from tests.integration.conftest import until
 from tests.routers import Router
 

@@ -22,11 +22,11 @@ import macs_zenoh.managers
 from bridge.gateway import Gateway
 from macs_zenoh.config import GatewaySettings, MeshSettings
 from macs_zenoh.errors import Refused
-from macs_zenoh.keyexpr import type_number
 from macs_zenoh.managers import Asker, Manager
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import Metadata, decode_data, encode_data
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.keyexpr import type_number
+from macs_zenoh.protocol.messages import Metadata, decode_data, encode_data
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.test_gateway import Socket, socket
 from tests.programs import ROOT, Program, ended, free_port, macs
 

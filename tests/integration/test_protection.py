@@ -9,13 +9,13 @@ import time
 import pytest
 
 import macs_zenoh
-from macs_zenoh import ping
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import NotServed, Refused
-from macs_zenoh.existing import CDR
-from macs_zenoh.keyexpr import BROADCAST, GROUP, PING
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import (
+from macs_zenoh.protocol import ping
+from macs_zenoh.protocol.existing import CDR
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, PING
+from macs_zenoh.protocol.messages import (
     ROS,
     UNITY,
     AddNode,
@@ -29,8 +29,8 @@ from macs_zenoh.messages import (
     encode_data,
     encode_management,
 )
-from macs_zenoh.routing import call, unicast_key
-from macs_zenoh.wire import PROBE, encode_frame, encode_message
+from macs_zenoh.protocol.routing import call, unicast_key
+from macs_zenoh.protocol.wire import PROBE, encode_frame, encode_message
 from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_gateway import Socket, socket
 
@@ -89,7 +89,7 @@ async def test_a_robot_program_is_told_once(start_gateway: StartGateway) -> None
 
 async def test_a_short_silence_is_noticed(start_gateway: StartGateway) -> None:
     """An agent that is silent from its configuration on is gone after the time for silence, not for the handshake."""
-    gateway = await start_gateway(silence_s=0.3, handshake_s=60.0)
+    gateway = await start_gateway(idle_timeout_s=0.3, handshake_timeout_s=60.0)
     async with socket(gateway) as agent:
         agent.configure()
         with pytest.raises(ConnectionError):
@@ -296,7 +296,7 @@ async def test_a_silent_agent_is_away_and_stays(
     """An agent that nothing is heard of stays connected for a minute, and its gateway says that it is away."""
     monkeypatch.setattr("bridge.gateway.connection.AWAY_S", 0.3)
     gateway = await start_gateway()
-    assert gateway.settings.silence_s == 60
+    assert gateway.settings.idle_timeout_s == 60
     lively = await connect(gateway, heartbeat_s=0.05)
     async with socket(gateway) as taken_off, await Mesh.open(MeshSettings(connect=[router])) as mesh:
         taken_off.configure()

@@ -21,14 +21,15 @@ from bridge.headset.client import Headset
 from macs_zenoh import awareness
 from macs_zenoh.agent import Agent, Call
 from macs_zenoh.config import GatewaySettings, MeshSettings, TrafficRule
-from macs_zenoh.keyexpr import NAMED_ALL
-from macs_zenoh.mesh import Mesh, Sample, Traffic, recovered
+from macs_zenoh.mesh import Mesh, Sample, Traffic
+from macs_zenoh.mesh import reliable as recovered
 from macs_zenoh.mesh.arrivals import Arrivals
+from macs_zenoh.mesh.declared import OnBatch
 from macs_zenoh.mesh.outgoing import Outgoing
-from macs_zenoh.mesh.samples import OnBatch
-from macs_zenoh.messages import AddNode, Metadata, NodeType, StreamData, decode_data, encode_management
-from macs_zenoh.named import Outcome
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.keyexpr import NAMED_ALL
+from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, StreamData, decode_data, encode_management
+from macs_zenoh.protocol.named import Outcome
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.conftest import until
 from tests.programs import free_port
 from tests.routers import Router

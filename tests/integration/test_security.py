@@ -26,11 +26,11 @@ from bridge.security.plan import Plan
 from macs_zenoh import awareness, config
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import NotServed, Refused, Unreachable
-from macs_zenoh.keyexpr import STREAM
 from macs_zenoh.mesh import Mesh, Sample
-from macs_zenoh.messages import Metadata, NodeType, StreamData, encode_management
-from macs_zenoh.named import Outcome
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.keyexpr import STREAM
+from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
+from macs_zenoh.protocol.named import Outcome
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.conftest import until
 from tests.integration.test_reliable import Numbers, Stream
 from tests.programs import ROOT, Program, ended, free_port, macs

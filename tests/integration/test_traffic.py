@@ -21,13 +21,13 @@ from bridge.headset.client import Headset
 from macs_zenoh import awareness
 from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.errors import OutOfRange
-from macs_zenoh.keyexpr import NAMED, STREAM, UNICAST
 from macs_zenoh.mesh import Mesh, Sample, Traffic
 from macs_zenoh.mesh.outgoing import Outgoing
-from macs_zenoh.messages import Metadata, NodeRefused, NodeType, StreamData, decode_data, encode_management
-from macs_zenoh.named import Outcome
-from macs_zenoh.shaping import BURST_S
-from macs_zenoh.wire import encode_frame, encode_message, parse_frames
+from macs_zenoh.protocol.keyexpr import NAMED, STREAM, UNICAST
+from macs_zenoh.protocol.messages import Metadata, NodeRefused, NodeType, StreamData, decode_data, encode_management
+from macs_zenoh.protocol.named import Outcome
+from macs_zenoh.protocol.policing import BURST_S
+from macs_zenoh.protocol.wire import encode_frame, encode_message, parse_frames
 from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_gateway import socket
 from tests.links import counted
@@ -108,7 +108,7 @@ async def test_what_is_above_the_rate_is_dropped_and_counted(
     await taker.all_of(mesh)
     for key in (CAMERA, OTHER_CAMERA):
         assert 1 + 50 * BURST_S <= taker.count(key) <= most
-        assert mesh.shaper.drops[CAMERAS, "over_rate", key] == 1000 - taker.count(key)
+        assert mesh.policer.drops[CAMERAS, "over_rate", key] == 1000 - taker.count(key)
     assert mesh.drops == {"over_rate": 2000 - taker.count(CAMERA) - taker.count(OTHER_CAMERA)}
     assert taker.count(MAP) == 1000
     (warning,) = [record.message for record in caplog.records if record.levelno >= logging.WARNING]

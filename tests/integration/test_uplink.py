@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 
 import macs_zenoh
-from macs_zenoh.messages import Metadata, NodeType, StreamData, encode_management
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.conftest import Connect, StartGateway
 from tests.links import counted
 

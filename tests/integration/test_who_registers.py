@@ -13,8 +13,8 @@ import macs_zenoh
 from bridge.gateway import Gateway
 from bridge.headset import frames
 from macs_zenoh.errors import HeldByAnother
-from macs_zenoh.limits import NAMED_EACH, NODE_AGENTS, NODES_EACH
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.limits import NAMED_EACH, NODE_AGENTS, NODES_EACH
+from macs_zenoh.protocol.messages import (
     ROS,
     UNITY,
     AddNode,
@@ -28,7 +28,7 @@ from macs_zenoh.messages import (
     decode_data,
     encode_management,
 )
-from macs_zenoh.wire import MessageDecoder, encode_frame, split_message
+from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, split_message
 from tests.integration.conftest import Connect, StartGateway, until
 
 

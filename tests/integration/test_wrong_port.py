@@ -83,7 +83,7 @@ async def test_a_router_is_no_gateway(site: Site) -> None:
     assert line.startswith(f"macs headset: {where} cannot be reached: that is a Zenoh router")
     host, _, port = where.rpartition(":")
     with pytest.raises(Unreachable, match="that is a Zenoh router"):
-        await Headset.connect(host, int(port), handshake_s=60)
+        await Headset.connect(host, int(port), handshake_timeout_s=60)
 
 
 async def test_an_endpoint_of_zenoh_is_no_gateway() -> None:

@@ -23,7 +23,7 @@ import macs_zenoh
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Incoming
 from macs_zenoh.config import MeshSettings
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.messages import (
     AddNode,
     Metadata,
     NodeType,
@@ -32,7 +32,7 @@ from macs_zenoh.messages import (
     encode_management,
     node_name,
 )
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 
 TYPE = "std_msgs/String"
 HEADER = b"\0\1\0\0"

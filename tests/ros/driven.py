@@ -17,7 +17,7 @@ from ros_peer import Peer, drive, until
 from macs_zenoh import join
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings
-from macs_zenoh.messages import AddNode, Metadata, NodeType, encode_data, node_name
+from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, encode_data, node_name
 from tests.programs import Program
 from tests.routers import Router
 

@@ -14,8 +14,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from bridge.ros.session import RosSession
-from macs_zenoh.messages import AddNode, Metadata, NodeType, RemoveNode, node_name
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, RemoveNode, node_name
+from macs_zenoh.protocol.reading import Message
 
 
 class Peer:

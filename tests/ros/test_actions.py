@@ -23,9 +23,9 @@ from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused, WireError
-from macs_zenoh.messages import ActionVerb, Metadata, NodeType
-from macs_zenoh.reading import Message
-from macs_zenoh.wire import MACS, split_message
+from macs_zenoh.protocol.messages import ActionVerb, Metadata, NodeType
+from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.wire import MACS, split_message
 
 COUNT = "macs_test_msgs/Count"
 
@@ -91,7 +91,7 @@ class Headset:
 async def site(session: RosSession, peer: Peer, count_action: Any) -> AsyncIterator[SimpleNamespace]:
     """A counting robot, headsets 5 and 6 of group 3, and 9 of none."""
     headsets = {number: Headset(number) for number in (5, 6, 9)}
-    rules = Rules(RobotSettings(call_s=1, rules=[TopicRule(match="/other", cancel_on_leave=True)]))
+    rules = Rules(RobotSettings(call_timeout_s=1, rules=[TopicRule(match="/other", cancel_on_leave=True)]))
     robot = Robot(
         session,
         7,
@@ -264,7 +264,7 @@ async def test_an_unknown_goal_is_told(site: SimpleNamespace) -> None:
 async def test_results_are_not_kept_for_ever(site: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the configured time the result is gone, and without registrants the node too."""
     settings = site.nodes.robot.rules.settings
-    site.nodes.robot.rules.settings = RobotSettings(call_s=settings.call_s, result_s=0.1)
+    site.nodes.robot.rules.settings = RobotSettings(call_timeout_s=settings.call_timeout_s, result_timeout_s=0.1)
     monkeypatch.setattr("bridge.ros.actions.WATCH_S", 0.05)
     goal = await site.five.client.send_goal(7, site.goal(1))
     await goal.result(5)

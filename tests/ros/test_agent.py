@@ -22,9 +22,9 @@ from bridge.ros.requests import STATUS
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings
 from macs_zenoh.errors import Refused
-from macs_zenoh.keyexpr import PRESENCE, STREAM
 from macs_zenoh.mesh import Mesh, Sample
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.keyexpr import PRESENCE, STREAM
+from macs_zenoh.protocol.messages import (
     Functionality,
     FunctionalityRequest,
     Metadata,
@@ -33,9 +33,9 @@ from macs_zenoh.messages import (
     decode_data,
     decode_management,
 )
-from macs_zenoh.messages import encode_data as encode
-from macs_zenoh.routing import call
-from macs_zenoh.wire import parse_frame
+from macs_zenoh.protocol.messages import encode_data as encode
+from macs_zenoh.protocol.routing import call
+from macs_zenoh.protocol.wire import parse_frame
 
 ROBOT = 7
 

@@ -21,8 +21,8 @@ from bridge.ros.session import RosSession
 from bridge.ros.topics import PublisherNode
 from macs_zenoh import join
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule
-from macs_zenoh.messages import AddNode, Metadata, NodeType, encode_data, node_name
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, encode_data, node_name
+from macs_zenoh.protocol.reading import Message
 from tests.routers import Router
 
 RULES = [

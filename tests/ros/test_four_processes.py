@@ -15,7 +15,7 @@ from std_msgs.msg import String
 import macs_zenoh
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Incoming
-from macs_zenoh.messages import Functionality, decode_data
+from macs_zenoh.protocol.messages import Functionality, decode_data
 from tests.programs import Program, free_port, macs
 from tests.ros.ros_peer import Peer, get
 

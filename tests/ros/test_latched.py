@@ -21,9 +21,9 @@ from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from macs_zenoh.config import RobotSettings, TopicRule
-from macs_zenoh.messages import Metadata, StreamData, decode_management
-from macs_zenoh.reading import Message
-from macs_zenoh.wire import parse_frame
+from macs_zenoh.protocol.messages import Metadata, StreamData, decode_management
+from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.wire import parse_frame
 
 
 def latched(depth: int = 1, **more: Any) -> QoSProfile:

@@ -7,7 +7,7 @@ from importlib import import_module
 import pytest
 from rclpy.serialization import serialize_message
 
-from macs_zenoh.least_bytes import ANSWERS, LEAST
+from macs_zenoh.protocol.least_bytes import ANSWERS, LEAST
 
 
 @pytest.mark.parametrize("name", LEAST)

@@ -19,10 +19,10 @@ from macs_zenoh.agent import Agent
 from macs_zenoh.agent import join as join_mesh
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings
 from macs_zenoh.errors import MacsError
-from macs_zenoh.keyexpr import UNICAST
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import Metadata, NodeType, encode_data, node_name
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.keyexpr import UNICAST
+from macs_zenoh.protocol.messages import Metadata, NodeType, encode_data, node_name
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.programs import free_port
 
 ROBOT = 7

@@ -20,8 +20,8 @@ from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from macs_zenoh.config import RobotSettings
 from macs_zenoh.errors import Refused
-from macs_zenoh.messages import DataRefused, Metadata, NodeType, StreamData, decode_data, decode_management
-from macs_zenoh.wire import parse_frame
+from macs_zenoh.protocol.messages import DataRefused, Metadata, NodeType, StreamData, decode_data, decode_management
+from macs_zenoh.protocol.wire import parse_frame
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)

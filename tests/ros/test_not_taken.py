@@ -15,7 +15,7 @@ from geometry_msgs.msg import Twist
 from ros_peer import Peer
 
 from bridge.headset.client import Headset
-from macs_zenoh.messages import Functionality, FunctionalityRequest, decode_data
+from macs_zenoh.protocol.messages import Functionality, FunctionalityRequest, decode_data
 from tests.programs import Program, ended, free_port
 
 SETTINGS = """

@@ -22,7 +22,7 @@ from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from macs_zenoh.config import GatewaySettings, MeshSettings, RobotSettings, Settings, TopicRule
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import NodeType
+from macs_zenoh.protocol.messages import NodeType
 from tests.programs import free_port
 from tests.routers import Router
 

@@ -24,14 +24,14 @@ from bridge.ros.rules import Rules
 from bridge.ros.services import servers_elsewhere
 from bridge.ros.session import RosSession
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule
-from macs_zenoh.directory import AgentInfo
 from macs_zenoh.errors import Refused
-from macs_zenoh.keyexpr import PRESENCE
 from macs_zenoh.mesh import Mesh, Sample, Token, Traffic
-from macs_zenoh.messages import ActionVerb, AddNode, CallFailure, Metadata, NodeType, encode_data
-from macs_zenoh.reading import Message
-from macs_zenoh.routing import call, inbox, keys_of
-from macs_zenoh.wire import MACS, encode_frame, encode_message, parse_frame
+from macs_zenoh.protocol.directory import AgentInfo
+from macs_zenoh.protocol.keyexpr import PRESENCE
+from macs_zenoh.protocol.messages import ActionVerb, AddNode, CallFailure, Metadata, NodeType, encode_data
+from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.routing import call, inbox, keys_of
+from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, parse_frame
 from tests.programs import free_port
 
 ROBOT = 7

@@ -12,7 +12,7 @@ import macs_zenoh
 from bridge.ros.agent import open_robot
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import Metadata
+from macs_zenoh.protocol.messages import Metadata
 from tests.programs import free_port
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -17,9 +17,9 @@ import macs_zenoh
 from bridge.ros.agent import open_robot
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule, TrafficRule
-from macs_zenoh.keyexpr import STREAM
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import encode_data
+from macs_zenoh.protocol.keyexpr import STREAM
+from macs_zenoh.protocol.messages import encode_data
 
 ROBOT = 7
 

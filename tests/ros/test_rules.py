@@ -37,14 +37,14 @@ def test_the_first_rule_that_gives_a_setting_counts() -> None:
             rules=[
                 TopicRule(match="/a/b", max_hz=5),
                 TopicRule(match="/a/*", max_hz=10, depth=3),
-                TopicRule(match="/c", call_s=1),
+                TopicRule(match="/c", call_timeout_s=1),
             ]
         )
     )
     assert (rules.of("/a/b").max_hz, rules.of("/a/b").depth) == (5, 3)
     assert (rules.of("/a/x").max_hz, rules.of("/a/x").depth) == (10, 3)
     assert rules.of("/d") == TopicRule(match="/**")
-    assert (rules.call_s("/c"), rules.call_s("/a/b")) == (1, 5)
+    assert (rules.call_timeout_s("/c"), rules.call_timeout_s("/a/b")) == (1, 5)
 
 
 def test_parameters_of_nodes_are_hidden_unless_asked_for() -> None:

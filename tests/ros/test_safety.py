@@ -21,7 +21,7 @@ from bridge.ros.safety import Control, DeadMan, EmergencyStop
 from bridge.ros.session import RosSession
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
-from macs_zenoh.messages import NodeType
+from macs_zenoh.protocol.messages import NodeType
 
 SILENCE_S = 0.3
 FIVE, SIX = Registrant(2, 5), Registrant(2, 6)

@@ -21,10 +21,10 @@ from std_msgs.msg import Bool
 from test_safety_shared import told
 
 from macs_zenoh.agent import Agent
-from macs_zenoh.keyexpr import CALL, GROUP
-from macs_zenoh.messages import Metadata, NodeType
-from macs_zenoh.routing import unicast_key
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.keyexpr import CALL, GROUP
+from macs_zenoh.protocol.messages import Metadata, NodeType
+from macs_zenoh.protocol.routing import unicast_key
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 
 ROBOT, FLOODER = 1, 4000
 GROWTH_MIB = 150

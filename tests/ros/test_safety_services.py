@@ -19,8 +19,8 @@ from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from macs_zenoh.config import RobotSettings, TopicRule
-from macs_zenoh.messages import CallFailure, Metadata, NodeType, decode_data, node_name
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, node_name
+from macs_zenoh.protocol.reading import Message
 
 RULES = [
     TopicRule(match="/state", allow_while_stopped=True),

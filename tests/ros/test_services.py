@@ -23,8 +23,8 @@ from bridge.ros.services import ClientNode, ServiceNode
 from bridge.ros.session import RosSession
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
-from macs_zenoh.messages import CallFailure, Metadata, NodeType, decode_data, encode_data, node_name
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, encode_data, node_name
+from macs_zenoh.protocol.reading import Message
 
 DEADLINE_S = 0.5
 SET = "std_srvs/SetBool"
@@ -54,8 +54,11 @@ async def headsets() -> Headsets:
 async def nodes(session: RosSession, headsets: Headsets) -> AsyncIterator[InterfaceNodes]:
     rules = Rules(
         RobotSettings(
-            call_s=DEADLINE_S,
-            rules=[TopicRule(match="/code", error_response={"message": "E1"}), TopicRule(match="/slow", call_s=5)],
+            call_timeout_s=DEADLINE_S,
+            rules=[
+                TopicRule(match="/code", error_response={"message": "E1"}),
+                TopicRule(match="/slow", call_timeout_s=5),
+            ],
         )
     )
     nodes = InterfaceNodes(Robot(session, 7, lambda node, frame: None, send=headsets.send, rules=rules))
@@ -460,7 +463,11 @@ async def test_calls_beyond_the_limit_are_refused(session: RosSession, headsets:
     """When as many calls are open as allowed, the next gets its error at once."""
     nodes = InterfaceNodes(
         Robot(
-            session, 7, lambda node, frame: None, send=headsets.send, rules=Rules(RobotSettings(max_calls=2, call_s=3))
+            session,
+            7,
+            lambda node, frame: None,
+            send=headsets.send,
+            rules=Rules(RobotSettings(max_calls=2, call_timeout_s=3)),
         )
     )
     caller = await caller_of(nodes, peer, "/ask")

@@ -11,8 +11,8 @@ from geometry_msgs.msg import Twist
 from rclpy.serialization import serialize_message
 
 from bridge.ros.stream import StreamFraming, cdr_problem
-from macs_zenoh.messages import Metadata, StreamData, decode_management
-from macs_zenoh.wire import Layout, parse_frame
+from macs_zenoh.protocol.messages import Metadata, StreamData, decode_management
+from macs_zenoh.protocol.wire import Layout, parse_frame
 
 VECTORS = Path(__file__).parents[1] / "vectors" / "router"
 METADATA = Metadata(1, 7, 0, StreamData.manager, 1, "nd__chatter", "std_msgs/String")

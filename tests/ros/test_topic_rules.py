@@ -17,8 +17,8 @@ from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from bridge.ros.topics import RateLimit
 from macs_zenoh.config import RobotSettings, TopicRule
-from macs_zenoh.messages import NodeType
-from macs_zenoh.wire import parse_frame
+from macs_zenoh.protocol.messages import NodeType
+from macs_zenoh.protocol.wire import parse_frame
 
 
 def test_the_latest_of_those_that_come_too_soon_is_sent() -> None:

@@ -25,8 +25,8 @@ from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.session import RosSession
 from bridge.ros.types import least_cdr_bytes
 from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
-from macs_zenoh.messages import Metadata, NodeType, node_name
-from macs_zenoh.reading import Message
+from macs_zenoh.protocol.messages import Metadata, NodeType, node_name
+from macs_zenoh.protocol.reading import Message
 
 pytestmark = pytest.mark.timeout(600)  # the first of them compiles its messages, on a busy machine for minutes
 

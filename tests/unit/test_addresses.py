@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from macs_zenoh import addresses
-from macs_zenoh.addresses import Address
 from macs_zenoh.config import GatewaySettings, MeshSettings
 from macs_zenoh.errors import ConfigError
+from macs_zenoh.protocol import addresses
+from macs_zenoh.protocol.addresses import Address
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from macs_zenoh.budget import Budget, Toll, Unfinished
+from macs_zenoh.protocol.budget import Budget, Toll, Unfinished
 
 
 def test_each_address_and_all_have_bounds() -> None:

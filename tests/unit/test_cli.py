@@ -17,7 +17,7 @@ from bridge.cli import VERBS, build_parser, children, main, options, up
 from bridge.headset.verbs import script_parser
 from macs_zenoh.config import MeshSettings, Settings
 from macs_zenoh.errors import ConfigError
-from macs_zenoh.keyexpr import KEYS
+from macs_zenoh.protocol.keyexpr import KEYS
 
 
 def parsed(*argv: str) -> argparse.Namespace:

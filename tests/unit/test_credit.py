@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from macs_zenoh.credit import Credit, Credits
+from macs_zenoh.protocol.credit import Credit, Credits
 
 
 def test_a_seconds_worth_may_come_at_once_and_the_rest_at_the_rate() -> None:

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from macs_zenoh.directory import AgentInfo, Change, Directory
-from macs_zenoh.keyexpr import LEASE, UNICAST
+from macs_zenoh.protocol.directory import AgentInfo, Change, Directory
+from macs_zenoh.protocol.keyexpr import LEASE, UNICAST
 
 GRACE_S = 2.0
 ROBOT = AgentInfo(1, 7, 3, "a1")

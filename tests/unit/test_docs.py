@@ -10,8 +10,8 @@ import pytest
 from bridge.cli import VERBS
 from macs_zenoh import config
 from macs_zenoh.config import Settings, TrafficRule
-from macs_zenoh.messages import MANAGERS, NodeType
-from macs_zenoh.shaping import REASONS
+from macs_zenoh.protocol.messages import MANAGERS, NodeType
+from macs_zenoh.protocol.policing import REASONS
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
@@ -42,12 +42,12 @@ def test_the_protocol_page_has_every_node_type() -> None:
 
 
 def test_the_design_page_names_modules_that_exist() -> None:
-    """The table of rooms is the core's list of modules."""
-    rooms = page("docs/design.md").partition("## Rooms")[2].partition("\nImports go")[0]
-    named = set(re.findall(r"[\w/]+\.py", rooms))
-    assert {name.removeprefix("macs_zenoh/") for name in named} == {
-        path.name for path in (ROOT / "macs_zenoh").glob("*.py") if path.name != "__init__.py"
-    }
+    """The table of modules is the list of modules: of the protocol, and of those beside it."""
+    table = page("docs/design.md").partition("## Modules")[2].partition("\nImports go")[0]
+    rows = [row.split("|")[1] for row in table.splitlines() if row.startswith("|")]
+    named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    core = (ROOT / "macs_zenoh").glob("*.py"), (ROOT / "macs_zenoh" / "protocol").glob("*.py")
+    assert named == {path.stem for paths in core for path in paths if path.name != "__init__.py"}
 
 
 def test_the_readme_has_every_verb() -> None:

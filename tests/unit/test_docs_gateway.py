@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from macs_zenoh.config import GatewaySettings, RobotSettings
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.messages import (
     AddNode,
     CallFailure,
     Metadata,
@@ -21,8 +21,8 @@ from macs_zenoh.messages import (
     encode_data,
     node_name,
 )
-from macs_zenoh.peer import DEFAULT_LIMITS
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol.tcp_agent import DEFAULT_LIMITS
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.replay import RULES
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -78,7 +78,7 @@ def test_the_refusal_is_shown_as_it_is_sent() -> None:
     assert (refused.robot_id, refused.node_type, refused.tos_name) == (1, 1, "/chatter")
 
 
-@pytest.mark.parametrize("name", ["handshake_s", "silence_s", "stall_s"])
+@pytest.mark.parametrize("name", ["handshake_timeout_s", "idle_timeout_s", "write_timeout_s"])
 def test_times_are_the_defaults(name: str) -> None:
     """The gateway's times in the table are its defaults."""
     (seconds,) = re.findall(rf"^\| (\d+) s \| gateway \| `{name}`", UNITY, re.MULTILINE)
@@ -95,7 +95,7 @@ def test_limits_are_the_defaults() -> None:
     assert "at most 256, and 1 MiB" in COMPATIBILITY
     assert (DEFAULT_LIMITS.held_frames, DEFAULT_LIMITS.held_bytes) == (256, 1 << 20)
     (seconds,) = re.findall(r"^\| (\d+) s \| robot \|", UNITY, re.MULTILINE)
-    assert float(seconds) == getattr(RobotSettings(), "call_s", 5.0)
+    assert float(seconds) == getattr(RobotSettings(), "call_timeout_s", 5.0)
 
 
 def test_the_four_kinds_are_there() -> None:

@@ -18,8 +18,8 @@ from bridge.doctor.kinds import ERROR, GROUPS, KINDS, NOTE, OK, WARNING, Severit
 from bridge.doctor.look import Who
 from macs_zenoh.config import GatewaySettings, OperatorSettings, RobotSettings, Settings
 from macs_zenoh.errors import UsageError
-from macs_zenoh.keyexpr import LEASE, NAME, PRESENCE
-from macs_zenoh.ping import Pong
+from macs_zenoh.protocol.keyexpr import LEASE, NAME, PRESENCE
+from macs_zenoh.protocol.ping import Pong
 
 ROOT = Path(__file__).parents[2]
 RECORDED = (ROOT / "tests" / "facts" / "healthy_mesh.json").read_bytes()

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from macs_zenoh.existing import (
+from macs_zenoh.protocol.existing import (
     CDR,
     PASS,
     Asked,
@@ -19,8 +19,8 @@ from macs_zenoh.existing import (
     to_newer,
     to_robot,
 )
-from macs_zenoh.messages import FOR_NEWER, MANAGERS, ROS, UNITY, AddNode, Metadata, NodeType
-from macs_zenoh.wire import Header, encode_frame, encode_message, parse_frame, parse_frames, split_message
+from macs_zenoh.protocol.messages import FOR_NEWER, MANAGERS, ROS, UNITY, AddNode, Metadata, NodeType
+from macs_zenoh.protocol.wire import Header, encode_frame, encode_message, parse_frame, parse_frames, split_message
 
 TEXT = CDR + b"\x02\x00\x00\x00a\x00"
 FORBIDDEN = [

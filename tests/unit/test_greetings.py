@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from macs_zenoh import greetings
-from macs_zenoh.messages import Metadata, Welcome, encode_data
-from macs_zenoh.wire import encode_frame, encode_message
+from macs_zenoh.protocol import greetings
+from macs_zenoh.protocol.messages import Metadata, Welcome, encode_data
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 
 INIT_SYN = bytes.fromhex("1900c109f2833e982bfd0db45cd0616d888075c66b0ac8ff812701")
 INIT_ACK = bytes.fromhex(

@@ -6,12 +6,12 @@ import itertools
 
 import pytest
 
-from macs_zenoh.guard import Ages, Allowances, Fresh, Guard, Limits, sender_of
-from macs_zenoh.keyexpr import GROUP
-from macs_zenoh.messages import Metadata, NodeType
-from macs_zenoh.reading import Message
-from macs_zenoh.routing import unicast_key
-from macs_zenoh.wire import MACS, encode_frame, encode_message
+from macs_zenoh.protocol.guard import Ages, Allowances, Fresh, Guard, Limits, sender_of
+from macs_zenoh.protocol.keyexpr import GROUP
+from macs_zenoh.protocol.messages import Metadata, NodeType
+from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.routing import unicast_key
+from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message
 
 ME = (1, 7)
 KEY = unicast_key(1, 7, 2, 300)

@@ -14,8 +14,8 @@ from scripted_router import WELCOME, ScriptedRouter, recorded, welcome
 from bridge.headset.client import Headset, Link
 from bridge.headset.nodes import ServiceRequest
 from macs_zenoh.errors import CallTimeout, TooManyDestinations, Unreachable, UsageError
-from macs_zenoh.messages import EXTENSIONS, Metadata, NodeType, node_name
-from macs_zenoh.wire import Frame, encode_message, parse_frame
+from macs_zenoh.protocol.messages import EXTENSIONS, Metadata, NodeType, node_name
+from macs_zenoh.protocol.wire import Frame, encode_message, parse_frame
 
 STRING = "std_msgs/String"
 SET_BOOL = "std_srvs/SetBool"
@@ -104,7 +104,7 @@ async def test_a_wrong_greeting_ends_it(greeting: bytes, why: str) -> None:
     """A router whose first message gives no id in time is not one, and its connection is closed."""
     async with ScriptedRouter(greeting) as router:
         with pytest.raises(Unreachable, match=why):
-            await Headset.connect("127.0.0.1", router.port, handshake_s=0.1)
+            await Headset.connect("127.0.0.1", router.port, handshake_timeout_s=0.1)
         await router.until(lambda: router.ended == 1)
 
 

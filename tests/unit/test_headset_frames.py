@@ -12,8 +12,8 @@ from scripted_router import VECTORS, rows
 from bridge.headset import frames
 from bridge.headset.frames import NodeSpec
 from macs_zenoh.errors import OutOfRange, TooManyDestinations
-from macs_zenoh.messages import NodeType
-from macs_zenoh.wire import parse_frame
+from macs_zenoh.protocol.messages import NodeType
+from macs_zenoh.protocol.wire import parse_frame
 
 SENT = [
     pytest.param(bytes.fromhex(row["hex"]), id=f"{path.stem}-{number}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from bridge.headset.hints import Role, judge
-from macs_zenoh.messages import Functionality
+from macs_zenoh.protocol.messages import Functionality
 
 OFFERED = Functionality(
     publishers={"/chatter": "std_msgs/msg/String", "/scan": "sensor_msgs/msg/LaserScan"},

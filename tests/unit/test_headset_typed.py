@@ -14,7 +14,7 @@ from scripted_router import recorded
 
 from bridge.headset import typed
 from bridge.headset.typed import BadCdr, BadValue, MissingRosbags, Types, UnknownType, request_of, response_of
-from macs_zenoh.wire import parse_frame, split_message
+from macs_zenoh.protocol.wire import parse_frame, split_message
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[2]
 CORE = sorted((ROOT / "macs_zenoh").rglob("*.py"))
 BRIDGE = sorted((ROOT / "bridge").rglob("*.py"))
 
+PURE = sorted((ROOT / "macs_zenoh" / "protocol").glob("*.py"))
 WITH_ZENOH = set((ROOT / "macs_zenoh" / "mesh").glob("*.py"))
 WITH_ASYNCIO = WITH_ZENOH | {
     ROOT / "macs_zenoh" / name for name in ("agent.py", "awareness.py", "identity.py", "presence.py")
@@ -116,6 +117,14 @@ def test_help_is_instant(path: Path) -> None:
     )
     at_once = {name for name, when_loaded in imported(path) if when_loaded}
     assert not {name for name in at_once if name.startswith(heavy) or name.partition(".")[0] in {"zenoh", "rosbags"}}
+
+
+@pytest.mark.parametrize("path", PURE, ids=lambda path: path.name)
+def test_the_protocol_stands_alone(path: Path) -> None:
+    """What decides without input or output needs nothing but itself and the pure modules beside it."""
+    ours = {name for name, _ in imported(path) if name.startswith("macs_zenoh.")}
+    allowed = tuple(f"macs_zenoh.{name}" for name in ("protocol", "errors", "plain", "config", "versions"))
+    assert not {name for name in ours if not name.startswith(allowed)}
 
 
 def test_the_public_names_are_there() -> None:

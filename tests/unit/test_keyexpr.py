@@ -10,9 +10,9 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from macs_zenoh import keyexpr
 from macs_zenoh.errors import UsageError
-from macs_zenoh.keyexpr import (
+from macs_zenoh.protocol import keyexpr
+from macs_zenoh.protocol.keyexpr import (
     CALL,
     GROUP,
     KEYS,
@@ -26,7 +26,7 @@ from macs_zenoh.keyexpr import (
     type_name,
     type_number,
 )
-from macs_zenoh.limits import KEY_BYTES
+from macs_zenoh.protocol.limits import KEY_BYTES
 
 FORBIDDEN = "/*$?#%"
 """Characters that Zenoh gives a meaning to, and the one that escapes them."""

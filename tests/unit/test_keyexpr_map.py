@@ -1,4 +1,4 @@
-"""keyexpr_map.md says what macs_zenoh/keyexpr.py does, table by table."""
+"""keyexpr_map.md says what macs_zenoh/protocol/keyexpr.py does, table by table."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from macs_zenoh import keyexpr
-from macs_zenoh.keyexpr import KEYS
+from macs_zenoh.protocol import keyexpr
+from macs_zenoh.protocol.keyexpr import KEYS
 
 ROOT = Path(__file__).parents[2]
 

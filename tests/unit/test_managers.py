@@ -12,7 +12,7 @@ from msgspec import Struct
 from macs_zenoh import managers
 from macs_zenoh.errors import BadField, ConfigError, UnknownManager
 from macs_zenoh.managers import Asker, Manager
-from macs_zenoh.messages import MANAGERS, Custom, decode_management
+from macs_zenoh.protocol.messages import MANAGERS, Custom, decode_management
 
 MODULE = """
 import msgspec

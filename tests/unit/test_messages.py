@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recordings import reading
 
-from macs_zenoh import messages
 from macs_zenoh.errors import BadField, BadJson, TooLong, UnknownManager, WireError
-from macs_zenoh.limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, REQUEST_BYTES
-from macs_zenoh.messages import (
+from macs_zenoh.protocol import messages
+from macs_zenoh.protocol.limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, REQUEST_BYTES
+from macs_zenoh.protocol.messages import (
     MANAGERS,
     AddNode,
     AgentsGone,

@@ -8,11 +8,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from macs_zenoh import named
 from macs_zenoh.errors import BadField, BadJson, BadSizes, UsageError, WireError
-from macs_zenoh.keyexpr import NAME, WANTED
-from macs_zenoh.named import Arrivals, Copies, Envelope, LastValues, Named, Names, Outcome, RateLimits, check_word
-from macs_zenoh.wire import encode_message
+from macs_zenoh.protocol import named
+from macs_zenoh.protocol.keyexpr import NAME, WANTED
+from macs_zenoh.protocol.named import (
+    Arrivals,
+    Copies,
+    Envelope,
+    LastValues,
+    Named,
+    Names,
+    Outcome,
+    RateLimits,
+    check_word,
+)
+from macs_zenoh.protocol.wire import encode_message
 
 
 @given(st.text(min_size=1, max_size=64), st.integers(0, 2**53), st.none() | st.floats(0.001, 1e6), st.binary())

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from macs_zenoh.errors import WireError
-from macs_zenoh.keyexpr import BROADCAST, GROUP
-from macs_zenoh.messages import ROS, UNITY, Metadata
-from macs_zenoh.reading import Message, Reader
-from macs_zenoh.routing import unicast_key
-from macs_zenoh.wire import MACS, encode_frame, encode_message
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP
+from macs_zenoh.protocol.messages import ROS, UNITY, Metadata
+from macs_zenoh.protocol.reading import Message, Reader
+from macs_zenoh.protocol.routing import unicast_key
+from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message
 
 ME = (ROS, 7)
 INBOX = unicast_key(*ME, UNITY, 256)

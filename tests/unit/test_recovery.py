@@ -8,8 +8,8 @@ from collections import deque
 
 import pytest
 
-from macs_zenoh import recovery
-from macs_zenoh.recovery import (
+from macs_zenoh.protocol import recovery
+from macs_zenoh.protocol.recovery import (
     ATTEMPTS,
     AWAY_S,
     NUMBERS,

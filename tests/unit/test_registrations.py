@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from macs_zenoh.messages import AddNode, NodeType, RemoveNode
-from macs_zenoh.registrations import AgentKey, Registrations, Task
+from macs_zenoh.protocol.messages import AddNode, NodeType, RemoveNode
+from macs_zenoh.protocol.registrations import AgentKey, Registrations, Task
 
 NODES = ["nd__chatter", "nd__camera"]
 

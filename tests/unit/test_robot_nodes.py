@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from macs_zenoh.errors import Refused
-from macs_zenoh.limits import NODES_EACH
-from macs_zenoh.messages import ROS, UNITY, AddNode, Functionality, GoneAgent, RemoveNode, node_name
-from macs_zenoh.robot_nodes import RobotNodes
+from macs_zenoh.protocol.limits import NODES_EACH
+from macs_zenoh.protocol.messages import ROS, UNITY, AddNode, Functionality, GoneAgent, RemoveNode, node_name
+from macs_zenoh.protocol.robot_nodes import RobotNodes
 
 
 def node(topic: str = "/a", kind: int = 1, type_: str = "std_msgs/String", agent: int = 5, **fields: Any) -> AddNode:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from bridge.gateway.routes import KNOWN_ROUTES, STRANGERS_PER_S, Routes
-from macs_zenoh.messages import Metadata
-from macs_zenoh.routing import keys_of
-from macs_zenoh.wire import Frame, encode_frame, encode_message, parse_frame
+from macs_zenoh.protocol.messages import Metadata
+from macs_zenoh.protocol.routing import keys_of
+from macs_zenoh.protocol.wire import Frame, encode_frame, encode_message, parse_frame
 
 ONLINE = {(2, agent_id) for agent_id in range(1, 1001)}
 ME = (2, 7)

@@ -9,9 +9,9 @@ import zenoh
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from macs_zenoh.keyexpr import BROADCAST, GROUP, KEYS, UNICAST, block_of, parse
-from macs_zenoh.routing import inbox, keys_of, takes_group_copy
-from macs_zenoh.wire import Header
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, KEYS, UNICAST, block_of, parse
+from macs_zenoh.protocol.routing import inbox, keys_of, takes_group_copy
+from macs_zenoh.protocol.wire import Header
 
 AgentKey = tuple[int, int]
 

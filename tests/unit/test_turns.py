@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from macs_zenoh.turns import Turns
+from macs_zenoh.protocol.turns import Turns
 
 ONE, TWO = (2, 1), (2, 2)
 

@@ -10,10 +10,10 @@ import msgspec
 import pytest
 from recordings import BY_NAME, RECORDINGS, Recording, cut_around, one_by_one, reading
 
-from macs_zenoh import messages
 from macs_zenoh.errors import BadField, BadJson, BadSizes, UnknownManager, WireError
-from macs_zenoh.messages import Management, Metadata, decode_data, decode_management, encode_management
-from macs_zenoh.wire import (
+from macs_zenoh.protocol import messages
+from macs_zenoh.protocol.messages import Management, Metadata, decode_data, decode_management, encode_management
+from macs_zenoh.protocol.wire import (
     MACS,
     FrameDecoder,
     MessageDecoder,

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from recordings import cut_around, one_by_one
 
 from macs_zenoh.errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations
-from macs_zenoh.limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, SAMPLE_BYTES
-from macs_zenoh.wire import (
+from macs_zenoh.protocol.limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, SAMPLE_BYTES
+from macs_zenoh.protocol.wire import (
     COPY_BYTES,
     EMPTY_MESSAGE,
     MACS,

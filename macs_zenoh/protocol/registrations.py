@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from msgspec import structs
 
-from .errors import Refused
+from ..errors import Refused
 from .keyexpr import type_name
 from .messages import AddNode, NodeType, RemoveNode
 

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 
-class Door:
+class Admission:
     """The limits on connections: ``allow`` lists networks (CIDR, empty = everybody), ``groups`` who
     may choose a group."""
 

@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple, TypeVar
 import msgspec
 from msgspec import Meta
 
-from .errors import BadField, BadJson, UsageError
+from ..errors import BadField, BadJson, UsageError
 from .keyexpr import NAME, WANTED, type_name
 from .wire import encode_message, split_message
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from macs_zenoh.blocks import (
+from macs_zenoh.protocol.ids import (
     BLOCKS,
     COMPLAINT_S,
     GATEWAY_PATIENCE_S,
@@ -17,7 +17,7 @@ from macs_zenoh.blocks import (
     free_id,
     keeps,
 )
-from macs_zenoh.keyexpr import block_of
+from macs_zenoh.protocol.keyexpr import block_of
 
 zids = st.text("0123456789abcdef", min_size=1, max_size=4)
 

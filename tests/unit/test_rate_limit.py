@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from macs_zenoh.pace import FLOODED, NOW, WAITED, Pace, Passing
+from macs_zenoh.protocol.rate_limit import FLOODED, NOW, WAITED, Pace, Passing
 
 
 @pytest.fixture

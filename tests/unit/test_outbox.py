@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from macs_zenoh.queues import Chunk, Outbox
+from macs_zenoh.protocol.outbox import Chunk, Outbox
 
 LIMIT = 100
 NODES = {"camera": (3, False), "pose": (1, False), "log": (2, True), "odd": (0, False)}

@@ -13,7 +13,7 @@ import pytest
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import NotServed
 from macs_zenoh.mesh import Mesh, Traffic
-from macs_zenoh.mesh.awake import Awake
+from macs_zenoh.mesh.cpu_latency import Awake
 from tests.integration.conftest import until
 
 STREAM_KEY = "macs/from/ros/7/nd__map"

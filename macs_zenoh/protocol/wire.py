@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from .errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations
+from ..errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations
 from .limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, RUN_BYTES, SAMPLE_BYTES
 
 MAX_FRAME_BYTES = 32 << 20

@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 from msgspec import Struct, structs
 
+from ..errors import BadField, BadJson, NotAllowed, TooFast, UnknownManager, WireError
 from . import greetings
 from .credit import Credit
-from .errors import BadField, BadJson, NotAllowed, TooFast, UnknownManager, WireError
 from .limits import (
     CONFIGURATION_BYTES,
     MANAGEMENT_BYTES,
@@ -73,8 +73,8 @@ class Limits(NamedTuple):
     """What one TCP agent may cost, and how long it may be silent."""
 
     max_frame_bytes: int = MAX_FRAME_BYTES
-    handshake_s: float = 10.0
-    silence_s: float = 60.0
+    handshake_timeout_s: float = 10.0
+    idle_timeout_s: float = 60.0
     held_frames: int = 256
     held_bytes: int = 1 << 20
     frames_per_s: float = 0.0
@@ -156,7 +156,7 @@ class Left(NamedTuple):
 Event = Joined | Sent | Streamed | Registering | AskedOnline | Asked | RegistrationRefused | Rejected | Left
 
 
-class Peer:
+class TcpAgent:
     """The protocol of one TCP agent.
 
     ``drops`` counts, by name, what was not passed on; ``corrected`` counts frames whose sender had to be put right.
@@ -315,8 +315,8 @@ class Peer:
     def next_deadline(self) -> float:
         """When `tick` is due at the latest."""
         if self.state is GREETED:
-            return self._connected_at + self._limits.handshake_s
-        due = self._heard_at + self._limits.silence_s
+            return self._connected_at + self._limits.handshake_timeout_s
+        due = self._heard_at + self._limits.idle_timeout_s
         if self._partial_since is not None:
             return min(due, self._partial_since + self._limits.partial_window_s)
         return due
@@ -326,9 +326,9 @@ class Peer:
         if self.state is GONE or now < self.next_deadline():
             return []
         if self.state is GREETED:
-            return [self._leave(f"no configuration within {self._limits.handshake_s:g} s")]
-        if now >= self._heard_at + self._limits.silence_s:
-            return [self._leave(f"silent for {self._limits.silence_s:g} s")]
+            return [self._leave(f"no configuration within {self._limits.handshake_timeout_s:g} s")]
+        if now >= self._heard_at + self._limits.idle_timeout_s:
+            return [self._leave(f"silent for {self._limits.idle_timeout_s:g} s")]
         return self._judge_partial(now)
 
     def _judge_partial(self, now: float) -> list[Event]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from .config import MeshSettings
-from .errors import BadJson
+from ..config import MeshSettings
+from ..errors import BadJson
 from .limits import REQUEST_BYTES
 from .wire import Buffer, encode_message, split_message
 

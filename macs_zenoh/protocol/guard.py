@@ -16,8 +16,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from typing import NamedTuple, Protocol
 
+from ..errors import WireError
 from .credit import Credit
-from .errors import WireError
 from .messages import ROS, NodeType
 from .reading import Message, Reader
 from .wire import Layout

@@ -11,8 +11,8 @@ import re
 import sys
 from collections.abc import Collection, Iterable
 
+from ..errors import HeldByAnother, Refused
 from .budget import may_have_one_more
-from .errors import HeldByAnother, Refused
 from .keyexpr import type_name
 from .limits import NODES_EACH
 from .messages import AddNode, Functionality, GoneAgent, NodeType, RemoveNode, node_name

@@ -19,7 +19,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from .errors import BadField, BadJson, TooLong, UnknownManager
+from ..errors import BadField, BadJson, TooLong, UnknownManager
 from .limits import (
     ANSWER_BYTES,
     CONFIGURATION_BYTES,

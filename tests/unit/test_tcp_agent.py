@@ -24,7 +24,7 @@ from macs_zenoh.errors import (
     UnknownManager,
     WireError,
 )
-from macs_zenoh.messages import (
+from macs_zenoh.protocol.messages import (
     MANAGERS,
     OPERATOR,
     ROS,
@@ -47,24 +47,24 @@ from macs_zenoh.messages import (
     encode_data,
     encode_management,
 )
-from macs_zenoh.peer import (
+from macs_zenoh.protocol.tcp_agent import (
     Asked,
     AskedOnline,
     Event,
     Joined,
     Left,
     Limits,
-    Peer,
     Registering,
     RegistrationRefused,
     Rejected,
     Sent,
     State,
     Streamed,
+    TcpAgent,
 )
-from macs_zenoh.wire import MACS, Layout, encode_frame, encode_message, parse_frame, split_message
+from macs_zenoh.protocol.wire import MACS, Layout, encode_frame, encode_message, parse_frame, split_message
 
-LIMITS = Limits(max_frame_bytes=1 << 20, handshake_s=10.0, silence_s=5.0, held_frames=4, held_bytes=1000)
+LIMITS = Limits(max_frame_bytes=1 << 20, handshake_timeout_s=10.0, idle_timeout_s=5.0, held_frames=4, held_bytes=1000)
 
 
 def configuration(agent_type: int = UNITY, agent_id: int = 7, group: int = 0, request_id: int = 42) -> bytes:
@@ -78,9 +78,9 @@ def message(*, sender: tuple[int, int] = (UNITY, 7), data: bytes = b"hi", ids: I
     return encode_frame(UNITY, tuple(ids), message=encode_message(metadata, data))
 
 
-def online(agent_type: int = UNITY, group: int = 0, limits: Limits = LIMITS) -> Peer:
+def online(agent_type: int = UNITY, group: int = 0, limits: Limits = LIMITS) -> TcpAgent:
     """Agent 7, configured at time 0."""
-    peer = Peer(7, 42, 0.0, limits=limits)
+    peer = TcpAgent(7, 42, 0.0, limits=limits)
     peer.receive(configuration(agent_type, group=group), 0.0)
     assert peer.state is State.ONLINE
     return peer
@@ -206,7 +206,7 @@ def test_a_recorded_agent_does_what_the_protocol_says(talk: Talk) -> None:
     """What existing agents were recorded to send gives exactly the events that the protocol page says, however the
     bytes are cut; nothing is rejected, and every message leaves with the connection's own id as its sender."""
     stream = b"".join(talk.stream)
-    whole = Peer(talk.agent_id, 42, 0.0)
+    whole = TcpAgent(talk.agent_id, 42, 0.0)
     events = whole.receive(stream, 1.0)
     assert [said(event) for event in events] == expected(talk)
     assert not whole.drops
@@ -215,7 +215,7 @@ def test_a_recorded_agent_does_what_the_protocol_says(talk: Talk) -> None:
             sender = reading(event.frame.metadata)
             assert (sender["sender_agent_type"], sender["sender_agent_id"]) == (whole.agent_type, talk.agent_id)
             assert Metadata.decode(event.frame.metadata) == event.metadata
-    piecewise = Peer(talk.agent_id, 42, 0.0)
+    piecewise = TcpAgent(talk.agent_id, 42, 0.0)
     assert [said(event) for piece in one_by_one(stream) for event in piecewise.receive(piece, 1.0)] == expected(talk)
 
 
@@ -259,7 +259,7 @@ def test_a_recorded_fault_costs_one_frame(name: str) -> None:
     assert [talk.agent_id for talk in found] == list(range(1, len(found) + 1))
     for talk, events in zip(found, FAULTS[name.removeprefix("router/fault_")], strict=True):
         for pieces in ([b"".join(talk.stream)], one_by_one(b"".join(talk.stream))):
-            peer = Peer(talk.agent_id, talk.agent_id, 0.0)
+            peer = TcpAgent(talk.agent_id, talk.agent_id, 0.0)
             got = [said(event) for piece in pieces for event in singles(peer.receive(piece, 1.0))]
             assert [event[:4] if event[0] == "Sent" else event for event in got] == events
             assert peer.agent_id == talk.agent_id
@@ -273,7 +273,7 @@ def test_a_recorded_fault_costs_one_frame(name: str) -> None:
 def test_the_welcome_is_the_recorded_one() -> None:
     """The first message tells the id, with the connection's number as its request, as the existing router does."""
     recorded = BY_NAME["headset/handshake_group0"].messages[0]
-    metadata, data = split_message(Peer(7, 42, 0.0).welcome())
+    metadata, data = split_message(TcpAgent(7, 42, 0.0).welcome())
     expected_metadata, expected_data = split_message(recorded)
     assert reading(metadata) == reading(expected_metadata)
     assert json.loads(bytes(data)) == json.loads(bytes(expected_data)) == {"agentId": 7}
@@ -282,7 +282,7 @@ def test_the_welcome_is_the_recorded_one() -> None:
 def test_registrations_before_the_configuration_wait_for_it() -> None:
     """What headsets send before their configuration follows their joining, in order, with the id they were given."""
     frames = BY_NAME["headset/register"].frames
-    peer = Peer(9, 42, 0.0, limits=LIMITS._replace(held_frames=256, held_bytes=1 << 20))
+    peer = TcpAgent(9, 42, 0.0, limits=LIMITS._replace(held_frames=256, held_bytes=1 << 20))
     assert peer.receive(b"".join(frames), 1.0) == []
     assert peer.state is State.GREETED
     joined, *registered = peer.receive(BY_NAME["headset/handshake_group3"].frames[0], 2.0)
@@ -295,7 +295,7 @@ def test_registrations_before_the_configuration_wait_for_it() -> None:
 
 def test_messages_before_the_configuration_wait_for_it() -> None:
     """A message sent too early is delivered after joining, with its true sender."""
-    peer = Peer(7, 42, 0.0, limits=LIMITS)
+    peer = TcpAgent(7, 42, 0.0, limits=LIMITS)
     assert peer.receive(message(sender=(UNITY, 0)), 1.0) == []
     joined, sent = peer.receive(configuration(), 2.0)
     assert isinstance(joined, Joined)
@@ -305,7 +305,7 @@ def test_messages_before_the_configuration_wait_for_it() -> None:
 
 def test_bad_frames_that_waited_are_rejected_after_joining() -> None:
     """A held frame that cannot be used costs itself; those held behind it are still delivered."""
-    peer = Peer(7, 42, 0.0, limits=LIMITS)
+    peer = TcpAgent(7, 42, 0.0, limits=LIMITS)
     no_metadata = encode_frame(UNITY, [5], message=encode_message(b"", b"x"))
     assert peer.receive(no_metadata + message(), 1.0) == []
     assert [said(event)[0] for event in singles(peer.receive(configuration(), 2.0))] == ["Joined", "Rejected", "Sent"]
@@ -314,7 +314,7 @@ def test_bad_frames_that_waited_are_rejected_after_joining() -> None:
 def test_what_may_wait_for_the_configuration_is_bounded() -> None:
     """Frames beyond the number or the bytes that may be held are dropped and counted, the first ones kept."""
     for frames, kept in (([message()] * 6, 4), ([message(data=bytes(400))] * 3, 1)):
-        peer = Peer(7, 42, 0.0, limits=LIMITS)
+        peer = TcpAgent(7, 42, 0.0, limits=LIMITS)
         peer.receive(b"".join(frames), 1.0)
         assert peer.drops == {"before_configuration": len(frames) - kept}
         assert [said(event)[0] for event in singles(peer.receive(configuration(), 2.0))] == ["Joined"] + [
@@ -325,7 +325,7 @@ def test_what_may_wait_for_the_configuration_is_bounded() -> None:
 @pytest.mark.parametrize(("agent_id", "request_id"), [(0, 42), (999, 42), (7, 1), (7, 0)])
 def test_the_id_in_a_configuration_is_not_believed(agent_id: int, request_id: int) -> None:
     """Whatever id and request a configuration names, the agent has the id it was given."""
-    peer = Peer(7, 42, 0.0)
+    peer = TcpAgent(7, 42, 0.0)
     assert peer.receive(configuration(UNITY, agent_id, 3, request_id), 1.0) == [Joined(UNITY, 3, None)]
     (sent,) = peer.receive(message(), 2.0)
     assert isinstance(sent, Sent)
@@ -334,7 +334,7 @@ def test_the_id_in_a_configuration_is_not_believed(agent_id: int, request_id: in
 
 def test_nobody_becomes_an_operator_over_tcp() -> None:
     """Who calls itself an operator does not get online: a robot that lets operators release it knows who they are."""
-    peer = Peer(7, 42, 0.0)
+    peer = TcpAgent(7, 42, 0.0)
     assert errors(peer.receive(configuration(OPERATOR), 1.0)) == [NotAllowed]
     assert peer.state is State.GREETED
     assert peer.receive(configuration(UNITY), 2.0) == [Joined(UNITY, 0, None)]
@@ -351,7 +351,7 @@ def test_a_second_configuration_may_change_the_group() -> None:
 
 def test_type_0_is_no_agent() -> None:
     """Nobody can join as the type that means everybody; a proper configuration still can follow."""
-    peer = Peer(7, 42, 0.0)
+    peer = TcpAgent(7, 42, 0.0)
     assert errors(peer.receive(configuration(0), 1.0)) == [BadField]
     assert peer.state is State.GREETED
     assert peer.receive(configuration(), 1.0) == [Joined(UNITY, 0, None)]
@@ -361,7 +361,7 @@ def test_a_robot_tells_what_it_offers() -> None:
     """The functionality in a robot's configuration is part of its joining."""
     offers = Functionality(publishers={"/cmd_vel": "geometry_msgs/msg/Twist"})
     raw = encode_management(Configuration(ROS, 7, 0, 42, offers))
-    peer = Peer(7, 42, 0.0)
+    peer = TcpAgent(7, 42, 0.0)
     assert peer.receive(encode_frame(management=raw), 1.0) == [Joined(ROS, 0, offers)]
     assert peer.functionality == offers
 
@@ -390,7 +390,7 @@ def test_who_does_not_say_that_it_is_newer_is_an_existing_program() -> None:
 def test_a_version_that_is_none_is_refused(extensions: str) -> None:
     """Extensions are a number from 0 to 65535; anything else costs the configuration."""
     raw = b'{"messageManager":"AgentclientConfigurer","agentType":2,"agentId":7,"extensions":%s}' % extensions.encode()
-    assert errors(Peer(7, 42, 0.0).receive(encode_frame(management=raw), 1.0)) == [BadField]
+    assert errors(TcpAgent(7, 42, 0.0).receive(encode_frame(management=raw), 1.0)) == [BadField]
 
 
 # -- leaving ---------------------------------------------------------------------------------------------------------
@@ -400,7 +400,7 @@ def test_a_version_that_is_none_is_refused(extensions: str) -> None:
 @pytest.mark.parametrize("configured", [True, False])
 def test_an_agent_may_go_offline(agent_id: int, configured: bool) -> None:
     """An agent that says it goes offline has left, and nothing it sent behind that counts."""
-    peer = online() if configured else Peer(7, 42, 0.0, limits=LIMITS)
+    peer = online() if configured else TcpAgent(7, 42, 0.0, limits=LIMITS)
     events = peer.receive(encode_frame(management=encode_management(GoOffline(agent_id))) + message(), 1.0)
     assert [type(event) for event in events] == [Left]
     assert peer.state is State.GONE
@@ -445,7 +445,7 @@ def test_a_lost_connection_says_nothing_more() -> None:
 
 def test_who_does_not_answer_the_welcome_leaves() -> None:
     """Without a configuration the connection ends when the handshake limit is over, whatever else was sent."""
-    peer = Peer(7, 42, 100.0, limits=LIMITS)
+    peer = TcpAgent(7, 42, 100.0, limits=LIMITS)
     peer.receive(message(), 109.0)
     assert peer.next_deadline() == 110.0
     assert peer.tick(109.9) == []
@@ -723,7 +723,7 @@ def test_an_added_manager_is_asked_once_the_agent_is_there() -> None:
         management=b'{"messageManager":"Battery","percent":5}',
         message=encode_message(Metadata(UNITY, 7, request_id=3).encode()),
     )
-    peer = Peer(7, 42, 0.0, custom={"Battery": Battery})
+    peer = TcpAgent(7, 42, 0.0, custom={"Battery": Battery})
     assert peer.receive(raw, 1.0) == []
     assert peer.receive(configuration(), 2.0) == [Joined(UNITY, 0, None), Asked("Battery", Battery(5), 3)]
     assert errors(online().receive(raw, 1.0)) == [UnknownManager]
@@ -732,7 +732,7 @@ def test_an_added_manager_is_asked_once_the_agent_is_there() -> None:
 # -- rate ------------------------------------------------------------------------------------------------------------
 
 
-def count_sent(peer: Peer, frames: int, now: float) -> int:
+def count_sent(peer: TcpAgent, frames: int, now: float) -> int:
     """How many of so many frames at once are passed on."""
     return sum(isinstance(event, Sent) for event in peer.receive(message() * frames, now))
 
@@ -807,7 +807,7 @@ def test_credit_is_that_of_the_connection_before() -> None:
     limits = LIMITS._replace(frames_per_s=10.0)
     first = online(limits=limits)
     assert count_sent(first, 20, 0.0) == 10
-    second = Peer(8, 43, 0.5, limits=limits, credit=first.credit)
+    second = TcpAgent(8, 43, 0.5, limits=limits, credit=first.credit)
     second.receive(configuration(), 0.5)
     assert count_sent(second, 20, 0.5) == 5
 
@@ -841,7 +841,7 @@ def test_a_registration_names_a_thousand_robots_at_most() -> None:
 SLOW = LIMITS._replace(max_frame_bytes=32 << 20, partial_bytes_per_s=1000.0, partial_window_s=10.0)
 
 
-def drip(peer: Peer, size: int, each_s: float, until_s: float, start_s: float = 0.0) -> list[Event]:
+def drip(peer: TcpAgent, size: int, each_s: float, until_s: float, start_s: float = 0.0) -> list[Event]:
     """So many bytes of zeros in each such time, with what `tick` says in between."""
     events: list[Event] = []
     now = start_s
@@ -903,7 +903,7 @@ def test_what_a_half_frame_costs_is_known() -> None:
 @pytest.mark.parametrize("configured", [True, False])
 def test_4_gib_declared_cost_nothing_but_the_connection(configured: bool) -> None:
     """A header that declares 4 GiB reserves no memory; the connection ends, what came before it counts."""
-    peer = online() if configured else Peer(7, 42, 0.0, limits=LIMITS)
+    peer = online() if configured else TcpAgent(7, 42, 0.0, limits=LIMITS)
     before = message() if configured else configuration()
     raw = before + MACS.pack(1, [1], [], 0, 0xFFFFFFFF) + bytes(1000)
     tracemalloc.start()
@@ -965,7 +965,7 @@ hostile_frames = st.builds(
 def test_any_bytes_give_events(frames: list[bytes], agent_type: int) -> None:
     """Whatever an agent sends there are only events: what is passed on has right sizes, readable metadata and its
     true sender, and after leaving there is nothing."""
-    peer = online(agent_type) if agent_type else Peer(7, 42, 0.0, limits=LIMITS)
+    peer = online(agent_type) if agent_type else TcpAgent(7, 42, 0.0, limits=LIMITS)
     events = peer.receive(b"".join(frames), 1.0)
     for event in events:
         if isinstance(event, Sent | Streamed):
@@ -979,7 +979,7 @@ def test_any_bytes_give_events(frames: list[bytes], agent_type: int) -> None:
 def test_other_layouts_work_alike() -> None:
     """With more slots in the header an agent joins and sends, and a corrected frame keeps that layout."""
     layout = Layout(20, 20)
-    peer = Peer(7, 42, 0.0, layout=layout)
+    peer = TcpAgent(7, 42, 0.0, layout=layout)
     joining = encode_frame(management=encode_management(Configuration(UNITY, 7)), layout=layout)
     ids = tuple(range(1, 21))
     raw = encode_frame(UNITY, ids, message=encode_message(Metadata(UNITY, 8).encode(), b"x"), layout=layout)
@@ -993,7 +993,7 @@ def test_other_layouts_work_alike() -> None:
 
 def test_a_group_that_is_not_to_be_chosen() -> None:
     """The agent comes online in no group; it may choose another one, and not this one later."""
-    peer = Peer(7, 42, 0.0, closed_groups={9})
+    peer = TcpAgent(7, 42, 0.0, closed_groups={9})
     for group, got in ((9, 0), (3, 3), (9, 0)):
         events = peer.receive(configuration(group=group), 0.0)
         joined = [event for event in events if isinstance(event, Joined)]

@@ -11,14 +11,14 @@ import asyncio
 
 from msgspec import UNSET, structs
 
-from macs_zenoh.directory import Directory
 from macs_zenoh.errors import Refused
-from macs_zenoh.keyexpr import CALL
 from macs_zenoh.mesh import Mesh, Subscription
-from macs_zenoh.messages import ROS, UNITY, AddNode, GoneAgent, Metadata, RemoveNode, decode_data, encode_data
-from macs_zenoh.registrations import AgentKey, check_own
-from macs_zenoh.routing import inbox
-from macs_zenoh.wire import Layout, encode_message, parse_frame
+from macs_zenoh.protocol.directory import Directory
+from macs_zenoh.protocol.keyexpr import CALL
+from macs_zenoh.protocol.messages import ROS, UNITY, AddNode, GoneAgent, Metadata, RemoveNode, decode_data, encode_data
+from macs_zenoh.protocol.registrations import AgentKey, check_own
+from macs_zenoh.protocol.routing import inbox
+from macs_zenoh.protocol.wire import Layout, encode_message, parse_frame
 
 from .agents import Agents
 from .connection import Connection
@@ -31,7 +31,7 @@ UNSEEN_S = 3.0
 """How long a registrant may not be seen online: news of a token and a call take the same way."""
 
 
-class OwnKeys:
+class AgentDeclarations:
     """By (type, id), from an agent's configuration to its end."""
 
     def __init__(

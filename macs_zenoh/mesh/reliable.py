@@ -1,4 +1,4 @@
-"""A subscription that recovers what it missed, from sources that keep it. See `macs_zenoh.recovery`."""
+"""A subscription that recovers what it missed, from sources that keep it. See `macs_zenoh.protocol.recovery`."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from functools import partial
 
 import zenoh
 
-from macs_zenoh.recovery import Ask, Recovery
+from macs_zenoh.protocol.recovery import Ask, Recovery
 
 from .arrivals import Arrivals
-from .samples import SOURCES, AtOnce, Numbered, OnBatch, OnMiss, OnNumbered, Sample, Subscription
+from .declared import SOURCES, AtOnce, Numbered, OnBatch, OnMiss, OnNumbered, Sample, Subscription
 
 log = logging.getLogger("macs.mesh")
 

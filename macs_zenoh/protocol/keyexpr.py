@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from urllib.parse import quote, unquote
 
-from .errors import UsageError
+from ..errors import UsageError
 from .limits import CHUNK_BYTES, KEY_BYTES
 from .messages import OPERATOR, ROS, UNITY
 

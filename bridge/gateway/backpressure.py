@@ -24,7 +24,7 @@ class Sender(Protocol):
         """Read again. Pauses and resumes are counted."""
 
 
-class Brake:
+class Backpressure:
     """One bottleneck, and the senders that wait for it."""
 
     def __init__(self) -> None:

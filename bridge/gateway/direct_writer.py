@@ -9,7 +9,7 @@ import socket
 from .listener import descriptors
 
 
-class Shortcut:
+class DirectWriter:
     """Writes into a socket that somebody else owns, as much as it takes at once. Its callers see to the order.
 
     It has a descriptor of its own: the owner may close his at any time, and its number can be another socket's then.

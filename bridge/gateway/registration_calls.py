@@ -16,16 +16,25 @@ from functools import partial
 
 from msgspec import structs
 
-from macs_zenoh.directory import Change, Directory
 from macs_zenoh.errors import HeldByAnother, OutOfRange, Refused, Unreachable
-from macs_zenoh.keyexpr import type_name
-from macs_zenoh.limits import NODE_AGENTS
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.messages import ROS, AddNode, Metadata, NodeRefused, NodeType, RemoveNode, encode_data, node_name
-from macs_zenoh.registrations import AgentKey, Registrations, Robots, StreamKey, Task, removal
-from macs_zenoh.routing import call
-from macs_zenoh.turns import Turns
-from macs_zenoh.wire import Layout
+from macs_zenoh.protocol.directory import Change, Directory
+from macs_zenoh.protocol.keyexpr import type_name
+from macs_zenoh.protocol.limits import NODE_AGENTS
+from macs_zenoh.protocol.messages import (
+    ROS,
+    AddNode,
+    Metadata,
+    NodeRefused,
+    NodeType,
+    RemoveNode,
+    encode_data,
+    node_name,
+)
+from macs_zenoh.protocol.registrations import AgentKey, Registrations, Robots, StreamKey, Task, removal
+from macs_zenoh.protocol.routing import call
+from macs_zenoh.protocol.turns import Turns
+from macs_zenoh.protocol.wire import Layout
 
 log = logging.getLogger("macs.gateway")
 

@@ -1,6 +1,6 @@
 """What the traffic rules say about a key, and whether a message may pass. Pure: times are passed in.
 
-The rules of a settings file (`TrafficRule`) become one `Shape` for each key that is sent to. A message that is too
+The rules of a settings file (`TrafficRule`) become one `Policy` for each key that is sent to. A message that is too
 much is dropped, whole and at once: nothing waits here, because all that waits in front of a limit comes late. Each
 drop has a reason, ``over_size``, ``over_rate`` or ``over_budget``.
 """
@@ -13,7 +13,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar
 
-from .config import Priority, TrafficRule
+from ..config import Priority, TrafficRule
 from .keyexpr import fits
 
 BURST_S = 0.1
@@ -74,8 +74,8 @@ class Limit:
             self._pace.take(1 if self.setting == "max_hz" else size, now)
 
 
-class Shape:
-    """What holds for one key. Made by `Shaper.of`.
+class Policy:
+    """What holds for one key. Made by `Policer.of`.
 
     Attributes:
         key: without wildcards.
@@ -85,35 +85,35 @@ class Shape:
     """
 
     def __init__(
-        self, shaper: Shaper, key: str, priority: Priority | None, reliable: int | None, limits: Sequence[Limit]
+        self, policer: Policer, key: str, priority: Priority | None, reliable: int | None, limits: Sequence[Limit]
     ) -> None:
         self.key = key
         self.priority = priority
         self.reliable = reliable
         self.limited = bool(limits)
-        self._shaper = shaper
+        self._policer = policer
         self._limits = limits
 
     def judge(self, size: int, now: float) -> Overrun | None:
         """Let a message pass, or count it as dropped and say why. From any thread."""
-        with self._shaper.lock:
+        with self._policer.lock:
             for limit in self._limits:
                 if not limit.allows(size, now):
-                    return self._shaper.count(limit, self.key)
+                    return self._policer.count(limit, self.key)
             for limit in self._limits:
                 limit.take(size, now)
         return None
 
     def too_large(self, size: int) -> Overrun | None:
         """The same with the limit on size only, for what must not be lost without an answer."""
-        with self._shaper.lock:
+        with self._policer.lock:
             for limit in self._limits:
                 if limit.setting == "max_bytes" and not limit.allows(size, 0.0):
-                    return self._shaper.count(limit, self.key)
+                    return self._policer.count(limit, self.key)
         return None
 
 
-class Shaper:
+class Policer:
     """The rules of one program.
 
     Of the rules that fit a key, each setting comes from the first one that gives it. ``max_hz`` holds for each key,
@@ -138,12 +138,12 @@ class Shaper:
             for setting in ("max_bytes", "max_bytes_per_s")
             if getattr(rule, setting) is not None
         }
-        self._shapes: OrderedDict[str, Shape] = OrderedDict()
+        self._shapes: OrderedDict[str, Policy] = OrderedDict()
         self._free: OrderedDict[str, None] = OrderedDict()
         """Keys that no rule fits: by themselves, so that they push nobody's pace out."""
         self._first: set[tuple[str, str]] = set()
 
-    def of(self, key: str) -> Shape | None:
+    def of(self, key: str) -> Policy | None:
         """What holds for a key; None when no rule fits it. From any thread."""
         if not self._rules:
             return None
@@ -184,7 +184,7 @@ class Shaper:
             lines.append(f"traffic rule {rule}: {reason} {by_key.total()}, on {most}{more}")
         return lines
 
-    def _shape(self, key: str) -> Shape | None:
+    def _shape(self, key: str) -> Policy | None:
         fitting = [(number, rule) for number, rule in enumerate(self._rules) if fits(rule.match, key)]
         if not fitting:
             return None
@@ -196,7 +196,7 @@ class Shaper:
                     break
         rules = [rule for _, rule in fitting]
         priority: Priority | None = _first_given(rule.priority for rule in rules)
-        return Shape(self, key, priority, _first_given(rule.reliable for rule in rules), limits)
+        return Policy(self, key, priority, _first_given(rule.reliable for rule in rules), limits)
 
 
 def _remember(among: OrderedDict[str, T], key: str, value: T, limit: int) -> None:

@@ -10,22 +10,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from macs_zenoh import shaping
 from macs_zenoh.config import TrafficRule
-from macs_zenoh.shaping import BURST_S, OTHER_KEYS, Pace, Shape, Shaper
+from macs_zenoh.protocol import policing as shaping
+from macs_zenoh.protocol.policing import BURST_S, OTHER_KEYS, Pace, Policer, Policy
 
 CAMERA = "macs/from/ros/7/nd__camera_front"
 OTHER_CAMERA = "macs/from/ros/7/nd__camera_back"
 CAMERAS = "macs/from/ros/*/nd__camera$*"
 
 
-def shape_of(*rules: TrafficRule, key: str = CAMERA) -> Shape:
-    shape = Shaper(rules).of(key)
+def shape_of(*rules: TrafficRule, key: str = CAMERA) -> Policy:
+    shape = Policer(rules).of(key)
     assert shape is not None
     return shape
 
 
-def passed(shape: Shape, times: list[float], size: int = 100) -> list[float]:
+def passed(shape: Policy, times: list[float], size: int = 100) -> list[float]:
     """Those of the times at which a message passes."""
     return [now for now in times if shape.judge(size, now) is None]
 
@@ -35,14 +35,14 @@ def passed(shape: Shape, times: list[float], size: int = 100) -> list[float]:
 
 def test_without_rules_no_key_has_a_shape() -> None:
     """Nothing is looked up or kept where nothing is configured."""
-    shaper = Shaper()
-    assert shaper.of(CAMERA) is None
-    assert shaper.report() == []
+    policer = Policer()
+    assert policer.of(CAMERA) is None
+    assert policer.report() == []
 
 
 def test_a_key_that_no_rule_fits_has_no_shape() -> None:
     """Rules for other keys leave a key alone."""
-    assert Shaper([TrafficRule(match=CAMERAS, max_hz=5)]).of("macs/from/ros/7/nd__map") is None
+    assert Policer([TrafficRule(match=CAMERAS, max_hz=5)]).of("macs/from/ros/7/nd__map") is None
 
 
 def test_each_setting_comes_from_the_first_rule_that_gives_it() -> None:
@@ -113,12 +113,12 @@ def test_no_span_of_time_holds_more_than_allowed(times: list[float], hz: float, 
 
 def test_a_rate_holds_for_each_key_and_a_budget_for_all() -> None:
     """Two cameras under one rule each have its rate, and share its budget."""
-    shaper = Shaper([TrafficRule(match=CAMERAS, max_hz=1), TrafficRule(match="macs/from/**", max_bytes_per_s=1000)])
-    front, back = shaper.of(CAMERA), shaper.of(OTHER_CAMERA)
+    policer = Policer([TrafficRule(match=CAMERAS, max_hz=1), TrafficRule(match="macs/from/**", max_bytes_per_s=1000)])
+    front, back = policer.of(CAMERA), policer.of(OTHER_CAMERA)
     assert front is not None
     assert back is not None
 
-    def why_not(shape: Shape, size: int, now: float) -> str | None:
+    def why_not(shape: Policy, size: int, now: float) -> str | None:
         over = shape.judge(size, now)
         return None if over is None else over.reason
 
@@ -159,22 +159,22 @@ def test_time_that_stands_still_or_runs_back_is_no_fault() -> None:
 def test_every_drop_is_counted_by_rule_reason_and_key() -> None:
     """What passes and what is counted is together what came; the first of a rule and reason says that it is."""
     totals: Counter[str] = Counter()
-    shaper = Shaper([TrafficRule(match=CAMERAS, max_hz=10, max_bytes=1000)], totals)
+    policer = Policer([TrafficRule(match=CAMERAS, max_hz=10, max_bytes=1000)], totals)
     overruns = []
     for key in (CAMERA, OTHER_CAMERA):
-        shape = shaper.of(key)
+        shape = policer.of(key)
         assert shape is not None
         overruns += [shape.judge(size, 0.0) for size in [1] * 10 + [1001] * 3]
     dropped = [over for over in overruns if over is not None]
     assert [(over.reason, over.first) for over in dropped if over.first] == [("over_rate", True), ("over_size", True)]
     assert totals == {"over_rate": 16, "over_size": 6}
-    assert shaper.drops == {
+    assert policer.drops == {
         (CAMERAS, "over_rate", CAMERA): 8,
         (CAMERAS, "over_rate", OTHER_CAMERA): 8,
         (CAMERAS, "over_size", CAMERA): 3,
         (CAMERAS, "over_size", OTHER_CAMERA): 3,
     }
-    assert shaper.report() == [
+    assert policer.report() == [
         f"traffic rule {CAMERAS}: over_rate 16, on {CAMERA} 8, {OTHER_CAMERA} 8",
         f"traffic rule {CAMERAS}: over_size 6, on {CAMERA} 3, {OTHER_CAMERA} 3",
     ]
@@ -192,16 +192,16 @@ def test_a_call_is_judged_by_its_size_alone() -> None:
 
 def test_keys_from_the_network_are_not_remembered_for_ever() -> None:
     """However many keys come, what is kept of them is bounded, and the counts stay true."""
-    shaper = Shaper([TrafficRule(match="**", max_bytes=1)])
-    number = 2 * Shaper.KEYS
+    policer = Policer([TrafficRule(match="**", max_bytes=1)])
+    number = 2 * Policer.KEYS
     for agent_id in range(number):
-        shape = shaper.of(f"macs/to/ros/0/{agent_id}")
+        shape = policer.of(f"macs/to/ros/0/{agent_id}")
         assert shape is not None
         assert shape.judge(2, 0.0) is not None
-    assert len(shaper.drops) == Shaper.KEYS + 1
-    assert shaper.drops["**", "over_size", OTHER_KEYS] == number - Shaper.KEYS
-    assert shaper.totals == {"over_size": number}
-    assert shaper.report()[0].endswith(f"and {Shaper.KEYS - 4} keys more")
+    assert len(policer.drops) == Policer.KEYS + 1
+    assert policer.drops["**", "over_size", OTHER_KEYS] == number - Policer.KEYS
+    assert policer.totals == {"over_size": number}
+    assert policer.report()[0].endswith(f"and {Policer.KEYS - 4} keys more")
 
 
 def test_a_key_that_no_rule_fits_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,25 +214,25 @@ def test_a_key_that_no_rule_fits_is_looked_at_once(monkeypatch: pytest.MonkeyPat
         return key == match
 
     monkeypatch.setattr(shaping, "fits", fits)
-    shaper = Shaper([TrafficRule(match=CAMERA, max_hz=5)])
-    shape = shaper.of(CAMERA)
-    for number in range(2 * Shaper.KEYS):
+    policer = Policer([TrafficRule(match=CAMERA, max_hz=5)])
+    shape = policer.of(CAMERA)
+    for number in range(2 * Policer.KEYS):
         for _ in range(3):
-            assert shaper.of(f"macs/to/ros/0/{number}") is None
+            assert policer.of(f"macs/to/ros/0/{number}") is None
     assert set(asked.values()) == {1}
-    assert shaper.of(CAMERA) is shape
-    assert len(shaper._free) == Shaper.KEYS
+    assert policer.of(CAMERA) is shape
+    assert len(policer._free) == Policer.KEYS
 
 
 def test_threads_share_a_rate() -> None:
     """Several threads at once get no more through than one, and each drop is counted."""
     totals: Counter[str] = Counter()
-    shaper = Shaper([TrafficRule(match="**", max_hz=100)], totals)
+    policer = Policer([TrafficRule(match="**", max_hz=100)], totals)
     went = [0] * 4
     begin = threading.Barrier(4)
 
     def send(thread: int) -> None:
-        shape = shaper.of(CAMERA)
+        shape = policer.of(CAMERA)
         assert shape is not None
         begin.wait()
         for _ in range(2000):

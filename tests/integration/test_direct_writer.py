@@ -19,11 +19,11 @@ from bridge.gateway.memory import Memory
 from bridge.headset import frames
 from bridge.headset.frames import NodeSpec
 from macs_zenoh import Agent, join
-from macs_zenoh.existing import CDR
-from macs_zenoh.messages import Metadata, NodeType, StreamData, encode_management
-from macs_zenoh.peer import Peer
-from macs_zenoh.queues import Chunk, Outbox
-from macs_zenoh.wire import MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.protocol.existing import CDR
+from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
+from macs_zenoh.protocol.outbox import Chunk, Outbox
+from macs_zenoh.protocol.tcp_agent import TcpAgent
+from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, encode_message, split_message
 from tests.integration.conftest import StartGateway, until
 
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy" fixture is deprecated')
@@ -237,7 +237,7 @@ class Nobody:
     """A gateway that does nothing."""
 
     def opened(self, connection: Connection) -> bool:
-        connection.greet(Peer(256, 1, time.monotonic()))
+        connection.greet(TcpAgent(256, 1, time.monotonic()))
         connection.registered(TOPIC.name, NodeType.SUBSCRIBER)
         return True
 
@@ -254,7 +254,7 @@ async def connection() -> AsyncIterator[tuple[Connection, socket.socket]]:
     made: list[Connection] = []
 
     def make() -> Connection:
-        made.append(Connection(Nobody(), memory=Memory(64 << 20, 32 << 20), outbox_bytes=64 << 20, stall_s=30))  # type: ignore[arg-type]
+        made.append(Connection(Nobody(), memory=Memory(64 << 20, 32 << 20), outbox_bytes=64 << 20, write_timeout_s=30))  # type: ignore[arg-type]
         return made[0]
 
     server = await asyncio.get_running_loop().create_server(make, "127.0.0.1", 0)

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+from ..errors import WireError
 from . import keyexpr
-from .errors import WireError
 from .keyexpr import type_name
 from .messages import Metadata
 from .routing import takes_group_copy
