@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _WHERE = {
     "agent": ("Agent", "Call", "join"),
     "config": ("MeshSettings", "TrafficRule"),
-    "directory": ("AgentInfo",),
+    "protocol.directory": ("AgentInfo",),
     "errors": (
         "CallTimeout",
         "ConfigError",
@@ -42,8 +42,8 @@ _WHERE = {
         "Unreachable",
         "UsageError",
     ),
-    "messages": ("Metadata", "NodeType"),
-    "reading": ("Message",),
+    "protocol.messages": ("Metadata", "NodeType"),
+    "protocol.reading": ("Message",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 
