@@ -23,7 +23,7 @@ from macs_zenoh.errors import MacsError, Unreachable
 if TYPE_CHECKING:
     from bridge.headset.client import Headset
     from bridge.headset.nodes import Subscription
-    from bridge.headset.typed import Types
+    from macs_zenoh.typed import Types
 
 POSE = ("/pose", "geometry_msgs/PoseStamped")
 CAMERA = ("/camera/image/compressed", "sensor_msgs/CompressedImage")
@@ -45,7 +45,7 @@ Say = Callable[[str], None]
 async def show(host: str, port: int, robot: int, say: Say) -> bool:
     """Play the whole show against a gateway and say what came of it, in one block; False when a step failed."""
     from bridge.headset.client import Headset
-    from bridge.headset.typed import Types
+    from macs_zenoh.typed import Types
 
     lines = ["", "A headset without hardware, over TCP, as a Unity headset would do it:", ""]
     try:

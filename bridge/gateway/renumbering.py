@@ -19,12 +19,12 @@ from macs_zenoh.protocol.ids import Contests
 from macs_zenoh.protocol.keyexpr import block_of
 from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.registrations import AgentKey, Task
+from macs_zenoh.registration_calls import RobotCalls
 
 from .agents import Agents
 from .connection import Connection
 from .declarations import AgentDeclarations
 from .leases import Leases
-from .registration_calls import RobotCalls
 
 log = logging.getLogger("macs.gateway")
 

@@ -64,6 +64,7 @@ from macs_zenoh.protocol.tcp_agent import (
     TcpAgent,
 )
 from macs_zenoh.protocol.wire import FrameDecoder, Layout, encode_message
+from macs_zenoh.registration_calls import RobotCalls, StreamChanges
 
 from .admission import Admission
 from .agents import Agents, Group
@@ -74,7 +75,6 @@ from .delivery import Delivery, Stream
 from .leases import Leases
 from .listener import BACKLOG, Listener, descriptors
 from .memory import Memory
-from .registration_calls import RobotCalls, StreamChanges
 from .renumbering import Renumbering
 from .robot_ids import RobotIds
 from .routes import Route, Routes

@@ -10,7 +10,7 @@
         async for message in images:
             print(message.sender_id, len(message.data))
 
-Messages of ROS are CDR bytes here; `bridge.headset.typed` turns them into Python and back. One task reads the
+Messages of ROS are CDR bytes here; `macs_zenoh.typed` turns them into Python and back. One task reads the
 socket and never waits for a slow taker: every queue is bounded and counts what it drops.
 
 Where the C# program is faulty this one is not: it takes groups off groups (the C# sends their numbers as

@@ -24,12 +24,12 @@ from typing import Any, NamedTuple
 
 from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError, WireError
 from macs_zenoh.protocol.keyexpr import type_name
+from macs_zenoh.typed import Types, part_of_action, request_of, response_of
 
 from .actions import ABORTED, CANCELED, SUCCEEDED, Goal
 from .client import Headset
 from .hints import Role, hints, offered_type
 from .nodes import Incoming, Node, Service, ServiceRequest, Subscription
-from .typed import Types, part_of_action, request_of, response_of
 from .verbs import MAX_BYTES, TYPE_IS_OPTIONAL, agent_type, json_object, script_parser
 
 log = logging.getLogger("macs.headset")

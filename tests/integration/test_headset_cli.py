@@ -17,7 +17,6 @@ import pytest
 
 import macs_zenoh
 from bridge.gateway import Gateway
-from bridge.headset.typed import Types, request_of, response_of
 from macs_zenoh.config import GatewaySettings, MeshSettings
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.messages import (
@@ -34,6 +33,7 @@ from macs_zenoh.protocol.messages import (
     node_name,
 )
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.typed import Types, request_of, response_of
 
 ROOT = Path(__file__).parents[2]
 SET_BOOL = "std_srvs/SetBool"

@@ -17,7 +17,6 @@ import pytest
 import macs_zenoh
 from bridge.gateway import Gateway, renumbering
 from bridge.gateway.leases import Leases
-from bridge.gateway.registration_calls import RobotCalls
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Incoming, Subscription
 from macs_zenoh.agent import Agent
@@ -42,6 +41,7 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.registrations import AgentKey, Task
 from macs_zenoh.protocol.wire import Layout, MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.registration_calls import RobotCalls
 from tests.integration.conftest import until
 from tests.links import Link, counted
 from tests.programs import Program, macs

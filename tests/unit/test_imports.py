@@ -19,7 +19,8 @@ BRIDGE = sorted((ROOT / "bridge").rglob("*.py"))
 PURE = sorted((ROOT / "macs_zenoh" / "protocol").glob("*.py"))
 WITH_ZENOH = set((ROOT / "macs_zenoh" / "mesh").glob("*.py"))
 WITH_ASYNCIO = WITH_ZENOH | {
-    ROOT / "macs_zenoh" / name for name in ("agent.py", "awareness.py", "identity.py", "presence.py")
+    ROOT / "macs_zenoh" / name
+    for name in ("agent.py", "awareness.py", "identity.py", "presence.py", "registration_calls.py")
 }
 NEEDED_FROM_OUTSIDE = {"msgspec", "zenoh", "tomli"}
 INPUT_OUTPUT = {

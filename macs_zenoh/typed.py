@@ -27,8 +27,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bridge.headset import definitions
-from macs_zenoh.errors import MissingExtra, UsageError, WireError
+from . import definitions
+from .errors import MissingExtra, UsageError, WireError
 
 MESSAGE_TYPE_PARTS = 3  # pkg, msg, Name
 

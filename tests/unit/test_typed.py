@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scripted_router import recorded
 
-from bridge.headset import typed
-from bridge.headset.typed import BadCdr, BadValue, MissingRosbags, Types, UnknownType, request_of, response_of
+from macs_zenoh import typed
 from macs_zenoh.protocol.wire import parse_frame, split_message
+from macs_zenoh.typed import BadCdr, BadValue, MissingRosbags, Types, UnknownType, request_of, response_of
 
 
 @pytest.fixture(scope="module")

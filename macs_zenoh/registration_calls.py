@@ -1,8 +1,10 @@
-"""What a gateway asks of robots for its headsets: interface nodes added and removed, by calls that are answered.
+"""What is asked of robots for agents: interface nodes added and removed, by calls that are answered.
+
+A gateway asks for its headsets, an agent for itself.
 
 Each call is for one robot and node; a newer one for the same node replaces it. A robot that does not answer is asked
-again while it is online; a refusal is final until the headset asks again or the robot comes back. Of the calls to one
-robot only so many are open at one time, and headsets take turns: one that asks for much makes no other wait.
+again while it is online; a refusal is final until the agent asks again or the robot comes back. Of the calls to one
+robot only so many are open at one time, and agents take turns: one that asks for much makes no other wait.
 """
 
 from __future__ import annotations
@@ -16,12 +18,12 @@ from functools import partial
 
 from msgspec import structs
 
-from macs_zenoh.errors import HeldByAnother, OutOfRange, Refused, Unreachable
-from macs_zenoh.mesh import Mesh
-from macs_zenoh.protocol.directory import Change, Directory
-from macs_zenoh.protocol.keyexpr import type_name
-from macs_zenoh.protocol.limits import NODE_AGENTS
-from macs_zenoh.protocol.messages import (
+from .errors import HeldByAnother, OutOfRange, Refused, Unreachable
+from .mesh import Mesh
+from .protocol.directory import Change, Directory
+from .protocol.keyexpr import type_name
+from .protocol.limits import NODE_AGENTS
+from .protocol.messages import (
     ROS,
     AddNode,
     Metadata,
@@ -31,12 +33,12 @@ from macs_zenoh.protocol.messages import (
     encode_data,
     node_name,
 )
-from macs_zenoh.protocol.registrations import AgentKey, Registrations, Robots, StreamKey, Task, removal
-from macs_zenoh.protocol.routing import call
-from macs_zenoh.protocol.turns import Turns
-from macs_zenoh.protocol.wire import Layout
+from .protocol.registrations import AgentKey, Registrations, Robots, StreamKey, Task, removal
+from .protocol.routing import call
+from .protocol.turns import Turns
+from .protocol.wire import Layout
 
-log = logging.getLogger("macs.gateway")
+log = logging.getLogger("macs.registrations")
 
 CALL_TIMEOUT_S = 2.0
 RETRY_S = (0.05, 0.05, 0.1, 0.2, 0.5)
@@ -48,9 +50,9 @@ MOVE_S = 1.0
 OPEN_CALLS = 256
 """Calls to one robot that may be open at one time."""
 OPEN_CALLS_EACH = 16
-"""Those of one headset among them."""
+"""Those of one agent among them."""
 CALLS_EACH = 8192
-"""Calls of one headset, to all robots, that may be wanted at one time."""
+"""Calls of one agent, to all robots, that may be wanted at one time."""
 
 CallKey = tuple[int, int, str]
 """(robot id, node type, node name)."""
@@ -68,7 +70,7 @@ class _Call:
 
 
 class RobotCalls:
-    """Registrations of this gateway's headsets, and the calls that make them true on the robots."""
+    """Registrations of agents, and the calls that make them true on the robots."""
 
     def __init__(
         self,
@@ -78,11 +80,14 @@ class RobotCalls:
         *,
         on_streams: Callable[[StreamChanges], None],
         on_refused: Callable[[AgentKey, NodeRefused], None],
+        on_done: Callable[[Task], None] = lambda task: None,
     ) -> None:
+        """``on_done`` hears of each task that a robot has confirmed."""
         self._mesh = mesh
         self._layout = layout
         self._on_streams = on_streams
         self._on_refused = on_refused
+        self._on_done = on_done
         self._registrations = Registrations()
         self._online: Robots = {agent.id: agent.group for agent in directory.of_type(ROS)}
         self._calls: dict[AgentKey, dict[CallKey, _Call]] = {}
@@ -101,7 +106,7 @@ class RobotCalls:
         self._turns.clear()
 
     def register(self, node: AddNode | RemoveNode, robot_ids: list[int], groups: list[int]) -> None:
-        """A headset registers on, or leaves, a node of these robots."""
+        """An agent registers on, or leaves, a node of these robots."""
         if isinstance(node, AddNode) and node.node_name != node_name(node.tos_name):  # it would get another's commands
             self.refuse(node, next(iter(robot_ids), 0), f"{node.node_name[:80]!r} is not its node name")
             return
@@ -117,7 +122,7 @@ class RobotCalls:
             self._start(task)
 
     def leave(self, agent: AgentKey) -> None:
-        """A headset is gone. Robots drop it when its presence ends; here it is only forgotten, except for what is on
+        """An agent is gone. Robots drop it when its presence ends; here it is only forgotten, except for what is on
         its way: that could reach a robot after the news that the headset has left."""
         self._registrations.leave(agent)
         self._streams_changed()
@@ -148,7 +153,7 @@ class RobotCalls:
 
     def presence(self, change: Change) -> None:
         """A robot that comes, comes back or changes its group is told everything that is registered for it, and what
-        it has to take back of a group that it has left. Where a headset has left, another may have its place."""
+        it has to take back of a group that it has left. Where an agent has left, another may have its place."""
         agent, online = change
         if agent.type != ROS:
             if not online:
@@ -217,13 +222,13 @@ class RobotCalls:
             self._start(task)
 
     def repeat_all(self) -> None:
-        """Our own link was lost: robots may have seen our headsets leave, so tell them everything again."""
+        """Our own link was lost: robots may have seen our agents leave, so tell them everything again."""
         for robot_id, group in self._online.items():
             for task in self._registrations.of_robot(robot_id, group):
                 self._start(task)
 
     def refuse(self, node: AddNode | RemoveNode, robot_id: int, reason: str) -> None:
-        """Tell a headset that it does not get a node of a robot, 0 being all of them."""
+        """Tell an agent that it does not get a node of a robot, 0 being all of them."""
         if isinstance(node, AddNode):
             refused = NodeRefused(
                 robot_id=robot_id,
@@ -298,6 +303,7 @@ class RobotCalls:
         try:
             await self._ask(task)
             log.debug("%s: done", _What(task))
+            self._on_done(task)
         except (Refused, OutOfRange) as refusal:  # by the robot, or here by a traffic rule
             log.warning("%s was refused: %s", _What(task), refusal)
             if isinstance(refusal, HeldByAnother):
@@ -309,7 +315,7 @@ class RobotCalls:
             pause_s = RETRY_S[min(wanted.attempt, len(RETRY_S) - 1)]
             wanted.again = asyncio.get_running_loop().call_later(pause_s, self._again, wanted)
             return
-        except Exception:  # whatever a headset asked for, it must not be wanted for ever
+        except Exception:  # whatever an agent asked for, it must not be wanted for ever
             log.exception("%s failed", _What(task))
         self._is_over(wanted)
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from macs_zenoh.errors import UsageError
+from .errors import UsageError
 
 WIDE_PACKAGE = "macs_wide"
 WIDE = re.compile(rf"{WIDE_PACKAGE}/msg/W(?P<limit>\d*)")
