@@ -40,11 +40,11 @@ async def _serve(settings: Settings, ros_args: list[str]) -> int:
     from bridge.doctor.first import told_while_waiting
     from bridge.ros import agent
 
-    with memory.given_back():
-        await agent.run(
-            settings,
-            ros_args=ros_args,
-            on_waiting=told_while_waiting(settings.mesh),
-            on_ready=lambda robot: running.say_ready(f"robot {robot.id}"),
-        )
+    memory.give_back()
+    await agent.run(
+        settings,
+        ros_args=ros_args,
+        on_waiting=told_while_waiting(settings.mesh),
+        on_ready=lambda robot: running.say_ready(f"robot {robot.id}"),
+    )
     return 0

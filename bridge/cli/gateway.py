@@ -131,6 +131,7 @@ async def _serve(settings: Settings) -> int:
     from macs_zenoh.mesh import Mesh
 
     _raise_descriptor_limit()
+    memory.give_back()
     own = managers.load(settings.gateway.managers)
     waiting = told_while_waiting(settings.mesh)
     async with await Mesh.open(settings.mesh, traffic=settings.traffic, on_waiting=waiting) as mesh:
@@ -142,8 +143,7 @@ async def _serve(settings: Settings) -> int:
                     "%s is open: whoever reaches it is a headset; --allow says which networks", gateway.address
                 )
             running.say_ready(f"gateway on {gateway.address}")
-            with memory.given_back():
-                await asyncio.Event().wait()
+            await asyncio.Event().wait()
         finally:
             await gateway.close()
     return 0

@@ -43,12 +43,13 @@ def run(args: argparse.Namespace) -> int:
 async def _serve(settings: MeshSettings) -> int:
     from bridge.router import open_to_anybody, serve
 
+    memory.give_back()
+
     def ready() -> None:
         for endpoint in open_to_anybody(settings):
             log.warning("%s is open: whoever reaches it sees all and drives robots; %s", endpoint, KEPT_IN)
         of_file = f"the endpoints of {settings.config_file}" if settings.config_file else EVERY_INTERFACE
         running.say_ready("router on " + (", ".join(settings.listen) or of_file))
 
-    with memory.given_back():
-        await serve(settings, on_ready=ready)
+    await serve(settings, on_ready=ready)
     return 0
