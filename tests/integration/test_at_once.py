@@ -39,8 +39,9 @@ class Receiver:
 
     def batch(self, batch: Iterator[Sample]) -> None:
         """On the loop."""
-        self.batches.append(len(batch))
-        self.numbers += [number(payload) for _, payload in batch]
+        come = [number(payload) for _, payload in batch]
+        self.batches.append(len(come))
+        self.numbers += come
 
     def one(self, _key: str, payload: Payload) -> bool:
         """At once."""
