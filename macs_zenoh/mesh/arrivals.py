@@ -232,6 +232,7 @@ class Arrivals:
             if not self._hand_over(on_batch, waiting):  # it did not look at them
                 next(waiting, None)
             now = time.monotonic()
+        self._handled = None  # it may have megabytes
         if queue and not self._waiting:
             self._waiting = True
             self._loop.call_soon(self._deliver)
@@ -259,7 +260,9 @@ class Arrivals:
 
     def pass_on(self, on_batch: OnBatch, samples: list[Sample]) -> None:
         """Let a subscription have samples that another one has put in order."""
+        handled = self._handled
         self._hand_over(on_batch, self._each(samples))
+        self._handled = handled
 
     def _each(self, samples: list[Sample]) -> Iterator[Sample]:
         for sample in samples:
