@@ -22,7 +22,7 @@ from typing import NamedTuple
 from .config import MeshSettings, Priority, TrafficRule, changed
 from .errors import CallTimeout, OutOfRange, Unreachable, UsageError, WireError
 from .identity import Identity
-from .mesh import Mesh, Sample, Subscription, Traffic
+from .mesh import Aged, Mesh, Sample, Subscription, Traffic
 from .presence import Presence
 from .protocol.directory import AgentInfo, Change, Directory
 from .protocol.guard import Guard
@@ -209,6 +209,20 @@ class Agent:
             for message in self._reader.read(key, payload, me, by_group=by_group):
                 self._on_message(message)
 
+    def _receive_judged(self, batch: Iterator[Aged], *, guard: Guard, by_group: bool = False) -> None:
+        me = (self.type_number, self.id)
+        for key, payload, age_s, now in batch:
+            for message in self._reader.read(key, payload, me, by_group=by_group):
+                if guard.judge(message, key, age_s, now):
+                    self._on_message(message)
+
+    def _subscribe(self, key: str, *, by_group: bool = False) -> Subscription:
+        """Receive what comes on a key."""
+        if self._guard is None:
+            return self.mesh.subscribe(key, partial(self._receive, by_group=by_group))
+        judged = partial(self._receive_judged, guard=self._guard, by_group=by_group)
+        return self.mesh.subscribe_guarded(key, judged, self._guard)
+
     def _bad_frame(self, key: str, error: WireError) -> None:
         self.drops["bad_frame"] += 1
         if self.drops["bad_frame"] == 1:
@@ -319,18 +333,16 @@ class Agent:
     async def _join(self, wanted_id: int | None) -> None:
         self._keep(self.mesh.answer_pings())
         await self._presence.start()
-        self._keep(self.mesh.subscribe(BROADCAST.every(), self._receive, gate=self._guard))
+        self._keep(self._subscribe(BROADCAST.every()))
         if self.group:
-            members = GROUP.every(group=self.group, type=self.type_number)
-            by_group = partial(self._receive, by_group=True)
-            self._keep(self.mesh.subscribe(members, by_group, gate=self._guard))
+            self._keep(self._subscribe(GROUP.every(group=self.group, type=self.type_number), by_group=True))
         self.id = await self._identity.take(wanted_id)
         self.serve("ping", _echo)
 
     def _listen(self, agent_id: int) -> Subscription:
         if self._guard is not None:
             self._guard.me = (self.type_number, agent_id)
-        return self.mesh.subscribe(inbox(self.type_number, agent_id), self._receive, gate=self._guard)
+        return self._subscribe(inbox(self.type_number, agent_id))
 
     def _keep(self, declared: Subscription) -> Subscription:
         self._declared.append(declared)

@@ -12,9 +12,9 @@ from typing import Any
 
 import zenoh
 
-from macs_zenoh.protocol.guard import Ages, Gate
+from macs_zenoh.protocol.guard import Gate
 
-from .declared import AtOnce, OnBatch, OnNumbered, Outlet, Payload, Sample
+from .declared import Aged, AtOnce, OnAged, OnBatch, OnNumbered, Outlet, Payload, Sample
 from .panics import end_if_panic
 from .threads import keep_attached
 
@@ -79,7 +79,6 @@ class Arrivals:
         self.asked: deque[zenoh.Query] = deque()
         """Queries on their way to the loop: an emergency stop can be among them, so no sample overtakes them."""
         self._own = threading.local()
-        self._ages = Ages()
         self.stirred = False
         """Whether a message or a question has come or gone since somebody took this back."""
 
@@ -149,10 +148,18 @@ class Arrivals:
 
         return receive
 
-    def guarded(self, on_batch: OnBatch, gate: Gate) -> Callable[[zenoh.Sample], None]:
+    def guarded(self, on_aged: OnAged, gate: Gate) -> Callable[[zenoh.Sample], None]:
         """The same for what is judged before it may wait, and where Zenoh's thread must never wait: what the gate does
         not admit is not even copied, what it takes is done, and for the rest there is room or there is not."""
-        queue, own, ages = self._queue, self._own, self._ages
+        queue, own = self._queue, self._own
+
+        def handle(samples: Iterator[tuple[str, Payload, float, float]]) -> None:
+            on_aged(aged(samples))
+
+        def aged(samples: Iterator[tuple[str, Payload, float, float]]) -> Iterator[Aged]:
+            for key, payload, age_s, at in samples:
+                now = now_s()
+                yield key, payload, age_s + now - at, now
 
         def receive(sample: zenoh.Sample) -> None:
             self.stirred = True
@@ -161,24 +168,23 @@ class Arrivals:
             except AttributeError:  # the first in this thread
                 payload = own.payload = None
                 keep_attached()
-            key = str(sample.key_expr)
+            key, now, age_s = str(sample.key_expr), now_s(), 0.0
             if payload is None:
-                now, encoded = now_s(), sample.payload
+                encoded = sample.payload
                 size = len(encoded)
                 if not gate.admits(key, size, sample.priority == URGENT, now):
                     if size <= self.AT_ONCE_BYTES:
                         self._try(gate.rescue, key, encoded.to_bytes(), now)
                     return
                 payload = encoded.to_bytes()
-                if size <= self.AT_ONCE_BYTES:
-                    stamp = sample.timestamp
-                    age_s = ages.age(stamp.get_id(), stamp.get_time_as_ntp64().as_secs_f64(), now) if stamp else 0.0
-                    if self._try(gate.first, key, payload, age_s, now):
-                        return
+                if stamp := sample.timestamp:
+                    age_s = gate.age(key, stamp.get_id(), stamp.get_time_as_ntp64().as_secs_f64(), now)
+                if size <= self.AT_ONCE_BYTES and self._try(gate.first, key, payload, age_s, now):
+                    return
             if len(queue) >= self.LIMIT or not self._takes_room_for(len(payload)):
                 self._drops["loop_behind"] += 1
                 return
-            queue.append((on_batch, (key, payload)))
+            queue.append((handle, (key, payload, age_s, now)))
             if not self._waiting:
                 self._wake_loop()
 

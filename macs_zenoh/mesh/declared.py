@@ -43,6 +43,9 @@ Sample = tuple[str, Payload]
 
 OnBatch = Callable[[Iterator[Sample]], None]
 """Takes samples one after the other: each leaves the queue when it is asked for."""
+Aged = tuple[str, Payload, float, float]
+"""Key, payload, how old the sample is in s, and the time now: of what passes a gate."""
+OnAged = Callable[[Iterator[Aged]], None]
 OnMiss = Callable[[str, int], None]
 AtOnce = Callable[[str, Payload], bool]
 """Takes one sample, by key and payload, in a thread of Zenoh's: soon, and without waiting for the loop. False: it has

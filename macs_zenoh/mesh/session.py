@@ -36,7 +36,7 @@ from macs_zenoh.versions import installed
 
 from .arrivals import Arrivals, now_s
 from .cpu_latency import Awake
-from .declared import AtOnce, Handler, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
+from .declared import AtOnce, Handler, OnAged, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
 from .outgoing import Outgoing
 from .panics import call, end_if_panic, end_on_panics, last_words, watched
 from .reliable import Recovered
@@ -273,7 +273,6 @@ class Mesh:
         on_batch: OnBatch,
         *,
         at_once: AtOnce | None = None,
-        gate: Gate | None = None,
         reliable: bool = False,
         on_miss: OnMiss | None = None,
     ) -> Subscription:
@@ -281,8 +280,7 @@ class Mesh:
         mesh, as long as it was put with one kind of traffic.
 
         ``at_once`` is offered a sample that comes from elsewhere while nothing else waits, in a thread of Zenoh's,
-        which saves it the way to the loop; what it does not take goes to ``on_batch``. A ``gate`` judges every sample
-        in that thread, whatever waits.
+        which saves it the way to the loop; what it does not take goes to ``on_batch``.
 
         ``reliable``: what a source keeps (`keep`) is received in order and once, also through outages. Samples that
         it has no more are counted as ``missed``, and ``on_miss(key, count)`` hears of them. What sources do not keep
@@ -301,10 +299,13 @@ class Mesh:
             )
             self._recovered.add(recovered)
             return recovered.declare()
-        if gate is not None:
-            guarded = zenoh.handlers.Callback(self._arrivals.guarded(on_batch, gate), indirect=False)
-            return Subscription(self._session.declare_subscriber(key, guarded))
         receive = self._arrivals.receiver(on_batch, at_once=at_once)
+        return Subscription(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+
+    def subscribe_guarded(self, key: str, on_aged: OnAged, gate: Gate) -> Subscription:
+        """Receive samples in batches, in the same order as with `subscribe`; ``gate`` judges each in the thread of
+        Zenoh's that brought it, whatever waits, and may take it."""
+        receive = self._arrivals.guarded(on_aged, gate)
         return Subscription(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
     def _lost(self, on_miss: OnMiss | None, key: str, count: int) -> None:

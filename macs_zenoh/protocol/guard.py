@@ -44,17 +44,25 @@ class Allowances:
         self._most = max(1.0, per_s / 4)
         self._little = self.LITTLE * per_s
         self._all = Credit(per_s * self.TOGETHER, -math.inf)
-        self._senders: dict[str, Credit] = {}
+        self._senders: OrderedDict[str, Credit] = OrderedDict()
+        """Who sent longest ago comes first."""
 
     def take(self, sender: str, size: int, now: float) -> bool:
         """Whether a message of this size may pass."""
         credit = self._senders.get(sender)
         if credit is None:
-            if len(self._senders) >= self.SENDERS:
-                self._senders.clear()
-            credit = self._senders[sender] = Credit(self._per_s, now)
+            credit = self._senders[sender] = self._credit_of_another(now)
+        else:
+            self._senders.move_to_end(sender)
         cost = 1.0 if size <= SINGLE_BYTES else min(self._most, size / RUN_BYTES)
         return credit.take(cost, now) and (credit.left(now) >= self._little or self._all.take(cost, now))
+
+    def _credit_of_another(self, now: float) -> Credit:
+        """What a new sender begins with; once there are too many, with what is left to whom it displaces: names that
+        somebody makes up give him no more."""
+        if len(self._senders) < self.SENDERS:
+            return Credit(self._per_s, now)
+        return self._senders.popitem(last=False)[1]
 
 
 class Ages:
@@ -62,47 +70,101 @@ class Ages:
 
     The difference between arrival and stamp is the way's length and that of the clocks; the smallest of the last
     minute is a sample that did not wait. What another has more is the time that it waited.
+
+    Whoever sends can write the stamp himself, and name any clock. So the smallest is each sender's own: what somebody
+    forges makes nobody else's commands old or young, and the clocks that he makes up displace his own. Only who is new
+    on a clock is compared with others as well, until it has been heard for `NEW_S`: what waited for it to connect is
+    no younger because nobody knows it. It is held to the median of those that came last to that clock, the smaller one
+    of two: a single forger among three shifts nothing, and where there are fewer he costs newcomers their commands for
+    that long, or the comparison, as if there were nobody.
     """
 
-    CLOCKS = 64
+    SENDERS = 1024
+    CLOCKS = 4
+    """Of one sender: it changes to another router when its own fails."""
+    WITNESSES = 9
+    """With so many senders of a clock a new one is compared."""
+    NEW_S = 1.0
     HALF_S = 30.0
     FORGET_S = 600.0
     """Two clocks drift apart: what was found so long ago says nothing."""
     STANDS_S = 1e-5
     """A hybrid clock that was put forward stands still until time has come up to it, but for a tick per sample."""
 
-    class _Clock:
-        """One clock that stamps."""
+    class _Way:
+        """What one sender's samples with the stamps of one clock have said."""
 
-        __slots__ = ("at", "before", "least", "since", "stamp")
+        __slots__ = ("at", "before", "first", "least", "others", "since", "stamp")
 
-        def __init__(self, stamp: float, now: float) -> None:
-            self.stamp, self.at, self.since = stamp, now, now
+        def __init__(self, stamp: float, now: float, others: float) -> None:
+            self.stamp, self.at, self.since, self.first = stamp, now, now, now
             self.least = self.before = now - stamp
+            self.others = others
+            """The delay that others had when this one was new; infinite when there was nobody."""
+
+        @property
+        def delay(self) -> float:
+            """Of a sample that did not wait."""
+            return min(self.least, self.before)
 
     def __init__(self) -> None:
-        self._clocks: OrderedDict[Hashable, Ages._Clock] = OrderedDict()
+        self._ways: OrderedDict[str, OrderedDict[Hashable, Ages._Way]] = OrderedDict()
+        """By sender and clock, those heard last at the end."""
+        self._witnesses: dict[Hashable, OrderedDict[str, Ages._Way]] = {}
+        """Some of them by clock, those that came last at the end."""
 
-    def age(self, clock: Hashable, stamp: float, now: float) -> float:
+    def age(self, sender: str, clock: Hashable, stamp: float, now: float) -> float:
         """How long a sample with this stamp has waited, in s."""
-        seen = self._clocks.get(clock)
-        if seen is None or now - seen.at > self.FORGET_S:
-            if len(self._clocks) >= self.CLOCKS:
-                self._clocks.popitem(last=False)
-            self._clocks[clock] = self._Clock(stamp, now)
-            return 0.0
-        self._clocks.move_to_end(clock)
-        stands = abs(stamp - seen.stamp) < self.STANDS_S and now - seen.at > 100 * self.STANDS_S
-        seen.stamp, seen.at = stamp, now
+        own = self._ways.get(sender)
+        way = own.get(clock) if own is not None else None
+        if own is None or way is None or now - way.at > self.FORGET_S:
+            way = self._begin(sender, clock, stamp, now)
+            return max(0.0, now - stamp - min(way.least, way.others))
+        self._ways.move_to_end(sender)
+        own.move_to_end(clock)
+        stands = abs(stamp - way.stamp) < self.STANDS_S and now - way.at > 100 * self.STANDS_S
+        way.stamp, way.at = stamp, now
         delay = now - stamp
         if stands:  # the smallest is from when it was put forward
-            seen.least, seen.before, seen.since = delay, delay, now
-            return 0.0
-        if now - seen.since > self.HALF_S:
-            seen.before, seen.least, seen.since = seen.least, delay, now
-        elif delay < seen.least:
-            seen.least = delay
-        return max(0.0, delay - min(seen.least, seen.before))
+            way.least, way.before, way.since = delay, delay, now
+        elif now - way.since > self.HALF_S:
+            way.before, way.least, way.since = way.least, delay, now
+        elif delay < way.least:
+            way.least = delay
+        if now - way.first <= self.NEW_S:
+            return max(0.0, delay - min(way.delay, way.others))
+        return max(0.0, delay - way.delay)
+
+    def _begin(self, sender: str, clock: Hashable, stamp: float, now: float) -> Ages._Way:
+        """Meet a sender on a clock on which it has not been heard."""
+        way = self._Way(stamp, now, self._delay_of_others(sender, clock, now))
+        own = self._ways.setdefault(sender, OrderedDict())
+        self._ways.move_to_end(sender)
+        own[clock] = way
+        own.move_to_end(clock)
+        if len(own) > self.CLOCKS:
+            self._dismiss(sender, own.popitem(last=False)[0])
+        if len(self._ways) > self.SENDERS:
+            gone, theirs = self._ways.popitem(last=False)
+            for other in theirs:
+                self._dismiss(gone, other)
+        witnesses = self._witnesses.setdefault(clock, OrderedDict())
+        witnesses[sender] = way
+        witnesses.move_to_end(sender)
+        if len(witnesses) > self.WITNESSES:
+            witnesses.popitem(last=False)
+        return way
+
+    def _dismiss(self, sender: str, clock: Hashable) -> None:
+        witnesses = self._witnesses.get(clock, OrderedDict())
+        witnesses.pop(sender, None)
+        if not witnesses:
+            self._witnesses.pop(clock, None)
+
+    def _delay_of_others(self, sender: str, clock: Hashable, now: float) -> float:
+        ways = self._witnesses.get(clock, OrderedDict())
+        delays = sorted(way.delay for other, way in ways.items() if other != sender and now - way.at <= self.FORGET_S)
+        return delays[(len(delays) - 1) // 2] if delays else math.inf
 
 
 class Fresh:
@@ -118,17 +180,18 @@ class Fresh:
 
     def __init__(self, max_age_s: float) -> None:
         self._max_age_s = max_age_s
-        self._late: dict[str, tuple[float, float]] = {}
-        """Who has waited: when the last that was too old came, and the last at all."""
+        self._late: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        """Who has waited: when the last that was too old came, and the last at all. Who sent last is at the end."""
 
     def take(self, sender: str, age_s: float, now: float) -> bool:
         """Whether a command of this age is carried out."""
         if not self._max_age_s:
             return True
         if age_s > self._max_age_s:
-            if len(self._late) >= self.LATE:
-                self._late.clear()
             self._late[sender] = (now, now)
+            self._late.move_to_end(sender)
+            if len(self._late) > self.LATE:
+                self._late.popitem(last=False)
             return False
         late = self._late.get(sender)
         if late is None:
@@ -139,6 +202,7 @@ class Fresh:
             del self._late[sender]
             return True
         self._late[sender] = (since, now)
+        self._late.move_to_end(sender)
         return False
 
 
@@ -161,8 +225,11 @@ class Gate(Protocol):
     def admits(self, key: str, size: int, urgent: bool, now: float) -> bool:
         """Whether a sample may be looked at."""
 
+    def age(self, key: str, clock: Hashable, stamp: float, now: float) -> float:
+        """How long a sample has waited on its way, by the stamp it bears."""
+
     def first(self, key: str, payload: Buffer, age_s: float, now: float) -> bool:
-        """Take a sample now, whatever waits. False: it has done nothing, and the loop shall."""
+        """Take a sample now, whatever waits. False: the loop shall."""
 
     def rescue(self, key: str, payload: Buffer, now: float) -> None:
         """Look at one that is not admitted for what must pass nevertheless."""
@@ -184,10 +251,13 @@ class Guard:
         self._urgent = Allowances(limits.commands_per_s)
         self._requests = Allowances(limits.requests_per_s)
         self._rescued = Allowances(limits.commands_per_s)
+        self._ages = Ages()
         self._fresh = Fresh(limits.max_command_age_s)
         self._reader = Reader(layout, self._found_bad)
         self._bad = False
         self._lock = threading.Lock()
+        self._counting = threading.Lock()
+        """Held for what is known of senders; never while a command is carried out."""
 
     @property
     def stop_name(self) -> str:
@@ -201,19 +271,30 @@ class Guard:
     def admits(self, key: str, size: int, urgent: bool, now: float) -> bool:
         """Whether a sample may be looked at."""
         sender = sender_of(key)
-        if (self._urgent if urgent else self._requests).take(sender, size, now):
+        with self._counting:
+            admitted = (self._urgent if urgent else self._requests).take(sender, size, now)
+        if admitted:
             return True
         self.on_dropped("flooded", sender, "it sends more than one agent may")
         return False
 
+    def age(self, key: str, clock: Hashable, stamp: float, now: float) -> float:
+        """How long a sample has waited on its way."""
+        with self._counting:
+            return self._ages.age(sender_of(key), clock, stamp, now)
+
     def first(self, key: str, payload: Buffer, age_s: float, now: float) -> bool:
-        """Carry out the commands of a sample. False: it is none, and nothing was done."""
+        """Carry out the commands of a sample. False: it holds something else, of which only a stop was carried out;
+        the loop has all of it in order, and asks `judge` about its commands."""
         command = self.on_command
         if command is None:
             return False
         with self._lock:  # of two threads each has its turn: what one sender put stays in order
             messages = self._read(key, payload)
             if self._bad or not messages or not all(_is_command(message) for message in messages):
+                for message in messages:
+                    if self._stops(message):
+                        command(message)
                 return False
             sender = sender_of(key)
             for message in messages:
@@ -221,26 +302,39 @@ class Guard:
                     command(message)
         return True
 
+    def judge(self, message: Message, key: str, age_s: float, now: float) -> bool:
+        """Whether a message that comes to the loop is delivered: commands among others, or in a sample too large to be
+        looked at before, are held to the same."""
+        if not _is_command(message):
+            return True
+        with self._lock:
+            return self._passes(message, sender_of(key), age_s, now)
+
     def rescue(self, key: str, payload: Buffer, now: float) -> None:
         """Of a sample that is not admitted: whoever floods may still stop the robot. What names the stop and does not
         stop is a flood as well, so that this has an allowance of its own."""
-        command, name = self.on_command, self.stop_name
-        if command is None or not name or self._stop_bytes not in payload:
+        command = self.on_command
+        if command is None or not self.stop_name or self._stop_bytes not in payload:
             return
-        if not self._rescued.take(sender_of(key), len(payload), now):
-            return
+        with self._counting:
+            if not self._rescued.take(sender_of(key), len(payload), now):
+                return
         with self._lock:
             for message in self._read(key, payload):
-                if _is_command(message) and message.metadata.node_name == name and presses(message.data):
+                if self._stops(message):
                     command(message)
 
     def _passes(self, message: Message, sender: str, age_s: float, now: float) -> bool:
-        if self.stop_name and message.metadata.node_name == self.stop_name and presses(message.data):
+        if self._stops(message):
             return True
         if self._fresh.take(sender, age_s, now):
             return True
         self.on_dropped("too_old", sender, f"a command has waited for {age_s:.2f} s on its way, or behind such a one")
         return False
+
+    def _stops(self, message: Message) -> bool:
+        name = message.metadata.node_name
+        return bool(name) and name == self.stop_name and _is_command(message) and presses(message.data)
 
     def _read(self, key: str, payload: Buffer) -> list[Message]:
         self._bad = False

@@ -9,7 +9,7 @@ import pytest
 from macs_zenoh.protocol.guard import Ages, Allowances, Fresh, Guard, Limits, sender_of
 from macs_zenoh.protocol.keyexpr import GROUP
 from macs_zenoh.protocol.messages import Metadata, NodeType
-from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.reading import Message, Reader
 from macs_zenoh.protocol.routing import unicast_key
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message
 
@@ -61,10 +61,10 @@ def test_ages_need_no_common_clock(offset: float) -> None:
     ages, drift = Ages(), 1.0001
     for number in range(2000):
         now = number / 10
-        age = ages.age("router", offset + (now - 0.02) * drift, now)
+        age = ages.age("unity/300", "router", offset + (now - 0.02) * drift, now)
         assert age < 0.02
     for waited in (1.5, 1.0, 0.5, 0.0):
-        age = ages.age("router", offset + (200.0 - 0.02 - waited) * drift, 200.0)
+        age = ages.age("unity/300", "router", offset + (200.0 - 0.02 - waited) * drift, 200.0)
         assert age == pytest.approx(waited, abs=0.02)
 
 
@@ -72,10 +72,81 @@ def test_a_clock_that_was_put_forward_makes_nothing_old() -> None:
     """A hybrid clock stands still until time has come up to it; then it goes on."""
     ages = Ages()
     for number in range(100):
-        assert ages.age("router", number / 10, number / 10) == 0.0
+        assert ages.age("unity/300", "router", number / 10, number / 10) == 0.0
     for number in range(100):
         now = 10 + number / 10
-        assert ages.age("router", max(now, 15.0 + number * 1e-8), now) < 0.11
+        assert ages.age("unity/300", "router", max(now, 15.0 + number * 1e-8), now) < 0.11
+
+
+def heard(ages: Ages, sender: str, *, delay: float, until: float = 10.0, clock: str = "router") -> None:
+    """Somebody has sent for a while; the clock differs from ours, and the way is long, by `delay`."""
+    for number in range(20):
+        now = until - 2 + number / 10
+        ages.age(sender, clock, now - delay, now)
+
+
+@pytest.mark.parametrize("forged", [-3600.0, -0.4, 3600.0])
+def test_who_forges_stamps_changes_nobody_elses_age(forged: float) -> None:
+    """With stamps in the future or the past, on the clock that others use: their commands are as old as before."""
+    ages = Ages()
+    heard(ages, "unity/300", delay=5.0)
+    heard(ages, "unity/666", delay=5.0 + forged)
+    heard(ages, "unity/666", delay=5.0, until=10.5)
+    assert ages.age("unity/300", "router", 11.0 - 5.0, 11.0) == pytest.approx(0, abs=1e-6)
+    assert ages.age("unity/300", "router", 12.0 - 7.0, 12.0) == pytest.approx(2)
+
+
+def test_clocks_that_somebody_makes_up_displace_his_own_only() -> None:
+    """After a thousand forged clocks of one sender an old command of another is as old as it is, known or new."""
+    ages = Ages()
+    heard(ages, "unity/300", delay=5.0)
+    for number in range(1000):
+        ages.age("unity/666", f"forged{number}", 0.0, 10.0)
+    assert ages.age("unity/300", "router", 11.0 - 7.0, 11.0) == pytest.approx(2)
+    assert ages.age("unity/301", "router", 11.0 - 7.0, 11.0) == pytest.approx(2)
+
+
+def test_names_that_somebody_makes_up_displace_those_heard_longest_ago() -> None:
+    """Who sends all the time is not forgotten, however many names pass by."""
+    ages = Ages()
+    for number in range(10 * Ages.SENDERS):
+        ages.age(f"unity/{1000 + number}", "forged", 0.0, 10.0 + number / 1000)
+        if number % 100 == 0:
+            now = 10.0 + number / 1000
+            assert ages.age("unity/300", "router", now - 5.0, now) == pytest.approx(0, abs=1e-6)
+    assert ages.age("unity/300", "router", 21.0 - 7.0, 21.0) == pytest.approx(2)
+
+
+def test_a_new_sender_is_compared_with_others_on_its_clock() -> None:
+    """What waited for its sender to connect is old, all that comes at first; with nobody to compare, nothing is."""
+    ages = Ages()
+    heard(ages, "unity/300", delay=5.0)
+    for number in range(10):
+        now = 11.0 + number / 1000
+        assert ages.age("unity/301", "router", 10.0 - 7.0 + number / 10, now) == pytest.approx(
+            now - 5.0 - (3.0 + number / 10)
+        )
+    assert ages.age("unity/301", "router", 11.5 - 5.0, 11.5) == pytest.approx(0, abs=1e-6)
+    assert ages.age("unity/302", "another router", 3.0, 11.5) == 0.0
+
+
+def test_one_forger_among_three_does_not_shift_what_newcomers_are_compared_with() -> None:
+    """Stamps of an hour ahead make no newcomer's command old, those of an hour ago none young."""
+    for forged in (-3600.0, 3600.0):
+        ages = Ages()
+        for sender, delay in (("unity/300", 5.0), ("unity/301", 5.001), ("unity/666", 5.0 + forged)):
+            heard(ages, sender, delay=delay)
+        assert ages.age("unity/302", "router", 11.0 - 5.0, 11.0) == pytest.approx(0, abs=0.01)
+        assert ages.age("unity/303", "router", 11.0 - 7.0, 11.0) == pytest.approx(2, abs=0.01)
+
+
+def test_what_a_single_forger_costs_newcomers_is_a_moment() -> None:
+    """Held back by stamps from the future, a new sender passes after a second."""
+    ages = Ages()
+    heard(ages, "unity/666", delay=5.0 - 3600)
+    at_first = [ages.age("unity/300", "router", 11.0 + n / 20 - 5.0, 11.0 + n / 20) for n in range(20)]
+    assert min(at_first) > 3000
+    assert ages.age("unity/300", "router", 12.1 - 5.0, 12.1) == pytest.approx(0, abs=1e-6)
 
 
 def test_of_commands_that_waited_none_is_carried_out() -> None:
@@ -96,6 +167,26 @@ def test_a_way_that_has_become_longer_does_not_silence_for_ever() -> None:
     taken = [fresh.take("a", 0.3, number / 20) for number in range(1, 40)]
     assert not any(taken[:15])
     assert all(taken[25:])
+
+
+def test_who_has_waited_is_not_forgotten_because_of_others() -> None:
+    """The late commands of a thousand others do not let those of one pass that waited, as long as they come."""
+    fresh = Fresh(0.5)
+    assert not fresh.take("a", 0.9, 0.0)
+    for number in range(10 * Fresh.LATE):
+        now = number / 20_000
+        fresh.take(f"s{number}", 9.0, now)
+        if number % 500 == 0:
+            assert not fresh.take("a", 0.3, now)
+
+
+def test_new_names_bring_no_new_credit() -> None:
+    """Who sends under more names than are remembered has what those have together, not a full one with each name."""
+    allowances, passed = Allowances(100), 0
+    allowances.SENDERS = 16
+    for number in range(100_000):
+        passed += allowances.take(f"s{number % 32}", 300, 0.0)
+    assert passed <= 16 * 100
 
 
 def test_no_limit_is_none() -> None:
@@ -138,6 +229,20 @@ def test_commands_are_taken_and_all_else_is_left(guard: Guard, taken: list[Messa
     ):
         assert not guard.first(KEY, other, 0.0, 0.0)
     assert len(taken) == 3
+
+
+def test_commands_among_others_are_held_to_their_age(guard: Guard, taken: list[Message]) -> None:
+    """What goes to the loop with other messages is judged there: what has waited too long, on the way or for the loop,
+    is not delivered; what is no command is, and a stop has been carried out before."""
+    dropped = []
+    guard.on_dropped = lambda name, sender, why: dropped.append(name)
+    mixed = frame(data=b"old") + frame(kind=NodeType.CLIENT) + frame(STOP)
+    assert not guard.first(KEY, mixed, 0.7, 0.0)
+    assert [message.metadata.node_name for message in taken] == [STOP]
+    messages = Reader(MACS, lambda key, error: None).read(KEY, mixed, ME, by_group=False)
+    assert [guard.judge(message, KEY, 0.7, 0.0) for message in messages] == [False, True, True]
+    assert dropped == ["too_old"]
+    assert [guard.judge(message, KEY, 0.001, 1.0) for message in messages] == [True, True, True]
 
 
 def test_a_group_copy_is_dropped_where_the_id_is_named(guard: Guard, taken: list[Message]) -> None:
