@@ -28,7 +28,8 @@ from .errors import Refused, Unreachable, UsageError, WireError
 from .mesh import Mesh, Sample, Subscription, Token, Traffic
 from .protocol import ids as blocks
 from .protocol import named
-from .protocol.keyexpr import LAST, NAME, NAMED, NAMED_ALL, WANTED, type_name
+from .protocol.agent_id import AgentId
+from .protocol.keyexpr import LAST, NAME, NAMED, NAMED_ALL, WANTED
 from .protocol.named import Arrivals, Envelope, LastValues, Named, Names, Outcome, RateLimits, check_word
 from .protocol.wire import PROBE
 
@@ -127,7 +128,7 @@ class Awareness:
         self._tasks: set[asyncio.Task[None]] = set()
 
     def __repr__(self) -> str:
-        return f"<Awareness {self.name!r} {type_name(self.agent_type)}/{self.agent_id}>"
+        return f"<Awareness {self.name!r} {AgentId(self.agent_type, self.agent_id)}>"
 
     # -- who is there --------------------------------------------------------------------------------------------
 

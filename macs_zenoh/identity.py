@@ -16,6 +16,7 @@ from .errors import MacsError, OutOfRange, Unreachable, UsageError
 from .mesh import Mesh, Subscription
 from .presence import Contested, Presence
 from .protocol import ids as blocks
+from .protocol.agent_id import AgentId
 from .protocol.ids import Contests
 from .protocol.keyexpr import LEASE, type_name
 
@@ -69,7 +70,7 @@ class Identity:
         self._changing: asyncio.Task[None] | None = None
 
     def __str__(self) -> str:
-        return f"{type_name(self._type)}/{self._claim.id if self._claim else 0}"
+        return str(AgentId(self._type, self._claim.id if self._claim else 0))
 
     async def take(self, wanted: int | None) -> int:
         """Be online under the id wanted, or a free one. Raises UsageError when it is taken, Unreachable when all
@@ -91,7 +92,7 @@ class Identity:
     # -- an id of one's own --------------------------------------------------------------------------------------
 
     async def _take_fixed(self, agent_id: int) -> _Claim:
-        name = f"{type_name(self._type)}/{agent_id}"
+        name = str(AgentId(self._type, agent_id))
         if not 1 <= agent_id <= 0xFFFF:
             raise OutOfRange("id", agent_id, 1, 0xFFFF)
         await self._wait_for_stale(name, (self._type, agent_id))

@@ -20,8 +20,8 @@ from msgspec import structs
 
 from .errors import HeldByAnother, OutOfRange, Refused, Unreachable
 from .mesh import Mesh
+from .protocol.agent_id import AgentId
 from .protocol.directory import Change, Directory
-from .protocol.keyexpr import type_name
 from .protocol.limits import NODE_AGENTS
 from .protocol.messages import (
     ROS,
@@ -356,7 +356,7 @@ class _What:
 
     def __str__(self) -> str:
         robot_id, node = self._task
-        who = f"{type_name(node.registrant_agent_type)}/{node.registrant_agent_id}"
+        who = AgentId(node.registrant_agent_type, node.registrant_agent_id)
         return f"{who}: {_describe(node)} on ros/{robot_id}"
 
 

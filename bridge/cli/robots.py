@@ -12,7 +12,7 @@ import json
 from collections import Counter
 from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager, suppress
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 from msgspec import Struct
@@ -20,8 +20,9 @@ from msgspec import Struct
 from macs_zenoh.config import MeshSettings, OperatorSettings
 from macs_zenoh.errors import MacsError, Refused, TooLong, Unreachable, UsageError
 from macs_zenoh.protocol import ping
+from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import AgentInfo, Directory
-from macs_zenoh.protocol.keyexpr import LEASE, NAME, PING, PRESENCE, type_name, type_number
+from macs_zenoh.protocol.keyexpr import LEASE, NAME, PING, PRESENCE, type_number
 from macs_zenoh.protocol.limits import ANSWER_BYTES
 from macs_zenoh.protocol.messages import OPERATOR, ROS, Metadata
 from macs_zenoh.protocol.named import Named, Names
@@ -40,14 +41,8 @@ USUALLY_S = 0.4
 WITHOUT_A_ROUTER = "(start one with `macs router`, or name it with -e; `macs doctor` looks closer)"
 
 
-class Caller(NamedTuple):
-    """As whom robots are asked."""
-
-    type: int
-    id: int
-
-    def __str__(self) -> str:
-        return f"{type_name(self.type)}/{self.id}"
+Caller = AgentId
+"""As whom robots are asked."""
 
 
 class Control(Struct, frozen=True):

@@ -13,9 +13,10 @@ from typing import NamedTuple
 
 from macs_zenoh.errors import WireError
 from macs_zenoh.mesh import Payload, Sample
+from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.existing import CDR, PASS, Data, Verdict, fitting, least_bytes, readable, refuses, topic_data
-from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue, type_name
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue
 from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, correct_sender, decode_management
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.routing import takes_group_copy
@@ -357,7 +358,7 @@ class Delivery:
 
     def _wrong_sender(self, key: str, named: tuple[int | None, int | None], count: int) -> None:
         if not self.drops["wrong_sender"]:
-            who = "nobody" if None in named else f"{type_name(named[0] or 0)}/{named[1]}"
+            who = "nobody" if None in named else AgentId(named[0] or 0, named[1] or 0)
             problem = "a frame on %s names %s as its sender: put right (logged once, counted as wrong_sender)"
             log.warning(problem, key, who)
         self.drops["wrong_sender"] += count
@@ -369,7 +370,7 @@ class Delivery:
 
 
 def _who(metadata: Metadata) -> str:
-    return f"{type_name(metadata.sender_agent_type or 0)}/{metadata.sender_agent_id}"
+    return str(AgentId(metadata.sender_agent_type or 0, metadata.sender_agent_id or 0))
 
 
 def _sender(fields: dict[str, FieldValue]) -> AgentKey:

@@ -23,11 +23,12 @@ from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Payload, Subscription, Traffic
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.addresses import joined
+from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.budget import Budget
 from macs_zenoh.protocol.credit import Credits
 from macs_zenoh.protocol.directory import Change
 from macs_zenoh.protocol.existing import asks
-from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM, UNICAST
 from macs_zenoh.protocol.limits import (
     NAMED_EACH,
     NAMED_IN_ALL,
@@ -415,7 +416,7 @@ class Gateway:
             return
         for agent in route.agents:
             if agent not in self.directory:
-                problem = f"a message goes to {type_name(agent[0])}/{agent[1]}, not online"
+                problem = f"a message goes to {AgentId(*agent)}, not online"
                 connection.complain("unknown_agent", problem, frame.count)
         metadata = sent.metadata
         traffic = COMMAND if metadata.node_type == PUBLISHER else CALL

@@ -209,7 +209,7 @@ class RobotAgent:
         deadline = time.monotonic() + JUDGED_S
         may_act = self.nodes.rights.may_act
         while registrant not in self.agent.directory and time.monotonic() < deadline:
-            if may_act(type_name(registrant.agent_type), registrant.agent_id):
+            if may_act(type_name(registrant.type), registrant.id):
                 return
             await asyncio.sleep(0.02)
 
@@ -248,7 +248,7 @@ class RobotAgent:
             self._loop.call_soon_threadsafe(self._send, to, metadata, data)
             return
         try:
-            self.agent.send(data, to=type_name(to.agent_type), ids=[to.agent_id], metadata=metadata)
+            self.agent.send(data, to=type_name(to.type), ids=[to.id], metadata=metadata)
         except MacsError as error:
             self.nodes.drops.note("failed", str(to), str(error))
 

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 from rclpy.exceptions import NameValidationException
 from rclpy.type_support import NoTypeSupportImportedException
@@ -23,6 +23,7 @@ from bridge.ros.session import RosSession
 from bridge.ros.types import InterfaceName
 from macs_zenoh.config import Priority
 from macs_zenoh.errors import HeldByAnother, Refused
+from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.keyexpr import type_name, type_number
 from macs_zenoh.protocol.messages import ROS, AddNode, Metadata, NodeType, RemoveNode, encode_data
 from macs_zenoh.protocol.reading import Message
@@ -36,19 +37,15 @@ SendTo = Callable[["Registrant", Metadata, bytes], None]
 """To one agent, on the loop."""
 
 
-class Registrant(NamedTuple):
+class Registrant(AgentId):
     """An agent that registered an interface node."""
 
-    agent_type: int
-    agent_id: int
-
-    def __str__(self) -> str:
-        return f"{type_name(self.agent_type)}/{self.agent_id}"
+    __slots__ = ()
 
     @classmethod
     def of(cls, message: Message) -> Registrant:
         """The sender of a message."""
-        return cls(int(type_number(message.sender_type)), message.sender_id)
+        return cls(type_number(message.sender_type), message.sender_id)
 
 
 class Drops(Counter[str]):
@@ -261,7 +258,7 @@ class InterfaceNode(ABC):
         """Tell registrants that know our extensions what is wrong with this node; not often. On the loop."""
         for registrant in self.registrants:
             about = Metadata(*registrant, node_type=self.key.node_type, node_name=self.key.node_name)
-            message = Message(type_name(registrant.agent_type), registrant.agent_id, about, b"")
+            message = Message(type_name(registrant.type), registrant.id, about, b"")
             self.robot.tell_refused(message, self.topic, kind, reason)
 
     def metadata(self, manager: str = "", request_id: int = 0) -> Metadata:

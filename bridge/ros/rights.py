@@ -45,7 +45,7 @@ class Rights:
 
     def check(self, agent: Registrant) -> None:
         """Raise Refused when it may not act."""
-        named = names_agent(self._allow, type_name(agent.agent_type), agent.agent_id, self._group_of(agent))
+        named = names_agent(self._allow, type_name(agent.type), agent.id, self._group_of(agent))
         if not named:
             raise Refused(f"{agent} may only register for topics that this robot sends, and not act on it")
 

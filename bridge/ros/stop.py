@@ -113,7 +113,7 @@ class StopNode(InterfaceNode):
             raise Refused(f"{sender} may not release this robot")
 
     def _names(self, patterns: list[str], sender: Registrant) -> bool:
-        return names_agent(patterns, type_name(sender.agent_type), sender.agent_id, self.robot.group_of(sender))
+        return names_agent(patterns, type_name(sender.type), sender.id, self.robot.group_of(sender))
 
     def press(self, by: str) -> None:
         """Stop, latched. Again changes nothing."""

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from hashlib import blake2b
 from typing import NamedTuple
 
+from .agent_id import AgentId
 from .keyexpr import PRESENCE, type_name
 
 EPOCH = "."
@@ -62,9 +63,9 @@ class AgentInfo(NamedTuple):
         return type_name(self.type)
 
     @property
-    def key(self) -> tuple[int, int]:
-        """What identifies the agent: (type, id)."""
-        return (self.type, self.id)
+    def key(self) -> AgentId:
+        """What identifies the agent: type and id."""
+        return AgentId(self.type, self.id)
 
 
 class Change(NamedTuple):

@@ -40,10 +40,12 @@ def type_name(agent_type: int) -> str:
     return _TYPE_NAMES.get(agent_type) or str(agent_type)
 
 
-def type_number(name: str) -> int:
-    """The agent type behind a name: ``ros`` → 1, ``unity`` → 2, ``"7"`` → 7. Raises UsageError."""
-    number = _TYPE_NUMBERS.get(name)
+def type_number(name: str | int) -> int:
+    """The agent type behind a name: ``ros`` → 1, ``unity`` → 2, ``"7"`` → 7, itself for a number. Raises
+    UsageError."""
+    number = _TYPE_NUMBERS.get(name) if isinstance(name, str) else None
     if number is None:
+        name = str(name)
         if len(name) > 3 or not name.isascii() or not name.isdigit() or not 1 <= int(name) <= 255:
             raise UsageError(f"unknown agent type {name!r}: use 'ros', 'unity', 'operator' or a number from 1 to 255")
         number = int(name)

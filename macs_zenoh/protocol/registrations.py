@@ -15,11 +15,11 @@ from typing import NamedTuple
 from msgspec import structs
 
 from ..errors import Refused
-from .keyexpr import type_name
+from .agent_id import AgentId
 from .messages import AddNode, NodeType, RemoveNode
 
 AgentKey = tuple[int, int]
-"""(agent type, agent id)."""
+"""(agent type, agent id), as of `AgentId`."""
 
 
 class Task(NamedTuple):
@@ -298,11 +298,7 @@ def check_own(node: AddNode | RemoveNode, caller: AgentKey) -> None:
     """
     registrant = (node.registrant_agent_type, node.registrant_agent_id)
     if registrant != caller:
-        raise Refused(f"{_named(caller)} cannot register or remove nodes for {_named(registrant)}")
-
-
-def _named(agent: AgentKey) -> str:
-    return f"{type_name(agent[0])}/{agent[1]}"
+        raise Refused(f"{AgentId(*caller)} cannot register or remove nodes for {AgentId(*registrant)}")
 
 
 def _keys(node: AddNode | RemoveNode) -> tuple[AgentKey, NodeKey]:

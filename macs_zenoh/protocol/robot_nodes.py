@@ -12,8 +12,8 @@ import sys
 from collections.abc import Collection, Iterable
 
 from ..errors import HeldByAnother, Refused
+from .agent_id import AgentId
 from .budget import may_have_one_more
-from .keyexpr import type_name
 from .limits import NODES_EACH
 from .messages import AddNode, Functionality, GoneAgent, NodeType, RemoveNode, node_name
 
@@ -132,8 +132,7 @@ class RobotNodes:
             raise Refused(f"this robot has {NODES} interface nodes, which is its limit")
         mine = sum(agent in registrants for registrants in self._registrants.values())
         if not may_have_one_more(len(self._nodes), mine, each=NODES_EACH, total=NODES):
-            who = f"{type_name(agent[0])}/{agent[1]}"
-            raise Refused(f"{who} has {mine} interface nodes on this robot; the rest is for others")
+            raise Refused(f"{AgentId(*agent)} has {mine} interface nodes on this robot; the rest is for others")
 
     def _check_same(self, node: AddNode, there: AddNode, agent: AgentKey) -> None:
         if node.tos_name != there.tos_name:
@@ -144,8 +143,8 @@ class RobotNodes:
             raise Refused(f"{node.tos_name} is registered with type {there.data_exchange_type}, not {other}")
         holder = (there.registrant_agent_type, there.registrant_agent_id)
         if node.node_type == NodeType.SERVICE and holder != agent:
-            who = f"{type_name(holder[0])}/{holder[1]}"
-            why = f"{node.tos_name} is already registered by another agent, {who}: a service of headsets has only one"
+            other = f"another agent, {AgentId(*holder)}"
+            why = f"{node.tos_name} is already registered by {other}: a service of headsets has only one"
             raise HeldByAnother(why, holder)
 
 

@@ -96,9 +96,9 @@ async def site(session: RosSession, peer: Peer, count_action: Any) -> AsyncItera
         session,
         7,
         lambda node, frame: None,
-        send=lambda to, metadata, data: headsets[to.agent_id].hear(metadata, data),
+        send=lambda to, metadata, data: headsets[to.id].hear(metadata, data),
         rules=rules,
-        group_of=lambda agent: 0 if agent.agent_id == 9 else 3,
+        group_of=lambda agent: 0 if agent.id == 9 else 3,
     )
     nodes = InterfaceNodes(robot)
     for headset in headsets.values():

@@ -447,7 +447,7 @@ async def test_a_topic_that_returns_with_another_type_is_told_once(
         await until(lambda: len(dict(nodes.robot.session.node.get_topic_names_and_types())["/changed"]) == 2)
         for _ in range(3):
             await _look(nodes)
-        assert {(await told.next())[0].agent_id for _ in range(2)} == {5, 6}
+        assert {(await told.next())[0].id for _ in range(2)} == {5, 6}
         assert told.queue.empty()
     finally:
         other.session.close()
@@ -498,7 +498,7 @@ async def test_a_message_that_is_too_large_is_dropped_at_its_source(
     assert (await streams.next())[1].data == "small"
     assert nodes.drops == {"too_large": 5}
     refusals = [await told.next() for _ in range(2)]
-    assert {to.agent_id for to, _ in refusals} == {5, 6}
+    assert {to.id for to, _ in refusals} == {5, 6}
     assert {(refused.kind, refused.tos_name, refused.node_type) for _, refused in refusals} == {
         ("too_large", "/big", 1)
     }

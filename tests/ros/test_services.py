@@ -110,7 +110,7 @@ async def test_many_calls_are_open_at_once(nodes: InterfaceNodes, headsets: Head
     for sender, number in asked:
         nodes.deliver(request("/slow", SetBool.Request(data=True), number=number, sender=sender))
     answers = [await get(headsets.sent) for _ in asked]
-    assert {(to.agent_id, metadata.request_id) for to, metadata, _ in answers} == asked
+    assert {(to.id, metadata.request_id) for to, metadata, _ in answers} == asked
 
 
 @pytest.mark.parametrize("asks", [True, False])
