@@ -1,6 +1,7 @@
 # make run    a headset, a mesh and a robot on this machine, without hardware
 # make test   every test;  make lint   ruff and mypy;  make bench   the speed ratios;  make clean
 # make attacks    every attack on a running site, as a table;  make chaos   an hour of kills, floods and cuts
+# make docs   the pages as a site, in build/docs;  make docs-links   and whether the links out of it still lead somewhere
 # make zenohd the router that the tests of networks and deployments run against, built by cargo (minutes, once)
 #
 # Needs python3 (3.10 or newer) with venv, and network access the first time. Everything goes into .venv.
@@ -27,7 +28,7 @@ VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)
 INTERFACES := $(if $(findstring ros,$(EXTRAS)),$(VENV)/.interfaces)
 
 .DEFAULT_GOAL := help
-.PHONY: help run install test lint format bench attacks chaos zenohd clean
+.PHONY: help run install test lint format bench attacks chaos docs docs-links zenohd clean
 
 help:
 	@sed -n '/^$$/q; s/^# \{0,1\}//p' Makefile
@@ -78,6 +79,21 @@ attacks: install
 chaos: install
 	@$(BIN)/python -m tests.attack.chaos $(ARGS)
 
+# A warning is an error: a link into nothing, a page on no shelf, a docstring that is no text.
+SPHINX = $(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -d build/doctrees
+
+docs: $(VENV)/.docs
+	@rm -rf docs/generated build/docs
+	@$(SPHINX) -b html docs build/docs
+	@echo "build/docs/index.html"
+
+docs-links: $(VENV)/.docs
+	@$(SPHINX) -b linkcheck docs build/links
+
+$(VENV)/.docs: $(STAMP)
+	@$(BIN)/python -m pip install --disable-pip-version-check --quiet -e ".[docs]"
+	@touch $@
+
 # The version of the wheel in use, so that both ends of a test are the same Zenoh. Cargo puts it into its own bin, where
 # the tests find it; without it they use the router inside the wheel.
 zenohd: install
@@ -90,5 +106,5 @@ zenohd: install
 	cargo install zenohd --version "$$version" --locked --debug --quiet
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -280,9 +280,11 @@ class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields
     """Address to listen on. The protocol has no authentication, so the network is opened on purpose: 0.0.0.0, or ::
     for IPv6 as well. With or without brackets."""
     port: Port = 7000
+    """TCP port to listen on. 0: any free one."""
     allow: list[str] = []
     """Networks whose addresses may connect, as in 192.168.1.0/24. Empty: everybody who reaches the port."""
     max_connections: Annotated[int, Meta(ge=1, le=65_535)] = 4096
+    """Connections at one time, of all addresses together."""
     max_connections_per_address: Annotated[int, Meta(ge=1, le=65_535)] = 3072
     """One address never takes all. Lower it where headsets have addresses of their own; behind NAT they share one."""
     max_frame_bytes: Bytes = 32 * 1024 * 1024
@@ -352,9 +354,11 @@ class TopicRule(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """As ``/camera/*`` (one level) or ``/camera/**`` (any levels below)."""
 
     reliability: Literal["best_effort", "reliable"] | None = None
+    """QoS of ROS, in place of what the topic's other endpoints have."""
     durability: Literal["volatile", "transient_local"] | None = None
+    """The same."""
     depth: Annotated[int, Meta(ge=1, le=1000)] | None = None
-    """These three replace what is taken from the topic's other endpoints and from the registration."""
+    """The same, in place of the registration's ``bufferSize``."""
     max_hz: Annotated[float, Meta(gt=0, le=10_000)] | None = None
     """Topic data to headsets: at most so many messages per second; of those in between, the latest is sent."""
     priority: Priority | None = None
@@ -413,6 +417,7 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     id: AgentId | None = None
     """Unset: lease a free one. Headsets address robots by number, so a robot in use has a fixed one."""
     group: GroupId = 0
+    """The group that the robot is in, 1 to 255. 0: in none."""
     max_nodes: Annotated[int, Meta(ge=1, le=10_000)] = 256
     """Interface nodes that headsets may have registered here at one time."""
     managers: list[str] = []
@@ -448,7 +453,7 @@ class RobotSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     """A larger message to headsets is not sent, and they are told. Gateways and headsets have limits of their own, by
     which such a message can end a connection."""
     rules: list[TopicRule] = []
-
+    """What holds for topics, services and actions by name, each a ``[[robot.rules]]`` table."""
     groups: dict[str, list[AgentPattern]] = {}
     """Who is believed to be in a group where rights name it: ``{9 = ["block/1"]}``. Agents choose their groups; so
     somebody has to answer for them, as the gateway of block 1 does with `GatewaySettings.groups`."""

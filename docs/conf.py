@@ -1,0 +1,60 @@
+"""The site made of these pages: `make docs`, then build/docs/index.html."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import version as version_of
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+import reference_pages  # noqa: E402
+
+project = "macs-zenoh"
+copyright = "the macs-zenoh authors, Apache-2.0"  # noqa: A001
+release = version = version_of("macs-zenoh")
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
+exclude_patterns = ["Thumbs.db", ".DS_Store"]
+
+html_theme = "furo"
+html_title = "macs-zenoh"
+html_theme_options = {
+    "source_repository": f"{reference_pages.repository()}/",
+    "source_branch": "main",
+    "source_directory": "docs/",
+}
+
+myst_enable_extensions = ["deflist", "attrs_block"]
+myst_heading_anchors = 4
+# A settings file with "…" in it, or JSON with a comment, is shown as it is.
+suppress_warnings = ["misc.highlighting_failure"]
+
+default_role = "code"  # docstrings write `name`, without saying what it is
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_preserve_defaults = True
+
+linkcheck_ignore = [r"https?://(localhost|127\.0\.0\.1).*", reference_pages.repository() + r".*"]
+
+
+def write_pages(app: Sphinx) -> None:
+    """Write what is generated from the code, before anything is read."""
+    folder = HERE / "generated"
+    folder.mkdir(exist_ok=True)
+    for name, text in reference_pages.pages().items():
+        path = folder / name
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def lead_inside(app: Sphinx, name: str, source: list[str]) -> None:
+    """Pages link to files of the repository: to pages of this site, where those are here, else to where it is kept."""
+    source[0] = reference_pages.links_of_site(source[0], name)
+
+
+def setup(app: Sphinx) -> None:
+    app.connect("builder-inited", write_pages)
+    app.connect("source-read", lead_inside)
