@@ -72,18 +72,23 @@ class EarlyMessages:
         self._bytes[sender] -= len(lost.data)
         return [lost]
 
-    def take(self, key: NodeKey, belongs: Callable[[Message], bool] = lambda message: True) -> list[Message]:
-        """The messages that wait for a node and belong to it, oldest first; others go on waiting."""
-        taken: list[EarlyMessage] = []
-        for sender, own in list(self._waiting):
-            if own == key:
-                taken += self._take(sender, own, lambda early: belongs(early.message))
-        return [early.message for early in sorted(taken, key=lambda early: early.deadline)]
+    def waits(self, sender: Sender) -> bool:
+        """Whether anything of one sender waits. From any thread."""
+        return sender in self._nodes
 
-    def of(self, sender: Sender) -> list[tuple[NodeKey, Message]]:
-        """What waits of one sender, with what it is for."""
-        mine = ((key, waiting) for (who, key), waiting in self._waiting.items() if who == sender)
-        return [(key, early.message) for key, waiting in mine for early in waiting]
+    def of(self, sender: Sender, key: NodeKey | None = None) -> list[tuple[NodeKey, Message]]:
+        """What waits of one sender, for one node or all, with what it is for; of each node the oldest first."""
+        mine = ((own, waiting) for (who, own), waiting in self._waiting.items() if who == sender)
+        return [(own, early.message) for own, waiting in mine if key in (None, own) for early in waiting]
+
+    def remove(self, key: NodeKey, message: Message) -> None:
+        """One message waits no more."""
+        self._take(_sender(message), key, lambda early: early.message is message)
+
+    def waiting_for(self, key: NodeKey) -> list[Message]:
+        """What waits for one node, of all senders, oldest first."""
+        waiting = [early for (_, own), mine in self._waiting.items() if own == key for early in mine]
+        return [early.message for early in sorted(waiting, key=lambda early: early.deadline)]
 
     def drop(self, sender: Sender) -> None:
         """Forget what somebody sent who has left: its id may be another one's by the time there is a node."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import operator
 import threading
 import time
 from collections.abc import Iterator
@@ -231,11 +230,7 @@ class InterfaceNodes:
         """An agent is seen now; what it sent before waits to be judged."""
         self.rights.changed()
         with self._early_lock:
-            waiting = self._early.of(registrant)
-            for key, message in waiting:
-                self._early.take(key, partial(operator.is_, message))
-        for _, message in waiting:
-            self.deliver(message)
+            self._pass_waiting(registrant)
 
     def returned(self, registrant: Registrant) -> None:
         """An agent that seemed to have left is there again, the same one."""
@@ -254,21 +249,40 @@ class InterfaceNodes:
 
         A registration is a call of its own, which the first message can overtake: a few wait for a moment.
         """
-        key = NodeKey(message.metadata.node_type, message.metadata.node_name)
-        node = self._meant(key, message)
-        stops = node is not None and node is self.stop  # who may is its own matter
-        allowed = stops or self.rights.may_act(message.sender_type, message.sender_id)
-        if not allowed and self.robot.is_online(Registrant.of(message)):
-            self._refuse(node, key, message)
+        key, sender = NodeKey(message.metadata.node_type, message.metadata.node_name), Registrant.of(message)
+        if self.stop is not None and key == self.stop.key:
+            self.stop.receive(message)  # who may is its own matter
             return
-        if node is None or not node.is_open or not allowed:
-            with self._early_lock:
-                node = self._meant(key, message)  # it may have been opened in this moment, or its sender been seen
-                allowed = allowed or self.rights.may_act(message.sender_type, message.sender_id)
-                if node is None or not node.is_open or not allowed:
-                    self._keep_early(key, message)
-                    return
+        if not self._early.waits(sender) and self._deliver(key, message):
+            return
+        with self._early_lock:
+            self._pass_waiting(sender, key)
+            if self._early.of(sender, key) or not self._deliver(key, message):
+                self._keep_early(key, message)
+
+    def _deliver(self, key: NodeKey, message: Message) -> bool:
+        """Whether a message need not wait."""
+        node = self._meant(key, message)
+        if not self.rights.may_act(message.sender_type, message.sender_id):
+            if not self.robot.is_online(Registrant.of(message)):
+                return False  # not seen yet
+            self._refuse(node, key, message)
+            return True
+        if node is None or not node.is_open:
+            return False
         node.receive(message)
+        return True
+
+    def _pass_waiting(self, sender: Registrant, key: NodeKey | None = None) -> None:
+        """Deliver what waits of one sender, as far as it need not any more. With the lock, and until all is delivered
+        it counts as waiting: nothing newer overtakes it in another thread."""
+        for own, message in self._early.of(sender, key):
+            passed = True
+            try:
+                passed = self._deliver(own, message)
+            finally:
+                if passed:
+                    self._early.remove(own, message)
 
     def _keep_early(self, key: NodeKey, message: Message) -> None:
         if self._has_just_left(key, message):
@@ -300,9 +314,13 @@ class InterfaceNodes:
     def _pass_early(self, node: InterfaceNode, key: NodeKey) -> None:
         """Give a node what came before the registration that it belongs to."""
         with self._early_lock:
-            early = self._early.take(key, lambda message: self._meant(key, message) is node)
-        for message in early:
-            node.receive(message)
+            for message in self._early.waiting_for(key):
+                may_act = isinstance(node, StopNode) or self.rights.may_act(message.sender_type, message.sender_id)
+                if may_act and self._meant(key, message) is node:
+                    try:
+                        node.receive(message)
+                    finally:
+                        self._early.remove(key, message)
 
     def last_words(self) -> None:
         """This program is about to end without closing anything: no last command may stay. From any thread."""

@@ -573,7 +573,9 @@ def test_waiting_messages_are_bounded_in_names_and_bytes() -> None:
     assert sum(len(messages) for messages in early.expire(EarlyMessages.HOLD_S).values()) == EarlyMessages.NODES
     assert early.next_deadline() is None
     assert not early.hold(NodeKey(2, "0"), big, now=0.0)
-    assert early.take(NodeKey(2, "0")) == [big]
+    assert early.waiting_for(NodeKey(2, "0")) == [big]
+    early.remove(NodeKey(2, "0"), big)
+    assert not early.waits((2, big.sender_id))
     assert early._bytes.total() == 0
 
 
@@ -588,7 +590,7 @@ def test_who_names_many_nodes_takes_nobodys_place() -> None:
     mine = [early_message._replace(data=bytes([number])) for number in range(3)]
     for message in mine:
         assert not early.hold(key, message, now=0.1)
-    assert [message for message in early.take(key) if message.sender_id == early_message.sender_id] == mine
+    assert [message for message in early.waiting_for(key) if message.sender_id == early_message.sender_id] == mine
     early.expire(5.0)
     assert (early.next_deadline(), early._bytes.total(), early._nodes.total()) == (None, 0, 0)
 

@@ -23,6 +23,7 @@ from bridge.ros.requests import ControlRequest, control
 from bridge.ros.rules import Rules
 from bridge.ros.services import servers_elsewhere
 from bridge.ros.session import RosSession
+from bridge.ros.topics import PublisherNode
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule
 from macs_zenoh.errors import Refused
 from macs_zenoh.mesh import Mesh, Sample, Token, Traffic
@@ -259,16 +260,25 @@ async def test_a_right_ends_when_it_is_taken_away(session: RosSession) -> None:
         nodes.close()
 
 
-async def test_what_comes_before_the_presence_of_its_sender_waits(session: RosSession, peer: Peer) -> None:
-    """A command can overtake the news that its sender is in a group; it is judged when that has come, or given up."""
+@asynccontextmanager
+async def not_seen_yet(session: RosSession, peer: Peer) -> AsyncIterator[tuple[InterfaceNodes, set[Registrant], Any]]:
+    """Nodes of a robot on which rights depend on a presence that has not come; who is seen; and what ROS hears."""
     seen: set[Registrant] = set()
     rules = Rules(RobotSettings(register_allow=["group/9", "unity/1"], groups={"9": ["unity"]}))
     robot = Robot(session, 7, lambda node, frame: None, rules=rules, group_of=lambda agent: 9 * (agent in seen))
     robot.is_online = seen.__contains__
     nodes = InterfaceNodes(robot)
     received = await heard(nodes, peer, "/cmd_vel")
+    await nodes.add(publishing("/cmd_vel", 1))
     try:
-        await nodes.add(publishing("/cmd_vel", 1))
+        yield nodes, seen, received
+    finally:
+        nodes.close()
+
+
+async def test_what_comes_before_the_presence_of_its_sender_waits(session: RosSession, peer: Peer) -> None:
+    """A command can overtake the news that its sender is in a group; it is judged when that has come, or given up."""
+    async with not_seen_yet(session, peer) as (nodes, seen, received):
         for sender in (OPERATOR, STRANGER):
             nodes.deliver(drive(sender, sender))
         assert nodes.drops == {}
@@ -277,8 +287,75 @@ async def test_what_comes_before_the_presence_of_its_sender_waits(session: RosSe
         assert (await get(received)).linear.x == OPERATOR
         await until(lambda: nodes.drops == {"not_allowed": 1})
         assert received.empty()
-    finally:
-        nodes.close()
+
+
+def overtaking(nodes: InterfaceNodes, monkeypatch: pytest.MonkeyPatch) -> threading.Thread:
+    """A thread as Zenoh's that brings a newer command while the older one is being delivered."""
+    newer = threading.Thread(target=nodes.deliver, args=[drive(2.0, OPERATOR)])
+    receive = PublisherNode.receive
+
+    def slow(node: PublisherNode, message: Message) -> None:
+        if threading.current_thread() is not newer:
+            newer.start()
+            newer.join(0.3)  # as long as it could take to overtake
+        receive(node, message)
+
+    monkeypatch.setattr(PublisherNode, "receive", slow)
+    return newer
+
+
+async def test_what_waited_comes_before_what_comes_while_it_is_delivered(
+    session: RosSession, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A newer command comes in Zenoh's thread while the loop delivers the one that waited: it does not overtake."""
+    async with not_seen_yet(session, peer) as (nodes, seen, received):
+        nodes.deliver(drive(1.0, OPERATOR))
+        newer = overtaking(nodes, monkeypatch)
+        seen.add(Registrant(2, OPERATOR))
+        nodes.arrived(Registrant(2, OPERATOR))
+        await asyncio.to_thread(newer.join)
+        assert [(await get(received)).linear.x for _ in range(2)] == [1.0, 2.0]
+
+
+async def test_what_waited_comes_before_what_is_judged_first(session: RosSession, peer: Peer) -> None:
+    """A newer command comes when its sender has been seen, and before the loop has heard of that."""
+    async with not_seen_yet(session, peer) as (nodes, seen, received):
+        for x in (1.0, 2.0):
+            nodes.deliver(drive(x, OPERATOR))
+        seen.add(Registrant(2, OPERATOR))
+        nodes.rights.changed()
+        await asyncio.to_thread(nodes.deliver, drive(3.0, OPERATOR))
+        nodes.arrived(Registrant(2, OPERATOR))
+        assert [(await get(received)).linear.x for _ in range(3)] == [1.0, 2.0, 3.0]
+
+
+async def test_what_waited_for_its_registration_comes_first(
+    session: RosSession, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same where the node was there for others, under a name that can mean two topics, and is registered now."""
+    async with robot_nodes(session) as nodes:
+        received = await heard(nodes, peer, "/cmd_vel")
+        await nodes.add(publishing("/cmd_vel", 1))
+        monkeypatch.setattr(nodes._places, "sole", lambda key: None)
+        nodes.deliver(drive(1.0, OPERATOR))
+        newer = overtaking(nodes, monkeypatch)
+        await nodes.add(publishing("/cmd_vel"))
+        await asyncio.to_thread(newer.join)
+        assert [(await get(received)).linear.x for _ in range(2)] == [1.0, 2.0]
+
+
+async def test_what_waits_of_a_stranger_does_not_pass_with_anothers_registration(
+    session: RosSession, peer: Peer
+) -> None:
+    """A command of somebody who was not seen waits for a node; when one who may opens it, the stranger's stays."""
+    async with not_seen_yet(session, peer) as (nodes, _seen, _received):
+        other = await heard(nodes, peer, "/other")
+        nodes.deliver(drive(6.0, STRANGER, topic="/other"))
+        nodes.deliver(drive(1.0, 1, topic="/other"))
+        await nodes.add(publishing("/other", 1))
+        assert (await get(other)).linear.x == 1.0
+        await until(lambda: nodes.drops["not_allowed"] == 1)
+        assert other.empty()
 
 
 async def test_a_group_that_one_only_says_gives_no_right(router: str, domain: int) -> None:
