@@ -20,13 +20,13 @@ from typing import Any
 
 from macs_zenoh.mesh.cpu_latency import Awake
 
-from . import awareness, cases, robot_speed, scale
+from . import awareness, cases, differing, robot_speed, scale
 from .figures import Figure, table
 from .plan import Plan
 from .processes import ProgramFailed, Stage
 
 WITH_ROS = {**robot_speed.CASES, **awareness.CASES}
-WITHOUT_ROS = {**cases.CASES, **scale.CASES}
+WITHOUT_ROS = {**cases.CASES, **differing.CASES, **scale.CASES}
 CASES = {**WITHOUT_ROS, **WITH_ROS}
 
 

@@ -81,7 +81,7 @@ def stream(plan: Plan, pair: Pair, size: int) -> Run:
         began = pair.sender.ask("send", size=size, count=count, **pair.to)["began"]
         there = pair.receiver.answer()
         got = sum(received // length for received in there["bytes"])
-        whole = plan.arrived(f"{pair.path}, {_size(size)}", count * everybody, got)
+        whole = plan.arrived(f"{pair.path}, {size_text(size)}", count * everybody, got)
         return float(got / (there["ended"] - began)) if whole else 0.0
 
     return run
@@ -114,7 +114,7 @@ class RawZenoh(NamedTuple):
             self.subscriber.ask("expect", count=count)
             began = self.publisher.ask("publish", key=self.key, size=size, count=count)["began"]
             there = self.subscriber.ask("receive", timeout_s=QUIET_S)
-            whole = plan.arrived(f"raw Zenoh, {_size(size)}", count, there["received"])
+            whole = plan.arrived(f"raw Zenoh, {size_text(size)}", count, there["received"])
             return float(count / (there["ended"] - began)) if whole else 0.0
 
         return run
@@ -134,7 +134,7 @@ def ends(stage: Stage, plan: Plan) -> Iterator[Figure]:
     relayed = connect(stage, "relay", port, port)
     for size in (64, KIB, 64 * KIB, MIB):
         values = in_turn(plan.rounds, {"direct": stream(plan, direct, size), "relay": stream(plan, relayed, size)})
-        yield _rate(f"ends joined, {_size(size)}", size, values["direct"], values["relay"], "plain relay")
+        yield rate(f"ends joined, {size_text(size)}", size, values["direct"], values["relay"], "plain relay")
 
 
 def through(stage: Stage, plan: Plan) -> Iterator[Figure]:
@@ -155,10 +155,10 @@ def through(stage: Stage, plan: Plan) -> Iterator[Figure]:
         }
         values = in_turn(plan.rounds, runs)
         for path in pairs:
-            name = f"1 to 1, {path}, {_size(size)}"
-            yield _rate(name, size, values[path], values["default"], "raw Zenoh", at_least=0.6)
-            yield _rate(name, size, values[path], values["direct"], "raw Zenoh, direct callback")
-            yield _rate(name, size, values[path], values["frame"], f"raw Zenoh, {frame} B")
+            name = f"1 to 1, {path}, {size_text(size)}"
+            yield rate(name, size, values[path], values["default"], "raw Zenoh", at_least=0.6)
+            yield rate(name, size, values[path], values["direct"], "raw Zenoh, direct callback")
+            yield rate(name, size, values[path], values["frame"], f"raw Zenoh, {frame} B")
 
 
 def latency(stage: Stage, plan: Plan) -> Iterator[Figure]:
@@ -177,7 +177,7 @@ def latency(stage: Stage, plan: Plan) -> Iterator[Figure]:
     values = in_turn(plan.rounds, {"zenoh": zenoh, "tcp": tcp, **runs})
     both = [a + b for a, b in zip(values["zenoh"], values["tcp"], strict=True)]
     for path in runs:
-        yield Figure(f"{path}, {_size(size)}", values[path], both, "raw Zenoh + raw TCP", "us", at_most=1.5)
+        yield Figure(f"{path}, {size_text(size)}", values[path], both, "raw Zenoh + raw TCP", "us", at_most=1.5)
     yield Figure("round trip, raw Zenoh", values["zenoh"], values["tcp"], "raw TCP", "us")
 
 
@@ -267,8 +267,13 @@ def _against_relay(stage: Stage, plan: Plan, sizes: Iterable[int], receivers: in
             baseline = values.pop(pairs[0].path)
             for path, rates in values.items():
                 bound = 0.7 if path.startswith("one") else None
-                yield _rate(
-                    f"1 to {receivers}, {path}, {_size(size)}", size, rates, baseline, "plain relay", at_least=bound
+                yield rate(
+                    f"1 to {receivers}, {path}, {size_text(size)}",
+                    size,
+                    rates,
+                    baseline,
+                    "plain relay",
+                    at_least=bound,
                 )
         for pair in pairs:
             pair.sender.stop()
@@ -332,7 +337,7 @@ CASES: dict[str, Case] = {
 """What needs no ROS, by its name on the command line."""
 
 
-def _rate(
+def rate(
     name: str, size: int, subject: list[float], baseline: list[float], against: str, *, at_least: float | None = None
 ) -> Figure:
     """Rates as people read them: messages for small sizes, MB of data for large ones."""
@@ -342,7 +347,7 @@ def _rate(
     return Figure(name, [v * mb for v in subject], [v * mb for v in baseline], against, "MB/s", at_least=at_least)
 
 
-def _size(size: int) -> str:
+def size_text(size: int) -> str:
     if size < KIB:
         return f"{size} B"
     return f"{size // KIB} KiB" if size < MIB else f"{size // MIB} MiB"

@@ -1,7 +1,8 @@
 """A worker that is one or more headsets on blocking sockets: sends, receives, echoes, registers.
 
 ``python -m benchmarks.headset PORT COUNT GROUP`` connects COUNT headsets to a gateway, or to the plain relay, on
-127.0.0.1. ``python -m benchmarks.headset sink`` is the far end for one such worker in place of a gateway.
+127.0.0.1; with ``robot`` behind it they are existing robot programs. ``python -m benchmarks.headset sink`` is the far
+end for one such worker in place of a gateway.
 """
 
 from __future__ import annotations
@@ -12,19 +13,32 @@ import socket
 import struct
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
 from bridge.headset import frames
-from macs_zenoh.protocol.messages import Metadata, NodeType, Welcome, encode_data
-from macs_zenoh.protocol.wire import MACS, FrameDecoder, MessageDecoder, encode_message, split_message
+from macs_zenoh.protocol.messages import (
+    ROS,
+    Configuration,
+    Functionality,
+    Metadata,
+    NodeType,
+    Welcome,
+    encode_data,
+    encode_management,
+)
+from macs_zenoh.protocol.wire import MACS, FrameDecoder, MessageDecoder, encode_frame, encode_message, split_message
 
+from . import sequence
 from .worker import serve
 
 RECEIVE_BYTES = 1 << 20
 SEND_BYTES = 32 << 10
 """Small frames are repeated until they fill this: a system call per frame would measure the sender."""
 BEAT_S = 4.0
+KEPT_BYTES = 64 << 20
+"""Up to so much of what differs is counted only when all has come."""
 PATIENCE_S = 5.0
 """How long an answer or a checked message may take."""
 
@@ -43,8 +57,8 @@ class Headset:
         self._next_beat = time.monotonic() + BEAT_S
 
     @classmethod
-    def join(cls, port: int, group: int) -> Headset:
-        """Connect and configure: a gateway counts this headset from now on."""
+    def join(cls, port: int, group: int, *, robot: bool = False) -> Headset:
+        """Connect and configure: a gateway counts this headset, or robot program, from now on."""
         sock = socket.create_connection(("127.0.0.1", port))
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         decoder = MessageDecoder()
@@ -52,7 +66,9 @@ class Headset:
             pass
         metadata, data = split_message(messages[0])
         agent_id = int(json.loads(bytes(data))["agentId"])
-        sock.sendall(frames.configuration(agent_id, group, json.loads(metadata)["requestId"]))
+        number = json.loads(metadata)["requestId"]
+        told = encode_management(Configuration(ROS, agent_id, group, number, Functionality()))
+        sock.sendall(encode_frame(management=told) if robot else frames.configuration(agent_id, group, number))
         return cls(sock, agent_id)
 
     def beat(self) -> None:
@@ -98,6 +114,7 @@ class Headsets:
         self.headsets = headsets
         self.first = headsets[0]
         self.buffer = bytearray(RECEIVE_BYTES)
+        self._load: sequence.Load
 
     def beat(self) -> None:
         """Heartbeats, where due."""
@@ -122,11 +139,35 @@ class Headsets:
         """How long a message is on the wire that carries so much data."""
         return {"message_bytes": len(self._frame(size, [], [])) - MACS.header_bytes}
 
-    def register(self, robots: int = 1) -> dict[str, Any]:
-        """Every headset registers on the topic of robot 1, or of the first so many."""
+    def register(self, robots: int = 1, ids: Sequence[int] = ()) -> dict[str, Any]:
+        """Every headset registers on the topic of robot 1, of the first so many, or of those with these ids."""
         for headset in self.headsets:
-            headset.socket.sendall(frames.registration(headset.id, TOPIC, list(range(1, robots + 1)), []))
+            on = list(ids or range(1, robots + 1))
+            headset.socket.sendall(frames.registration(headset.id, TOPIC, on, []))
         return {"registered": len(self.headsets)}
+
+    def prepare(self, size: int, count: int, ways: list[dict[str, list[int]]]) -> dict[str, Any]:
+        """Make ``count`` messages that differ in number, request id and length, to these destinations in turn; returns
+        how many bytes each destination is to receive."""
+        totals = [0] * len(ways)
+        for number, frame in enumerate(sequence.messages(self.first.id, size, count, ways)):
+            totals[number % len(ways)] += len(frame) - MACS.header_bytes
+        self._load = sequence.Load(sequence.messages(self.first.id, size, count, ways), size)
+        return {"bytes": totals}
+
+    def prepare_topic(self, size: int, count: int, to: list[int]) -> dict[str, Any]:
+        """The same for topic data of a robot program."""
+        made = list(sequence.topic(self.first.id, size, count, to, TOPIC))
+        whole = sum(map(len, made)) - sum(FrameDecoder().feed(made[0])[0].message_at for _ in made)
+        self._load = sequence.Load(iter(made), size)
+        return {"bytes": whole}
+
+    def send_prepared(self) -> dict[str, Any]:
+        """Send what was prepared; returns when it began."""
+        began = time.monotonic()
+        with suppress(ConnectionError):  # the receiver sees what is missing
+            self._load.send(self.first.socket)
+        return {"began": began}
 
     # -- receiving -----------------------------------------------------------------------------------------------
 
@@ -175,6 +216,35 @@ class Headsets:
                         missing -= 1
                 self.beat()
         return received
+
+    def receive_sequence(self, totals: list[int], timeout_s: float) -> dict[str, Any]:
+        """Receive what was prepared until each connection has its bytes, or nothing comes for ``timeout_s``: how many
+        messages each received, and how many of them out of order."""
+        tallies = [sequence.Tally() for _ in self.headsets]
+        by_descriptor = {headset.socket.fileno(): i for i, headset in enumerate(self.headsets)}
+        kept: list[tuple[sequence.Tally, bytes]] = []
+        left = list(totals)
+        at_once = sum(totals) > KEPT_BYTES  # otherwise in the end: it would slow down the receiver
+        view = memoryview(self.buffer)
+        with select.epoll() as ready:
+            for descriptor in by_descriptor:
+                ready.register(descriptor, select.EPOLLIN)
+            missing = len(left)
+            while missing and (events := ready.poll(timeout_s)):
+                for descriptor, _ in events:
+                    i = by_descriptor[descriptor]
+                    got = self.headsets[i].take(self.buffer)
+                    if at_once:
+                        tallies[i].feed(view[:got])
+                    else:
+                        kept.append((tallies[i], bytes(view[:got])))
+                    left[i] -= got
+                    if not got or left[i] <= 0:
+                        ready.unregister(descriptor)
+                        missing -= 1
+                self.beat()
+        ended = time.monotonic()
+        return {"ended": ended, **sequence.count(tallies, kept)}
 
     # -- both ----------------------------------------------------------------------------------------------------
 
@@ -251,8 +321,10 @@ def main() -> None:
         serve({"port": sink.port}, {"accept": sink.accept, "receive": sink.receive})
         return
     port, count, group = map(int, sys.argv[1:4])
-    workers = Headsets([Headset.join(port, group) for _ in range(count)])
-    names = ("send", "message_bytes", "register", "check", "receive", "ping", "echo")
+    robot = sys.argv[4:] == ["robot"]
+    workers = Headsets([Headset.join(port, group, robot=robot) for _ in range(count)])
+    names: tuple[str, ...] = ("send", "message_bytes", "register", "check", "receive", "ping", "echo")
+    names = (*names, "prepare", "prepare_topic", "send_prepared", "receive_sequence")
     works = {name: getattr(workers, name) for name in names}
     serve({"ids": [headset.id for headset in workers.headsets]}, works, workers.beat)
 
