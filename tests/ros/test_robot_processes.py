@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import asyncio
+import contextlib
 import json
 import signal
 import time
@@ -209,6 +210,47 @@ async def test_a_robot_that_restarts_streams_on(site: Site, peer: Peer, domain: 
     ):
         pass
     task.cancel()
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+async def test_who_holds_a_service_keeps_it_when_the_robot_restarts(
+    site: Site, peer: Peer, how: signal.Signals
+) -> None:
+    """A headset behind another gateway that was refused does not get the service by being quicker: whoever holds it
+    has it after each restart, and the other one when the holder has left."""
+
+    def served_by(name: str) -> Any:
+        async def handler(request: Any) -> bytes:
+            return bytes(serialize_message(SetBool.Response(success=True, message=name)))
+
+        return handler
+
+    client = await peer.session.run(lambda: peer.session.node.create_client(SetBool, "/ask"))
+
+    async def who_answers() -> str:
+        while True:
+            await until(client.service_is_ready, 20)
+            call = await peer.session.run(lambda: client.call_async(SetBool.Request(data=True)))
+            with contextlib.suppress(AssertionError):  # it went to a server that is no more
+                await until(call.done, 5)
+                return str(call.result().message)
+
+    async with AsyncExitStack() as stack:
+        far = await stack.enter_async_context(Program("gateway", "--port", "0", *site.robot.argv[-2:]))
+        second = await stack.enter_async_context(await Headset.connect("127.0.0.1", far.port, reconnect=True))
+        while (await second.online()).ros_agent_ids != [1]:
+            await asyncio.sleep(0.02)
+        async with await Headset.connect("127.0.0.1", site.gateway.port) as first:
+            await first.serve("/ask", SET, served_by("first"), agents=[1])
+            assert await who_answers() == "first"
+            refused = await second.serve("/ask", SET, served_by("second"), agents=[1])
+            await until(lambda: "registered by another agent" in str(refused.refusing()))
+            for _ in range(3):
+                await site.robot.stop(how)
+                await site.robot.start()
+                assert await who_answers() == "first"
+        while await who_answers() != "second":
+            await asyncio.sleep(0.1)
 
 
 async def test_what_a_robot_offers_and_its_state_are_asked_by_a_headset(site: Site, peer: Peer) -> None:
