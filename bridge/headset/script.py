@@ -243,6 +243,9 @@ class Session:
         """Say what came of `pub`. What some robots refused was sent; whether all of it was lost there is not known."""
         if not refusals:
             self._emit({"topic": args.topic, "published": sent})
+            if args.groups:  # a headset is not told who is in which group
+                named = ", ".join(map(str, args.groups))
+                log.warning("sent to all robots of group %s, if there are any: macs ls shows the groups", named)
             return 0
         refused = [{"robot": robot, "reason": reason} for robot, reason in sorted(refusals.items())]
         self._emit({"topic": args.topic, "sent": sent, "refused": refused})

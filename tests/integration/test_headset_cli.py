@@ -435,6 +435,9 @@ async def test_a_group_without_robots_is_told(start: Start, robot: EchoRobot) ->
     sub = await start("sub", "/chatter", STRING, "--groups", "9", "--timeout", "6")
     code, _, log = await sub.end()
     assert (code, "nothing from group 9 yet" in log) == (1, True), log
+    pub = await start("pub", "/chatter", STRING, '{"data": "x"}', "--groups", "9", "--settle", "0")
+    code, _, log = await pub.end()
+    assert (code, "sent to all robots of group 9, if there are any" in log) == (0, True), log
 
 
 async def test_who_hears_something_is_told_nothing(start: Start, robot: EchoRobot) -> None:
