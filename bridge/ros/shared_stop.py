@@ -6,14 +6,20 @@ number that grows with each change; the highest is adopted, so nothing goes roun
 once the stop wins (`safety.EmergencyStop.adopt`).
 
 On the stop's own topic any ROS node can stop the robot, as a button does: true. Its false releases nothing, that is a
-right of agents on the mesh. What agents themselves publish there is not taken for a button: only where the topic has
-more publishers than there are agents on the graph.
+right of agents on the mesh. The node need not stay: one that publishes and ends has stopped the robot.
+
+What agents publish there themselves is no button's. An agent knows its own messages by the time at which they were
+published. Of other agents on the graph it only knows that they are there: as long as the topic has more publishers
+than the graph has agents, a true can be a button's; if not, it is one when no agent has said why within a moment.
 """
 
 from __future__ import annotations
 
 import logging
+import math
+import time
 import uuid
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -33,6 +39,10 @@ STATE_BYTES = 16 << 10
 KNOWN = 64
 """Agents of one graph that are remembered."""
 A_NODE = "a ROS node"
+EXPLAINED_S = 0.1
+"""How long before or after a message on the topic of the stop another agent may say that it was its own."""
+UNREAD = 256
+"""More messages of our own do not wait to be read."""
 
 
 class StopState(Struct, frozen=True):
@@ -68,6 +78,10 @@ class SharedStop:
         self._on_press = on_press
         self._session = uuid.uuid4().hex
         self._agents: dict[str, int] = {}
+        self._own: deque[list[float]] = deque(maxlen=UNREAD)
+        """From when to when each of our own messages was published, in ns since the epoch."""
+        self._stopped_at = -math.inf
+        """When another agent said last that the robot is stopped."""
         self._text: Any = None
         self._publisher: Any = None
         self._subscriptions: list[Any] = []
@@ -91,6 +105,13 @@ class SharedStop:
             self._robot.session.intake.unsubscribe(subscription)
         if publisher is not None:
             self._robot.session.node.destroy_publisher(publisher)
+
+    def publish(self, publisher: Any, state: bytes) -> None:
+        """Publish on the topic of the stop; our subscription to it knows that this is our own. From any thread."""
+        published: list[float] = [time.time_ns(), math.inf]
+        self._own.append(published)
+        publisher.publish(state)
+        published[1] = time.time_ns()
 
     def tell(self) -> None:
         """Tell the state as it is now. From any thread."""
@@ -124,6 +145,8 @@ class SharedStop:
         if state.session == self._session:
             return
         self._meet(state)
+        if state.pressed:
+            self._stopped_at = time.monotonic()
         self._on_state(state)
 
     def _meet(self, state: StopState) -> None:
@@ -139,13 +162,26 @@ class SharedStop:
                 state.robot,
             )
 
-    def _pressed(self, cdr: bytes, _info: Mapping[str, Any]) -> None:
-        if bytes(cdr[4:5]) == b"\x01" and not self._robot.stop.stopped and self._has_buttons():
+    def _pressed(self, cdr: bytes, info: Mapping[str, Any]) -> None:
+        if bytes(cdr[4:5]) != b"\x01" or self._is_own(info["source_timestamp"]):
+            return
+        count = self._robot.session.node.count_publishers
+        agents = count(self._topic + AGENTS)
+        if agents <= 1:
+            self._on_press()
+        elif not self._robot.stop.stopped:
+            if count(self._topic) > agents:
+                self._on_press()
+            else:  # of a node that has ended, or of another agent
+                self._robot.alarms.at(time.monotonic() + EXPLAINED_S, self._pressed_by_nobody)
+
+    def _pressed_by_nobody(self) -> None:
+        explained = time.monotonic() - self._stopped_at <= 2 * EXPLAINED_S
+        if not explained and not self._robot.stop.stopped:
             self._on_press()
 
-    def _has_buttons(self) -> bool:
-        count = self._robot.session.node.count_publishers
-        return bool(count(self._topic) > count(self._topic + AGENTS))
+    def _is_own(self, published_ns: int) -> bool:
+        return any(begun <= published_ns <= done for begun, done in list(self._own))
 
 
 def _latched(depth: int) -> QoSProfile:

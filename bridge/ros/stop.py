@@ -182,7 +182,7 @@ class StopNode(InterfaceNode):
         log.warning("emergency stop released by %s", self.robot.stop.by)
 
     def _tell(self) -> None:
-        if self._publisher is not None:
-            self._publisher.publish(STATES[self.robot.stop.stopped])
-        if self._shared is not None:
-            self._shared.tell()
+        publisher, shared = self._publisher, self._shared
+        if publisher is not None and shared is not None:
+            shared.publish(publisher, STATES[self.robot.stop.stopped])
+            shared.tell()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from driven import STOPPED, driving, hear, may_command, site
+from driven import STOPPED, driving, hear, may_command, send_bool, site
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -18,6 +18,8 @@ from ros_peer import Peer, until
 from std_msgs.msg import Bool
 
 from bridge.ros.safety import EmergencyStop
+from bridge.ros.shared_stop import A_NODE
+from macs_zenoh import join
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Refused
 
@@ -146,3 +148,57 @@ async def test_a_ros_node_stops_the_robot(domain: int, peer: Peer, tmp_path: Pat
         async with place.robot():
             await until(lambda: (1, 1) in driver.directory)
             await stopped(driver, 1)
+
+
+async def test_a_stop_holds_when_its_node_ends_at_once(domain: int, peer: Peer, tmp_path: Path) -> None:
+    """True on the topic, and the publisher is gone: ten of ten stops hold, however soon the robot looks who it was."""
+    async with site(domain, tmp_path) as place, join("operator", id=5, settings=place.mesh) as operator, place.robot():
+        await until(lambda: (1, 1) in operator.directory, 20)
+        for _ in range(10):
+            button = await peer.publisher(Bool, "/emergency_stop", LATCHED, matched=1)
+            await peer.session.run(lambda button=button: press_and_go(peer, button))
+            await stopped(operator, 1)
+            assert (await told(operator, 1))["stop"]["pressed"] == [A_NODE]
+            await operator.call("ros", 1, "stop", b"false")
+            assert not (await told(operator, 1))["stopped"]
+
+
+def press_and_go(peer: Peer, button: Any) -> None:
+    button.publish(Bool(data=True))
+    peer.session.node.destroy_publisher(button)
+
+
+async def test_the_stop_of_a_node_holds_beside_that_of_a_headset(domain: int, peer: Peer, tmp_path: Path) -> None:
+    """A button pressed while the robot is stopped counts: the headset that stopped before cannot take that back. What
+    the agent says itself on the topic presses no button."""
+    button = await peer.publisher(Bool, "/emergency_stop", LATCHED)
+    async with site(domain, tmp_path) as place, place.robot(), place.headset() as headset:
+        await until(lambda: (1, 1) in headset.directory, 20)
+        for _ in range(5):
+            await headset.call("ros", 1, "stop", b"true")
+            assert (await told(headset, 1))["stop"]["pressed"] == ["unity/300"]
+            await headset.call("ros", 1, "stop", b"false")
+        await headset.call("ros", 1, "stop", b"true")
+        await until(lambda: button.get_subscription_count() >= 1)
+        await peer.session.run(lambda: button.publish(Bool(data=True)))
+        deadline = time.monotonic() + 10
+        while (await told(headset, 1))["stop"]["pressed"] != ["unity/300", A_NODE]:
+            assert time.monotonic() < deadline
+        with pytest.raises(Refused, match="a ROS node stopped it as well"):
+            await headset.call("ros", 1, "stop", b"false")
+
+
+async def test_the_stop_of_a_headset_holds_when_it_leaves_at_once(domain: int, tmp_path: Path) -> None:
+    """True on the topic, and the session ends: five of five stops hold, and nobody with its id takes them back."""
+    async with site(domain, tmp_path) as place, join("operator", id=5, settings=place.mesh) as operator, place.robot():
+        for _ in range(5):
+            async with place.headset() as headset:
+                await until(lambda headset=headset: (1, 1) in headset.directory, 20)
+                send_bool(headset, 1, True)
+            await stopped(operator, 1)
+            await until(lambda: (2, 300) not in operator.directory)
+            async with place.headset() as another:
+                await until(lambda another=another: (1, 1) in another.directory, 20)
+                with pytest.raises(Refused, match="may not release"):
+                    await another.call("ros", 1, "stop", b"false")
+            await operator.call("ros", 1, "stop", b"false")
