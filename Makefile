@@ -1,5 +1,6 @@
 # make run    a headset, a mesh and a robot on this machine, without hardware
-# make test   every test;  make lint   ruff and mypy;  make bench   the speed ratios;  make clean
+# make test   the tests;  make test-all   and those that take minutes, as CI;  make lint   ruff and mypy
+# make bench  the speed ratios;  make clean
 # make attacks    every attack on a running site, as a table;  make chaos   an hour of kills, floods and cuts
 # make docs   the pages as a site, in build/docs;  make docs-links   and whether the links out of it still lead somewhere
 # make zenohd the router that the tests of networks and deployments run against, built by cargo (minutes, once)
@@ -28,7 +29,7 @@ VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)
 INTERFACES := $(if $(findstring ros,$(EXTRAS)),$(VENV)/.interfaces)
 
 .DEFAULT_GOAL := help
-.PHONY: help run install test lint format bench attacks chaos docs docs-links zenohd clean
+.PHONY: help run install test test-all lint format bench attacks chaos docs docs-links zenohd clean
 
 help:
 	@sed -n '/^$$/q; s/^# \{0,1\}//p' Makefile
@@ -60,6 +61,9 @@ $(VENV)/.interfaces: $(STAMP) $(wildcard interfaces/*/package.xml interfaces/*/m
 # A whole run that ran no ROS test proves too little, so it fails (tests/conftest.py); a chosen part may.
 test: install
 	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),MACS_NEED_ROS_TESTS=1 $(BIN)/python -m tests.run)
+
+test-all: install
+	@MACS_NEED_ROS_TESTS=1 $(BIN)/python -m tests.run --all
 
 lint: install
 	@$(BIN)/ruff check .

@@ -28,6 +28,17 @@ ALONE = (
 )
 """What measures how long something takes, or needs the machine for itself: marked ``alone``."""
 
+SOAK = (
+    "tests/attack/",
+    "tests/network/",
+    "tests/integration/test_deploy_doc.py",
+    "tests/integration/test_limits.py::test_a_thousand_headsets",
+    "tests/integration/test_wheel.py::test_a_shipped_interface_package_builds",
+    "tests/ros/test_awareness_robots.py",
+    "tests/ros/test_interfaces.py",
+)
+"""What takes minutes, and seldom finds what others do not: marked ``soak``, run by ``make test-all`` and CI."""
+
 # Timings never decide a test: a busy machine is no counterexample.
 settings.register_profile("macs", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("macs")
@@ -72,3 +83,5 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.nodeid.startswith(ALONE):
             item.add_marker(pytest.mark.alone)
+        if item.nodeid.startswith(SOAK):
+            item.add_marker(pytest.mark.soak)

@@ -1,6 +1,7 @@
-"""Every test: those that may share the machine at the same time, then one by one those that measure time.
+"""The tests: those that may share the machine at the same time, then one by one those that measure time.
 
-``python -m tests.run`` is what ``make test`` runs. A part of the tests is plain pytest: ``make test ARGS=tests/unit``.
+``python -m tests.run`` is what ``make test`` runs; with ``--all`` those that take minutes too (``make test-all``, CI).
+A part of the tests is plain pytest: ``make test ARGS=tests/unit``.
 """
 
 from __future__ import annotations
@@ -31,11 +32,12 @@ def part(name: str, *argv: str) -> tuple[bool, int, int]:
 
 
 def main() -> int:
-    together = part("together", "-n", str(WORKERS), "--dist", "loadfile", "-m", f"{TIERS} and not alone")
+    tiers = TIERS if "--all" in sys.argv[1:] else f"{TIERS} and not soak"
+    parts = [part("together", "-n", str(WORKERS), "--dist", "loadfile", "-m", f"{tiers} and not alone")]
     os.environ.pop("MACS_NEED_ROS_TESTS", None)  # judged by the first part
-    alone = part("alone", "-m", f"{TIERS} and alone")
-    print(f"{together[1] + alone[1]} passed, {together[2] + alone[2]} failed")
-    return 0 if together[0] and alone[0] else 1
+    parts.append(part("alone", "-m", f"{tiers} and alone"))
+    print(f"{sum(passed for _, passed, _ in parts)} passed, {sum(failed for *_, failed in parts)} failed")
+    return 0 if all(good for good, *_ in parts) else 1
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ pytest.importorskip("rclpy", reason="the robot that runs in it needs ROS")
 
 from tests.attack.chaos import run
 
-MINUTES = float(os.environ.get("MACS_CHAOS_MINUTES", "3"))
+MINUTES = float(os.environ.get("MACS_CHAOS_MINUTES", "5"))
 SEED = int(os.environ.get("MACS_CHAOS_SEED", "12"))
 
 
