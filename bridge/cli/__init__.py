@@ -16,6 +16,7 @@ from typing import Any
 from bridge.cli import (
     agent,
     awareness,
+    completion,
     doctor,
     gateway,
     headset,
@@ -49,6 +50,7 @@ VERBS = {
     "init": init,
     "keys": keys,
     "interfaces": interfaces,
+    "completion": completion,
 }
 
 DESCRIPTION = """\
@@ -64,7 +66,10 @@ examples:
   macs agent --id 7 -e tcp/192.168.1.10:7447         this machine's ROS 2 graph is robot 7
   macs ls -e tcp/192.168.1.10:7447                   who is online there
 
-`macs VERB --help` explains one verb."""
+`macs VERB --help` explains one verb, and shows what it prints.
+MACS_CONNECT names the router for verbs that were told of none with -e or in settings.
+Exit codes: 0 done; 1 not found, unreachable, unhealthy, not done; 2 wrong usage or
+configuration; 130 stopped before it was done."""
 
 
 NEVER_MEANT = frozenset({"stop"})
@@ -130,6 +135,7 @@ def build_parser() -> Parser:
 
 def program() -> int:
     """The process ``macs``: `main`, with streams that can be used whatever they are."""
+    completion.answer_shell(build_parser)
     output.prepare()
     return main()
 

@@ -7,7 +7,10 @@ or from pip install 'macs-zenoh[ros]'.
 examples:
   macs agent --id 7 --group 3 -e tcp/192.168.1.10:7447
   macs agent --id 7 --ros-args -r __ns:=/robot7
-  ROS_DOMAIN_ID=5 macs agent --id 7"""
+  ROS_DOMAIN_ID=5 macs agent --id 7
+
+what it prints:
+  ready: robot 7"""
 
 from __future__ import annotations
 

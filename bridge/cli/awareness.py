@@ -8,7 +8,10 @@ examples:
   macs awareness --name drone0 -e tcp/192.168.1.10:7447
   macs awareness --name drone0 --beside 7                    where `macs agent --id 7` runs already
   macs awareness --transport topic --ros-args -p agent_id:=drone0
-  macs awareness --name drone0 --no-autostart                then: ros2 lifecycle set /ca_gateway_node configure"""
+  macs awareness --name drone0 --no-autostart                then: ros2 lifecycle set /ca_gateway_node configure
+
+what it prints:
+  ready: awareness of drone0 in /ca_gateway_node, active"""
 
 from __future__ import annotations
 

@@ -7,7 +7,10 @@ examples:
   macs gateway --host 0.0.0.0                              headsets from the network
   macs gateway --workers 4                                 four processes behind one port
   macs gateway --robots 1,2                                existing robot programs too, as robots 1 and 2
-  macs gateway --port 7001 -e tcp/10.0.0.1:7447 -e tcp/10.0.0.2:7447   two routers, for fail-over"""
+  macs gateway --port 7001 -e tcp/10.0.0.1:7447 -e tcp/10.0.0.2:7447   two routers, for fail-over
+
+what it prints:
+  ready: gateway on 127.0.0.1:7000"""
 
 from __future__ import annotations
 

@@ -12,7 +12,11 @@ examples:
   macs headset 127.0.0.1:7000 --group 3 listen
   macs headset 127.0.0.1:7000 run script.txt
 
-`macs headset HOST:PORT VERB --help` explains one verb."""
+`macs headset HOST:PORT VERB --help` explains one verb.
+
+what it prints:
+  {"id": 2, "ros": [1], "unity": [2]}                                     of online
+  {"topic": "/chatter", "from": 1, "message": {"data": "hello"}}          of sub; each verb's help has its own"""
 
 from __future__ import annotations
 

@@ -6,7 +6,13 @@ examples:
   macs init robot --id 7 -e tcp/192.168.1.10:7447      robot.toml, macs-robot.service, robot.launch.py
   macs init gateway --into /etc/macs                   gateway.toml, macs-gateway.service
   macs init router                                     router.json5, macs-router.service, macs-zenohd.service
-  macs init site --into hall-1                         two routers, a gateway, a robot, and a plan for certificates"""
+  macs init site --into hall-1                         two routers, a gateway, a robot, and a plan for certificates
+
+what it prints:
+  ./robot.toml
+  ./macs-robot.service
+  ./robot.launch.py
+  ./macs.toml"""
 
 from __future__ import annotations
 

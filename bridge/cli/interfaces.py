@@ -7,7 +7,11 @@ With a ROS installation, build the same folder with colcon instead.
 examples:
   macs interfaces build as2_ca_msgs --install                 one that comes with macs, by its name
   macs interfaces build my_msgs --into dist && pip install --no-deps dist/my_msgs-*.whl
-  macs interfaces build my_msgs --json | jq .hashes"""
+  macs interfaces build my_msgs --json | jq .hashes
+
+what it prints:
+  as2_ca_msgs/msg/InterAgentMessage  RIHS01_7d534e45…
+  dist/as2_ca_msgs-0.1.0-cp312-cp312-linux_x86_64.whl"""
 
 from __future__ import annotations
 
@@ -17,14 +21,19 @@ import subprocess
 import sys
 from pathlib import Path
 
-from bridge.cli import output
+from bridge.cli import output, terminal
+from bridge.cli.terminal import Columns
 from macs_zenoh.errors import Unreachable
 
 SUMMARY = "build ROS interface packages where ROS comes from pip"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("action", choices=["build"], help="what to do")
+    verbs = parser.add_subparsers(dest="what", metavar="VERB", required=True, title="verbs")
+    _add_build(verbs.add_parser("build", help="make a wheel of a package", description="Make a wheel of a package."))
+
+
+def _add_build(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", metavar="PATH", type=Path, help="the package's folder, or the name of a shipped one")
     parser.add_argument("--into", metavar="DIR", type=Path, default=Path("dist"), help="for the wheel (default: dist)")
     parser.add_argument("--install", action="store_true", help="install the wheel into this Python as well")
@@ -42,9 +51,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         output.say(json.dumps({"wheel": str(built.wheel), "hashes": built.hashes}))
         return 0
-    width = max(map(len, built.hashes))
-    lines = [f"{name:{width}}  {value}" for name, value in sorted(built.hashes.items())]
-    output.say("\n".join([*lines, str(built.wheel)]))
+    terminal.show(Columns(sorted(built.hashes.items())), str(built.wheel))
     return 0
 
 

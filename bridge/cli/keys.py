@@ -3,15 +3,19 @@
 examples:
   macs keys
   macs keys macs/to/ros/0/7/unity/9
-  macs keys --json | jq -r '.[].key'"""
+  macs keys --json | jq -r '.[].key'
+
+what it prints:
+  unicast     macs/to/{type}/{block}/{id}/{from_type}/{from_id}"""
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 
-from bridge.cli import output
-from macs_zenoh.plain import plain
+from bridge.cli import output, terminal
+from bridge.cli.terminal import HEADING, Block, Columns
 from macs_zenoh.protocol import keyexpr
 from macs_zenoh.protocol.keyexpr import Key
 
@@ -28,9 +32,9 @@ def run(args: argparse.Namespace) -> int:
         return _explain(args.key, as_json=args.json)
     rows = [_row(plane, space) for plane, space in keyexpr.KEYS.items()]
     if args.json:
-        _print(json.dumps(rows, indent=2))
+        output.say(json.dumps(rows, indent=2))
     else:
-        _print(_table(rows))
+        terminal.show(*_table(rows))
     return 0
 
 
@@ -44,21 +48,13 @@ def _row(plane: str, space: Key) -> dict[str, str]:
     }
 
 
-def _table(rows: list[dict[str, str]]) -> str:
-    """Plane and key in columns, the sentences below each: they do not fit beside it on a terminal."""
-    width = max(len(row["plane"]) for row in rows) + 2
-    blocks = (
-        "\n".join(
-            [
-                f"{row['plane']:{width}}{row['key']}",
-                f"{'':{width}}  from     {row['publisher']}",
-                f"{'':{width}}  to       {row['subscriber']}",
-                f"{'':{width}}  payload  {row['payload']}",
-            ]
-        )
-        for row in rows
-    )
-    return "\n".join(blocks)
+def _table(rows: list[dict[str, str]]) -> Iterator[Block]:
+    """Key space and key in columns, the sentences below each: they do not fit beside it on a terminal."""
+    width = max(len(row["plane"]) for row in rows)
+    for row in rows:
+        yield f"{row['plane']:{width}}  {row['key']}", HEADING
+        said = (("from", row["publisher"]), ("to", row["subscriber"]), ("payload", row["payload"]))
+        yield Columns(said, indent=width + 4)
 
 
 def _explain(key: str, *, as_json: bool) -> int:
@@ -69,12 +65,15 @@ def _explain(key: str, *, as_json: bool) -> int:
     plane, fields = known
     space = keyexpr.KEYS[plane]
     if as_json:
-        _print(json.dumps({**_row(plane, space), "fields": fields}))
+        output.say(json.dumps({**_row(plane, space), "fields": fields}))
         return 0
-    lines = [f"{plane}: {space.template}"]
-    lines += [f"  {name:10}{_shown(name, value)}" for name, value in fields.items()]
-    lines += [f"from {space.publisher}", f"to {space.subscriber}", f"payload: {space.payload}"]
-    _print("\n".join(lines))
+    terminal.show(
+        (f"{plane}: {space.template}", HEADING),
+        Columns([(name, _shown(name, value)) for name, value in fields.items()], indent=2, gap=1),
+        f"from {space.publisher}",
+        f"to {space.subscriber}",
+        f"payload: {space.payload}",
+    )
     return 0
 
 
@@ -82,8 +81,4 @@ def _shown(name: str, value: int | str) -> str:
     """A type by number as well, since that is what frames carry."""
     if name.endswith("type") and isinstance(value, int):
         return f"{keyexpr.type_name(value)} (type {value})"
-    return plain(str(value))
-
-
-def _print(text: str) -> None:
-    output.say(text)
+    return str(value)

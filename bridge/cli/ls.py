@@ -14,7 +14,15 @@ examples:
   macs ls --json | jq '.[] | select(.type == "ros").id'
   macs ls --json | jq '.[] | select(.status.stopped) | {id, by: .status.stop.by}'
   macs ls -v --json | jq '.[] | select(.type == "ros") | {id, topics: .offers.publishers}'
-  macs ls -v --json | jq '.[] | select(.type == "gateway").address'"""
+  macs ls -v --json | jq '.[] | select(.type == "gateway").address'
+
+what it prints:
+  TYPE    ID  GROUP  SESSION   NAME    STATE
+  ros      7      3  3c41ba1c  drone0  stopped by operator/5, /cmd_vel: unity/256
+  unity  256      -  9f2d07e1  -       -
+
+  gateway  9f2d07e1  10.0.0.5:7000      1 agents  macs 0.1.0, Zenoh 1.10.2
+  router   d8c1f2aa  tcp/10.0.0.1:7447            Zenoh 1.10.2"""
 
 from __future__ import annotations
 
@@ -22,14 +30,14 @@ import argparse
 import asyncio
 import json
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from bridge.cli import options, output, robots, running
+from bridge.cli import options, output, robots, running, terminal
 from bridge.cli.robots import Node, Offers, Operator, Router, Status
+from bridge.cli.terminal import BAD, HEADING, ODD, Block, Cell, Columns
 from macs_zenoh.errors import MacsError, NotServed, Refused, Unreachable
-from macs_zenoh.plain import plain
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.named import Named
@@ -41,12 +49,13 @@ VERBOSE = "all about each robot"
 SHORT = 8
 """Of a session's id so much tells it from others; --json has all of it."""
 
+FACT_WIDTH = len("emergency stop")
 ANSWER_S = 1.0
 """How long robots may take to tell their state; without -v nobody wants to wait for one that is stuck."""
 
 
 @dataclass(frozen=True)
-class Told:
+class RobotReport:
     """What a robot said of itself: as it was, for programs, and as it is read here.
 
     ``problem`` is why it said nothing, empty for one that has nothing to say, as robots behind a gateway.
@@ -73,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="how long to wait for a router, the last of several (default: 3)",
     )
-    robots.add_as_option(parser)
+    options.add_as_option(parser)
     options.add_mesh_options(parser)
 
 
@@ -98,8 +107,8 @@ def run(args: argparse.Namespace) -> int:
         if args.json:
             output.say(_json(agents, names, told, away, _infrastructure(agents, pongs, routers), args.verbose))
         else:
-            text = _text(agents, names, told, away, args.verbose) or _nobody(elsewhere)
-            output.say("\n".join([text, *_shown_infrastructure(_infrastructure(agents, pongs, routers))]))
+            blocks = _text(agents, names, told, away, args.verbose) or [_nobody(elsewhere)]
+            terminal.show(*blocks, *_shown_infrastructure(_infrastructure(agents, pongs, routers)))
         return 0
 
     return running.until_stopped(show, interrupted=running.INTERRUPTED)
@@ -107,11 +116,11 @@ def run(args: argparse.Namespace) -> int:
 
 async def _ask(
     operator: Operator, robot: AgentInfo, gateways: Collection[str], timeout_s: float, *, offers: bool
-) -> Told:
-    told = Told()
+) -> RobotReport:
+    told = RobotReport()
     try:
         raw, status = robots.read(await operator.ask(robot.id, "status", timeout_s=timeout_s), Status)
-        told = Told(status=status, raw_status=raw)
+        told = RobotReport(status=status, raw_status=raw)
         if offers:
             raw, offered = robots.read(await operator.ask(robot.id, "offers", timeout_s=timeout_s), Offers)
             told = replace(told, offers=offered, raw_offers=raw)
@@ -166,7 +175,7 @@ def _infrastructure(
 def _json(
     agents: list[AgentInfo],
     names: list[Named],
-    told: dict[int, Told],
+    told: dict[int, RobotReport],
     away: Away,
     infrastructure: list[dict[str, Any]],
     verbose: bool,
@@ -183,77 +192,82 @@ def _json(
 # -- for people ------------------------------------------------------------------------------------------------------
 
 
-def _text(agents: list[AgentInfo], names: list[Named], told: dict[int, Told], away: Away, verbose: bool) -> str:
+def _text(
+    agents: list[AgentInfo], names: list[Named], told: dict[int, RobotReport], away: Away, verbose: bool
+) -> list[Block]:
     rows = _rows(agents, names, away)
     if not rows:
-        return ""
-    states = [_state(told.get(row["id"])) if row["type"] == "ros" else "" for row in rows]
-    states = ["away" if row.get("away") else state for row, state in zip(rows, states, strict=True)]
+        return []
+    states: list[Cell] = [_state(told.get(row["id"])) if row["type"] == "ros" else "" for row in rows]
+    states = [("away", ODD) if row.get("away") else state for row, state in zip(rows, states, strict=True)]
+    headings = ["TYPE", "ID", "GROUP", "SESSION", "NAME"]
+    lines: list[list[Cell]] = [
+        [row["type"], str(row["id"] or "-"), str(row["group"] or "-"), row["zid"][:SHORT], row["name"] or "-"]
+        for row in rows
+    ]
     if any(states):
-        states = [state or "-" for state in states]
-    lines = [("TYPE", "ID", "GROUP", "SESSION", "NAME", "STATE" if any(states) else "")]
-    lines += [
-        (row["type"], str(row["id"] or "-"), str(row["group"] or "-"), row["zid"][:SHORT], row["name"] or "-", state)
-        for row, state in zip(rows, states, strict=True)
-    ]
-    session, name = (max(len(line[column]) for line in lines) for column in (3, 4))
-    shown = [
-        f"{line[0]:<8}{line[1]:>6}{line[2]:>7}  {line[3]:<{session}}  {line[4]:<{name}}  {line[5]}" for line in lines
-    ]
+        headings.append("STATE")
+        lines = [[*line, state or "-"] for line, state in zip(lines, states, strict=True)]
+    shown: list[Block] = [Columns(lines, headings=headings, right={1, 2})]
     if verbose:
         for robot, what in told.items():
-            shown += ["", f"robot {robot}", *(f"  {line}" for line in _details(what))]
-    return "\n".join(plain(line.rstrip()) for line in shown)
+            shown += ["", (f"robot {robot}", HEADING), *_details(what)]
+    return shown
 
 
 def _nobody(elsewhere: Mapping[str, int]) -> str:
     others = ", ".join(f"{count} in {name!r} (--namespace {name})" for name, count in sorted(elsewhere.items()))
-    return plain("nobody is online" + (f" here; {others}" if others else ""))
+    return "nobody is online" + (f" here; {others}" if others else "")
 
 
-def _shown_infrastructure(rows: list[dict[str, Any]]) -> list[str]:
+def _shown_infrastructure(rows: list[dict[str, Any]]) -> list[Block]:
     """Gateways and routers in columns, below the agents."""
-    lines = []
+    lines: list[list[Cell]] = []
     for row in rows:
+        what: Cell = ""
         if row["type"] == "gateway":
             where = row["address"] or "?"
-            what = f"{row['agents']} agents" if row["answers"] else f"{row['agents']} agents, does not answer"
+            what = f"{row['agents']} agents" if row["answers"] else (f"{row['agents']} agents, does not answer", ODD)
             version = f"macs {row['macs']}, Zenoh {row['zenoh']}" if row["macs"] else ""
         else:
-            where, what = ", ".join(row["addresses"]) or "?", ""
+            where = ", ".join(row["addresses"]) or "?"
             version = f"Zenoh {row['zenoh']}" if row["zenoh"] else ""
-        lines.append((row["type"], row["zid"][:SHORT], where, what, version))
-    if not lines:
-        return []
-    widths = [max(len(line[column]) for line in lines) for column in range(5)]
-    shown = ("  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)) for line in lines)
-    return ["", *(plain(line).rstrip() for line in shown)]
+        lines.append([row["type"], row["zid"][:SHORT], where, what, version])
+    return ["", Columns(lines)] if lines else []
 
 
-def _state(robot: Told | None) -> str:
+def _state(robot: RobotReport | None) -> Cell:
     """What somebody has to know before commanding it; empty when there is nothing."""
     if robot is None or robot.status is None:
-        return "?" if robot is not None and robot.problem else ""
+        return ("?", ODD) if robot is not None and robot.problem else ""
     stopped = [f"stopped by {robot.status.stop.by}"] if robot.status.stopped else []
     controls = [(node.name, node.control.holder) for node in robot.status.nodes if node.control is not None]
-    return ", ".join(stopped + [f"{topic}: {holder}" for topic, holder in controls if holder])
+    state = ", ".join(stopped + [f"{topic}: {holder}" for topic, holder in controls if holder])
+    return (state, BAD) if stopped else state
 
 
-def _details(robot: Told) -> list[str]:
+def _details(robot: RobotReport) -> list[Block]:
     status = robot.status
     if status is None:
         silent = "is no `macs agent`: it tells nothing of itself"
-        return [f"tells nothing: {robot.problem}" if robot.problem else silent]
-    domain = "?" if status.ros_domain is None else status.ros_domain
-    lines = [f"ROS node        {status.ros_node}", f"ROS domain      {domain}", f"emergency stop  {_stop(status)}"]
+        return [f"  tells nothing: {robot.problem}" if robot.problem else f"  {silent}"]
+    domain = "?" if status.ros_domain is None else str(status.ros_domain)
+    lines: list[Block] = [
+        _facts(("ROS node", status.ros_node), ("ROS domain", domain), ("emergency stop", _stop(status)))
+    ]
     # the stop has a node of its own, which concerns people only when somebody has registered it
     nodes = [node for node in status.nodes if node.role != "emergency stop" or node.registrants]
     lines += _block("registered", [(node.role, node.name, node.type, _registrants(node)) for node in nodes])
     lines += _block("safety", [row for node in nodes for row in _safety(node)])
     lines += _block("lost", [(name, str(count)) for name, count in sorted(status.drops.items())])
     if robot.offers is None:
-        return [*lines, f"offers          ? {robot.problem}"]
-    return lines + (_block("offers", list(_offered(robot.offers))) or [f"offers          {_nothing(status)}"])
+        return [*lines, _facts(("offers", f"? {robot.problem}"))]
+    return lines + (_block("offers", list(_offered(robot.offers))) or [_facts(("offers", _nothing(status)))])
+
+
+def _facts(*facts: tuple[str, str]) -> Columns:
+    """What is known of a robot, each under its name, all in one column."""
+    return Columns([(f"{name:<{FACT_WIDTH}}", fact) for name, fact in facts], indent=2)
 
 
 def _nothing(status: Status) -> str:
@@ -298,9 +312,6 @@ def _offered(offers: Offers) -> Iterator[tuple[str, ...]]:
             yield (what, name, of_type)
 
 
-def _block(heading: str, rows: list[tuple[str, ...]]) -> list[str]:
+def _block(heading: str, rows: Sequence[Sequence[str]]) -> list[Block]:
     """A heading with rows in columns below it; nothing for no rows."""
-    columns = max((len(row) for row in rows), default=0)
-    widths = [max(len(row[i]) for row in rows if len(row) > i) for i in range(columns)]
-    lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=False)).rstrip() for row in rows]
-    return [heading, *(f"  {line}" for line in lines)] if lines else []
+    return [f"  {heading}", Columns(rows, indent=4)] if rows else []

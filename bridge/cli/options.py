@@ -1,7 +1,8 @@
 """Options that several verbs share, and how they, a settings file and the environment become settings.
 
 The Zenoh options are spelled as Zenoh's own tools spell them. An option wins over the settings file; a Zenoh
-configuration file (``-c``) wins over our defaults, and ``--cfg`` over everything.
+configuration file (``-c``) wins over our defaults, and ``--cfg`` over everything. The environment is asked last:
+``ZENOH_CONFIG`` for ``-c``, and ``MACS_CONNECT`` for ``-e`` where nothing else names a router.
 """
 
 from __future__ import annotations
@@ -11,12 +12,18 @@ import logging
 import os
 
 from bridge.logs import log_to_stderr
+from bridge.principal import GRAMMAR, Principal
 from macs_zenoh import config
-from macs_zenoh.config import Settings
+from macs_zenoh.config import MeshSettings, Settings
+from macs_zenoh.errors import UsageError
 
 
 def add_log_options(parser: argparse.ArgumentParser, verbose: str = "log more") -> None:
     parser.add_argument("-v", "--verbose", action="store_true", help=verbose)
+
+
+CONNECT = "MACS_CONNECT"
+"""Routers, as ``-e`` names them, with commas or spaces between them."""
 
 
 def add_settings_option(parser: argparse.ArgumentParser) -> None:
@@ -28,16 +35,42 @@ def add_settings_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_mesh_options(parser: argparse.ArgumentParser, *, modes: tuple[str, ...] = ("client", "peer")) -> None:
-    """``modes``: those that make sense for the verb; none means that its mode is fixed."""
+def add_as_option(parser: argparse.ArgumentParser) -> None:
+    """Whose rights to use, told the same way to every verb: a `Principal`, None unless told."""
+    parser.add_argument(
+        "--as",
+        dest="principal",
+        type=_principal,
+        metavar="WHO",
+        help=f"whose rights to use: {GRAMMAR} (default: as the settings say)",
+    )
+
+
+def _principal(text: str) -> Principal:
+    try:
+        return Principal.parse(text)
+    except UsageError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def add_mesh_options(
+    parser: argparse.ArgumentParser, *, modes: tuple[str, ...] = ("client", "peer"), dials: bool = True
+) -> None:
+    """``modes``: those that make sense for the verb; none means that its mode is fixed. ``dials``: it needs a router,
+    so that the environment may name one."""
     add_settings_option(parser)
     zenoh = parser.add_argument_group("Zenoh options")
     zenoh.add_argument("-c", "--config", metavar="FILE", help="Zenoh configuration (JSON5); default: $ZENOH_CONFIG")
     if modes:
         zenoh.add_argument("-m", "--mode", choices=modes, help="how to join the mesh (default: client)")
     zenoh.add_argument(
-        "-e", "--connect", metavar="ENDPOINT", action="append", help="router, as tcp/HOST:7447; repeat for fail-over"
+        "-e",
+        "--connect",
+        metavar="ENDPOINT",
+        action="append",
+        help="router, as tcp/HOST:7447; repeat for fail-over" + (f"; default: ${CONNECT}" if dials else ""),
     )
+    parser.set_defaults(dials=dials)
     zenoh.add_argument("-l", "--listen", metavar="ENDPOINT", action="append", help="where to accept Zenoh sessions")
     zenoh.add_argument(
         "--cfg", metavar="PATH:JSON5", action="append", help="set one value, as transport/link/tx/lease:5000"
@@ -53,16 +86,27 @@ def settings_file(args: argparse.Namespace) -> Settings:
 def settings(args: argparse.Namespace) -> Settings:
     """The settings file, changed by the options given. Raises `ConfigError`."""
     base = settings_file(args)
+    config_file = args.config or base.mesh.config_file or os.environ.get("ZENOH_CONFIG")
+    unnamed = args.dials and not base.mesh.connect and not config_file
     mesh = config.changed(
         base.mesh,
         mode=getattr(args, "mode", None),
-        connect=args.connect,
+        connect=args.connect or (_routers_of_environment() if unnamed else None),
         listen=args.listen,
-        config_file=args.config or base.mesh.config_file or os.environ.get("ZENOH_CONFIG"),
+        config_file=config_file,
         overrides=[*base.mesh.overrides, *args.cfg] if args.cfg else None,
         namespace=args.namespace,
     )
     return config.changed(base, mesh=mesh)
+
+
+def defaults() -> Settings:
+    """The settings of who was told nothing."""
+    return config.changed(Settings(), mesh=config.changed(MeshSettings(), connect=_routers_of_environment()))
+
+
+def _routers_of_environment() -> list[str] | None:
+    return os.environ.get(CONNECT, "").replace(",", " ").split() or None
 
 
 def start_logging(args: argparse.Namespace) -> None:

@@ -99,14 +99,6 @@ def note(text: str) -> None:
         sys.stderr.flush()
 
 
-def note_progress(text: str) -> None:
-    """Something that is written over, for a terminal only."""
-    with suppress(OSError, ValueError):
-        if sys.stderr.isatty():
-            sys.stderr.write(text)
-            sys.stderr.flush()
-
-
 def as_json(value: Any) -> str:
     """One line of JSON in the encoding of stdout, with control characters as JSON writes them."""
     ascii_only = _encoding().lower() not in ("utf-8", "utf8")

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 from msgspec import Struct
 
+from bridge.principal import Principal
 from macs_zenoh.config import MeshSettings, OperatorSettings
-from macs_zenoh.errors import MacsError, Refused, TooLong, Unreachable, UsageError
+from macs_zenoh.errors import MacsError, Refused, TooLong, Unreachable
 from macs_zenoh.protocol import ping
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import AgentInfo, Directory
-from macs_zenoh.protocol.keyexpr import LEASE, NAME, PING, PRESENCE, type_number
+from macs_zenoh.protocol.keyexpr import LEASE, NAME, PING, PRESENCE
 from macs_zenoh.protocol.limits import ANSWER_BYTES
 from macs_zenoh.protocol.messages import OPERATOR, ROS, Metadata
 from macs_zenoh.protocol.named import Named, Names
@@ -39,10 +40,6 @@ USUALLY_S = 0.4
 """Within so long a router has let us in, if one does."""
 
 WITHOUT_A_ROUTER = "(start one with `macs router`, or name it with -e; `macs doctor` looks closer)"
-
-
-Caller = AgentId
-"""As whom robots are asked."""
 
 
 class Control(Struct, frozen=True):
@@ -124,37 +121,16 @@ class Offers(Struct, frozen=True):
     qos: dict[str, dict[str, str]] = {}
 
 
-def add_as_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--as",
-        dest="caller",
-        type=caller,
-        metavar="TYPE/ID",
-        help="ask robots as this agent, as operator/5 or unity/5 (default: as the settings say, else operator/0)",
-    )
-
-
-def caller(text: str) -> Caller:
-    """Read ``operator``, ``operator/5``. Raises argparse.ArgumentTypeError."""
-    kind, slash, number = text.partition("/")
-    try:
-        found = Caller(type_number(kind), int(number) if slash else 0)
-    except (UsageError, ValueError):
-        found = Caller(0, -1)
-    if not 0 <= found.id <= 0xFFFF:
-        raise argparse.ArgumentTypeError(f"{text!r} is no agent, as in operator/5")
-    return found
-
-
-def chosen_caller(args: argparse.Namespace, settings: OperatorSettings) -> Caller:
-    """Who ``--as`` names, else who the settings are for."""
-    return args.caller or Caller(OPERATOR, settings.id or 0)
+def chosen_caller(args: argparse.Namespace, settings: OperatorSettings) -> AgentId:
+    """Who ``--as`` names, else who the settings are for; whom nobody named asks as ``operator/0``."""
+    principal: Principal = args.principal or Principal("operator", settings.id or 0)
+    return AgentId(*principal.agent) if principal.kind else AgentId(OPERATOR, 0)
 
 
 class Operator:
     """Looks at the mesh and calls robots. Made by `operator`."""
 
-    def __init__(self, mesh: Mesh, caller: Caller, timeout_s: float) -> None:
+    def __init__(self, mesh: Mesh, caller: AgentId, timeout_s: float) -> None:
         self._mesh = mesh
         self._caller = caller
         self._timeout_s = timeout_s
@@ -246,7 +222,7 @@ class Operator:
 
 
 @asynccontextmanager
-async def operator(settings: MeshSettings, caller: Caller, *, timeout_s: float) -> AsyncIterator[Operator]:
+async def operator(settings: MeshSettings, caller: AgentId, *, timeout_s: float) -> AsyncIterator[Operator]:
     """An operator's session until the end of the block. Of several routers each but the last one may take its time
     (``open_limit_ms``) beside ``timeout_s``, as when its host is off.
 

@@ -9,7 +9,10 @@ who reaches it sees all and drives robots: for networks that you trust (docs/sec
 examples:
   macs router
   macs router -l tcp/10.0.0.1:7447 -l tls/0.0.0.0:7448 -c tls.json5
-  macs router -e tcp/other-site:7447             linked to another router"""
+  macs router -e tcp/other-site:7447             linked to another router
+
+what it prints:
+  ready: router on tcp/10.0.0.1:7447"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ SUMMARY = "a Zenoh router, where robots and gateways meet"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    options.add_mesh_options(parser, modes=())
+    options.add_mesh_options(parser, modes=(), dials=False)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -12,7 +12,13 @@ examples:
   macs security generate site.yaml --into pki --at /etc/macs       where the files will be on their machines
   macs security generate site.yaml --into pki --renew robot-7
   macs security check site.yaml --dir pki
-  macs security check site.yaml --dir pki -e tls/10.0.0.5:7447 --json"""
+  macs security check site.yaml --dir pki -e tls/10.0.0.5:7447 --json
+
+what it prints:
+  robot-7: certificate made, new, until 2027-02-26                                   of generate
+  ../pki: 5 certificates made, 0 kept, 18 files written; the first certificate ends on 2027-02-26
+  WRONG tls/10.0.0.5:7447: robot-9 commands robot-7: forbidden, permitted seen       of check
+  212 attempts, 211 as planned, 1 not"""
 
 from __future__ import annotations
 
@@ -22,7 +28,8 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bridge.cli import output, running
+from bridge.cli import output, running, terminal
+from bridge.cli.terminal import BAD, Block
 
 if TYPE_CHECKING:
     from bridge.security.check import Result
@@ -132,27 +139,30 @@ def _check(args: argparse.Namespace) -> int:
     if not args.verbose:
         logging.getLogger("macs.mesh").setLevel(logging.WARNING)  # of each of many sessions
 
-    def progress(done: int, of: int) -> None:
-        output.note_progress(f"\r{done} of {of} attempts\033[K" + ("\n" if done == of else ""))
-
     async def work() -> int:
-        results = await check(read, Path(args.dir), args.connect, timeout_s=args.timeout, progress=progress)
+        with terminal.progress() as tell:
+            results = await check(
+                read,
+                Path(args.dir),
+                args.connect,
+                timeout_s=args.timeout,
+                progress=lambda done, of: tell("attempts", done, of),
+            )
         wrong = [result for result in results if not result.as_planned]
         if args.json:
             output.say(json.dumps([result.as_dict() for result in results]))
         else:
-            for result in results if args.all else wrong:
-                output.say(_line(result))
+            terminal.show(*(_line(result) for result in (results if args.all else wrong)))
             output.say(f"{len(results)} attempts, {len(results) - len(wrong)} as planned, {len(wrong)} not")
         return 1 if wrong or not results else 0
 
     return running.until_stopped(work, interrupted=running.INTERRUPTED)
 
 
-def _line(result: Result) -> str:
+def _line(result: Result) -> Block:
     verdict = "ok   " if result.as_planned else "WRONG"
     expected = "permitted" if result.permitted else "forbidden"
     seen = "permitted" if result.seen else "forbidden"
-    return f"{verdict} {result.router}: {result.what}: {expected}, {seen} seen" + (
-        f" ({result.key})" if result.key else ""
-    )
+    key = f" ({result.key})" if result.key else ""
+    line = f"{verdict} {result.router}: {result.what}: {expected}, {seen} seen{key}"
+    return line if result.as_planned else (line, BAD)

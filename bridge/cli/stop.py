@@ -13,7 +13,11 @@ examples:
   macs stop 7 8 -e tcp/192.168.1.10:7447          these two, whether they can be seen or not
   macs stop --group 3 --as operator/5             every robot of group 3
   macs stop 7 --release
-  macs stop --all --release"""
+  macs stop --all --release
+
+what it prints:
+  robot 7 is stopped, by operator/0
+  robot 8 is NOT stopped: no answer within 5 s"""
 
 from __future__ import annotations
 
@@ -63,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="for a router, more with several; then for the robots (default: 5)",
     )
-    robots.add_as_option(parser)
+    options.add_as_option(parser)
     options.add_mesh_options(parser)
 
 

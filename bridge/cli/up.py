@@ -11,7 +11,13 @@ of its own on the mesh; both are printed, and where a usual port is taken, the f
 examples:
   macs up --demo
   macs up --host 0.0.0.0 --id 7             headsets and other robots from the network
-  macs up -e tcp/192.168.1.10:7447          gateway and robot here, router there"""
+  macs up -e tcp/192.168.1.10:7447          gateway and robot here, router there
+
+what it prints:
+  It runs. Ctrl-C stops it; meanwhile, in another terminal:
+    who is online      macs ls
+    receive a topic    macs headset 127.0.0.1:7000 sub /TOPIC pkg/Type
+  A Unity headset connects to 127.0.0.1:7000, from this machine only."""
 
 from __future__ import annotations
 

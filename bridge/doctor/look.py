@@ -18,14 +18,14 @@ from typing import Any
 import msgspec
 from msgspec import structs
 
+from bridge.principal import Principal
 from macs_zenoh.config import Settings
-from macs_zenoh.errors import CallTimeout, ConfigError, MacsError, Refused, Unreachable, UsageError, WireError
+from macs_zenoh.errors import CallTimeout, ConfigError, MacsError, Refused, Unreachable, WireError
 from macs_zenoh.mesh import Mesh, Subscription, Traffic, configuration
 from macs_zenoh.protocol import ping
 from macs_zenoh.protocol.addresses import of_endpoint
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.keyexpr import (
-    BLOCK_SIZE,
     LEASE,
     NAME,
     PING,
@@ -33,9 +33,8 @@ from macs_zenoh.protocol.keyexpr import (
     UNICAST,
     block_of,
     type_name,
-    type_number,
 )
-from macs_zenoh.protocol.messages import NOBODY, ROS, UNITY, Metadata
+from macs_zenoh.protocol.messages import ROS, Metadata
 from macs_zenoh.protocol.routing import call, inbox
 from macs_zenoh.protocol.wire import PROBE
 
@@ -74,60 +73,6 @@ JUDGED = (
 OnProgress = Callable[[str], None]
 
 
-@dataclass(frozen=True)
-class Who:
-    """Whose rights to try: a robot's or another agent's (its id), a gateway's (its first block), an operator's (who
-    calls robots and is not online), or nobody's in particular."""
-
-    kind: str = ""
-    number: int = 0
-    group: int = 0
-
-    @classmethod
-    def parse(cls, text: str, group: int = 0) -> Who:
-        """``ros/7``, ``gateway/1``, ``operator/5`` or ``observer``. Raises UsageError."""
-        kind, _, number = text.partition("/")
-        if kind == "observer" and not number:
-            return cls()
-        highest = 255 if kind == "gateway" else 65_535
-        if not number.isascii() or not number.isdigit() or int(number) > highest:
-            raise UsageError(f"{text!r} is nobody: use ros/7, gateway/1 (its block), operator/5 or observer")
-        if kind != "gateway":
-            type_number(kind)
-        return cls(kind, int(number), group)
-
-    @classmethod
-    def of(cls, settings: Settings) -> Who:
-        """Who the settings are for, as far as they say."""
-        if settings.robot.id is not None:
-            return cls("ros", settings.robot.id, settings.robot.group)
-        gateway = settings.gateway
-        blocks = [*([gateway.block] if gateway.block is not None else []), *gateway.blocks]
-        if blocks:
-            return cls("gateway", blocks[0])
-        return cls("operator", settings.operator.id) if settings.operator.id is not None else cls()
-
-    def __str__(self) -> str:
-        return f"{self.kind}/{self.number}" if self.kind else ""
-
-    @property
-    def agent(self) -> tuple[int, int]:
-        """(type, id) that it may be. A gateway is its headsets; the last id of its block is given out last."""
-        if self.kind == "gateway":
-            return UNITY, self.number * BLOCK_SIZE + BLOCK_SIZE - 1
-        return (type_number(self.kind), self.number) if self.kind else (NOBODY, 0xFFFF)
-
-    @property
-    def joins(self) -> bool:
-        """Whether it is online when it runs, and hears what is sent to it."""
-        return self.kind not in ("", "operator")
-
-    @property
-    def calls(self) -> bool:
-        """Whether it calls robots."""
-        return self.kind in ("gateway", "operator")
-
-
 @dataclass
 class _Place:
     """A router endpoint while it is examined: its facts, and the sessions through it."""
@@ -149,7 +94,7 @@ class Examination:
         self,
         settings: Settings,
         *,
-        who: Who,
+        principal: Principal,
         timeout_s: float,
         quick: bool,
         versions: tuple[str, str],
@@ -157,7 +102,7 @@ class Examination:
     ) -> None:
         """``versions``: of macs-zenoh and of the wheel. ``quick`` leaves out the echoes that measure throughput."""
         self._mesh = settings.mesh
-        self._who = who
+        self._principal = principal
         self._timeout_s = timeout_s
         self._quick = quick
         self._say = on_progress
@@ -170,7 +115,7 @@ class Examination:
             macs=versions[0],
             zenoh=versions[1],
             python=platform.python_version(),
-            who=str(who),
+            who=str(principal),
             namespace=zenoh.get("namespace") or "",
             id_slots=settings.mesh.id_slots,
             group_slots=settings.mesh.group_slots,
@@ -301,22 +246,22 @@ class Examination:
 
     async def _try_rights(self, place: _Place) -> Rights:
         first, second, wait_s = place.first, place.second, place.waited_s
-        kind, number = self._who.agent
+        kind, number = self._principal.agent
         rights = Rights()
         watched: list[str] = []
         place.kept.append(second.watch_tokens(PRESENCE.every(), lambda key, alive: watched.append(key)))
-        key = PRESENCE.of(type=kind, id=number, group=self._who.group, zid=first.zid)
+        key = PRESENCE.of(type=kind, id=number, group=self._principal.group, zid=first.zid)
         place.mark = _marked(key)
         place.kept.append(first.declare_token(place.mark))
         rights.seen = await self._shows_up(second, PRESENCE.every(), place.mark, wait_s)
         if rights.seen:
             rights.watches = await _until(lambda: place.mark in watched, wait_s)
         rights.sees = rights.seen or bool(place.facts.leases or await self._tokens(first, PRESENCE.every())) or None
-        if self._who.kind == "gateway":
-            lease = _marked(LEASE.of(block=self._who.number, zid=first.zid))
+        if self._principal.kind == "gateway":
+            lease = _marked(LEASE.of(block=self._principal.number, zid=first.zid))
             place.kept.append(first.declare_token(lease))
             rights.leases = await self._shows_up(second, LEASE.every(), lease, wait_s)
-        if self._who.joins:
+        if self._principal.joins:
             rights.hears = await self._hears(place, kind, number)
         rights.pings = await self._pings(place)
         return rights
@@ -334,8 +279,8 @@ class Examination:
         """Send to our own inbox with one session and listen with the other."""
         heard: list[str] = []
         key = UNICAST.of(type=kind, block=block_of(number), id=number, from_type=kind, from_id=number)
-        gateway = self._who.kind == "gateway"
-        ours = UNICAST.every(type=kind, block=self._who.number) if gateway else inbox(kind, number)
+        gateway = self._principal.kind == "gateway"
+        ours = UNICAST.every(type=kind, block=self._principal.number) if gateway else inbox(kind, number)
         listening = place.second.subscribe(ours, lambda batch: heard.extend(sent_to for sent_to, _ in batch))
         arrived = await self._repeat(lambda: place.first.put(key, PROBE), lambda: key in heard, place.waited_s)
         listening.close()
@@ -442,7 +387,7 @@ class Examination:
                 await self._ping(place.first, program)
             if program.pong is not None and not self._quick and number < MAX_ECHOED:
                 await self._echo(place.first, program.zid, program.way)
-            if self._who.calls and program.agents and not program.blocks:
+            if self._principal.calls and program.agents and not program.blocks:
                 program.called = await self._call(place.first, program.agents[0])
 
     async def _ping(self, mesh: Mesh, program: Program) -> None:
@@ -466,7 +411,7 @@ class Examination:
         kind, _, number = agent.partition("/")
         if kind != type_name(ROS):
             return None
-        sender = self._who.agent
+        sender = self._principal.agent
         for verb in CALLED:
             key, frame = call((ROS, int(number)), verb, sender, b"", Metadata(*sender))
             try:

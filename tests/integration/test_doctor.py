@@ -127,7 +127,7 @@ async def test_a_router_that_is_not_there() -> None:
     alone = await doctor("-e", wrong)
     assert alone.wrong == {"refused": "error"}
     assert alone.find("refused")["where"] == wrong
-    assert alone.code == 3
+    assert alone.code == 1
     async with Router() as router:
         beside = await doctor("-e", wrong, "-e", router.endpoint, "--quick")
     assert beside.wrong == {"refused": "warning"}
@@ -196,7 +196,7 @@ async def test_an_expired_certificate_is_named(authority: Authority) -> None:
     async with tls_router(authority.issue("router", days=-1)) as router:
         report = await doctor("-e", router.endpoint, cfg=[trusting(authority.ca)])
     assert report.wrong == {"tls_expired": "error"}
-    assert report.code == 3
+    assert report.code == 1
 
 
 async def test_an_unknown_ca_is_named(authority: Authority, foreign: Authority) -> None:
@@ -299,7 +299,7 @@ async def test_what_access_rules_allow_and_forbid(guarded: Router) -> None:
         thief = await doctor("-e", endpoint, "--as", "ros/8", "--quick", cfg=credentials("robot-7"))
         assert thief.wrong == {"presence_denied": "error", "inbox_denied": "error"}
         assert "macs/live/ros/8/**" in thief.find("presence_denied")["todo"]
-        assert thief.code == 3
+        assert thief.code == 1
 
         observer = await doctor("-e", endpoint, "--as", "observer", "--quick", cfg=credentials("observer"))
         assert not observer.wrong

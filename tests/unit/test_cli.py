@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import re
 import socket
@@ -11,13 +12,17 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from bridge.cli import VERBS, build_parser, children, main, options, up
+from bridge.cli import VERBS, build_parser, children, ls, main, options, robots, stop, terminal, up
 from bridge.headset.verbs import script_parser
-from macs_zenoh.config import MeshSettings, Settings
+from macs_zenoh.config import MeshSettings, OperatorSettings, Settings
 from macs_zenoh.errors import ConfigError
+from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.keyexpr import KEYS
+from macs_zenoh.protocol.named import Named
+from macs_zenoh.protocol.ping import Pong
 
 
 def parsed(*argv: str) -> argparse.Namespace:
@@ -36,6 +41,7 @@ def test_help_names_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
     for verb, module in VERBS.items():
         assert f"    {verb:12}{module.SUMMARY}" in shown
     assert shown.count("\n  macs ") == 3
+    assert "Exit codes: 0 done; 1 " in shown
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -45,7 +51,8 @@ def test_help_of_a_verb_has_examples(verb: str, capsys: pytest.CaptureFixture[st
         main([verb, "--help"])
     assert ended.value.code == 0
     shown = capsys.readouterr().out
-    assert f"\n  macs {verb}" in shown
+    assert f"\n  macs {verb}" in shown or f"$(macs {verb}" in shown
+    assert re.search(r"(?i)^what it prints", shown, re.MULTILINE)
     assert max(len(line) for line in shown.splitlines()) < 120
 
 
@@ -203,7 +210,8 @@ def test_options_are_spelled_as_zenohs_tools_spell_them() -> None:
 
 def test_no_options_are_all_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without options, files and environment the defaults hold."""
-    monkeypatch.delenv("ZENOH_CONFIG", raising=False)
+    for name in ("MACS_CONNECT", "ZENOH_CONFIG"):
+        monkeypatch.delenv(name, raising=False)
     assert options.settings(parsed("gateway")) == Settings()
 
 
@@ -212,6 +220,68 @@ def test_the_environment_names_a_zenoh_file_unless_an_option_does(monkeypatch: p
     monkeypatch.setenv("ZENOH_CONFIG", "env.json5")
     assert options.settings(parsed("ls")).mesh.config_file == "env.json5"
     assert options.settings(parsed("ls", "-c", "option.json5")).mesh.config_file == "option.json5"
+
+
+@pytest.fixture
+def unnamed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No program's environment but ours."""
+    for name in ("MACS_CONNECT", "ZENOH_CONFIG"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.mark.parametrize("verb", ["ls", "stop", "doctor", "gateway", "agent", "awareness"])
+def test_the_environment_names_routers_unless_somebody_does(
+    verb: str, unnamed: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """MACS_CONNECT stands for -e; an option, a settings file and a Zenoh configuration win over it."""
+    monkeypatch.setenv("MACS_CONNECT", "tcp/a:1, tcp/b:2")
+    assert options.settings(parsed(verb)).mesh.connect == ["tcp/a:1", "tcp/b:2"]
+    assert options.settings(parsed(verb, "-e", "tcp/c:3")).mesh.connect == ["tcp/c:3"]
+    assert options.settings(parsed(verb, "-c", "z.json5")).mesh.connect == []
+    file = tmp_path / "macs.toml"
+    file.write_text('[mesh]\nconnect = ["tcp/file:1"]\n')
+    assert options.settings(parsed(verb, "--settings", str(file))).mesh.connect == ["tcp/file:1"]
+    monkeypatch.setenv("MACS_CONNECT", "nonsense")
+    with pytest.raises(ConfigError, match="connect"):
+        options.settings(parsed(verb))
+
+
+def test_the_environment_links_no_routers(unnamed: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A router does not dial itself because programs beside it are told of it; `macs up` starts one all the same."""
+    monkeypatch.setenv("MACS_CONNECT", "tcp/127.0.0.1:7447")
+    assert options.settings(parsed("router")).mesh.connect == []
+    assert plan().router_child() is not None
+
+
+@pytest.mark.parametrize(
+    ("words", "caller"),
+    [
+        ([], "operator/5"),
+        (["--as", "operator"], "operator/0"),
+        (["--as", "operator/7"], "operator/7"),
+        (["--as", "unity/300"], "unity/300"),
+        (["--as", "ros/7"], "ros/7"),
+        (["--as", "gateway/1"], "unity/511"),
+        (["--as", "observer"], "operator/0"),
+    ],
+)
+@pytest.mark.parametrize("verb", ["ls", "stop", "doctor"])
+def test_as_means_the_same_to_every_verb(verb: str, words: list[str], caller: str) -> None:
+    """Whoever is named, who calls a robot is an agent; without it the settings say who."""
+    args = parsed(verb, *words)
+    assert str(robots.chosen_caller(args, OperatorSettings(id=5))) == caller
+
+
+@pytest.mark.parametrize(
+    "who", ["gateway", "gateway/256", "ros", "ros/65536", "robot/7", "observer/1", "operator/-1", ""]
+)
+@pytest.mark.parametrize("verb", ["ls", "stop", "doctor"])
+def test_as_names_somebody(verb: str, who: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Who is nobody is wrong usage, told by the verb."""
+    with pytest.raises(SystemExit) as ended:
+        main([verb, "--as", who])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"macs {verb}: error: argument --as: ")
 
 
 def test_an_option_wins_over_the_settings_file(tmp_path: Path) -> None:
@@ -265,6 +335,42 @@ def test_keys_does_not_know_every_key(capsys: pytest.CaptureFixture[str]) -> Non
     """A key of nobody's space, or with a wildcard, is exit code 1."""
     assert main(["keys", "macs/to/ros/**"]) == 1
     assert "no concrete key" in capsys.readouterr().err
+
+
+# -- what help says is printed ---------------------------------------------------------------------------------------
+
+
+def promised(verb: str) -> list[str]:
+    """The lines below "what it prints" in the help of a verb."""
+    text = (VERBS[verb].__doc__ or "").partition("what it prints:\n")[2]
+    return [line.removeprefix("  ") for line in text.splitlines()]
+
+
+def test_keys_prints_what_its_help_shows(capsys: pytest.CaptureFixture[str]) -> None:
+    """The example is how the table begins."""
+    assert main(["keys"]) == 0
+    assert capsys.readouterr().out.splitlines()[: len(promised("keys"))] == promised("keys")
+
+
+def test_ls_prints_what_its_help_shows() -> None:
+    """The example is what `ls` makes of such a mesh."""
+    robot, headset = AgentInfo(1, 7, 3, "3c41ba1c00"), AgentInfo(2, 256, 0, "9f2d07e100")
+    control = {"holder": "unity/256"}
+    node = {"role": "publisher", "name": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "control": control}
+    said = {"ros_node": "/r", "stopped": True, "stop": {"by": "operator/5"}, "nodes": [node]}
+    told = {7: ls.RobotReport(status=msgspec.convert(said, robots.Status))}
+    pongs = {headset.zid: Pong(time_s=0.0, address="10.0.0.5:7000", macs="0.1.0", zenoh="1.10.2")}
+    routers = [robots.Router("d8c1f2aa", "v1.10.2-release built", ["tcp/10.0.0.1:7447"])]
+    agents = [robot, headset]
+    blocks = ls._text(agents, [Named("drone0", 1, 7, robot.zid)], told, [], verbose=False)
+    blocks += ls._shown_infrastructure(ls._infrastructure(agents, pongs, routers))
+    assert terminal.drawn(blocks, io.StringIO()).splitlines() == promised("ls")
+
+
+def test_stop_prints_what_its_help_shows() -> None:
+    """One line for a robot that stopped and one for a robot that did not."""
+    outcomes = [stop.Outcome(7, True, True, "operator/0"), stop.Outcome(8, False, problem="no answer within 5 s")]
+    assert [stop._line(outcome, release=False) for outcome in outcomes] == promised("stop")
 
 
 # -- up --------------------------------------------------------------------------------------------------------------

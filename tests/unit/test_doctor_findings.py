@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import string
@@ -11,11 +12,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from bridge.cli import terminal
+from bridge.cli.doctor import shown
 from bridge.doctor import below, report
 from bridge.doctor.facts import Certificate, Clock, Echo, Endpoint, Facts, Rights, RouterInfo, Session, Tls
 from bridge.doctor.findings import found, judge, worst
 from bridge.doctor.kinds import ERROR, GROUPS, KINDS, NOTE, OK, WARNING, Severity
-from bridge.doctor.look import Who
+from bridge.principal import Principal
 from macs_zenoh.config import GatewaySettings, OperatorSettings, RobotSettings, Settings
 from macs_zenoh.errors import UsageError
 from macs_zenoh.protocol.keyexpr import LEASE, NAME, PRESENCE
@@ -445,15 +448,22 @@ def test_the_page_explains_every_finding() -> None:
     assert dict(rows) == {name: kind.severity.name.lower() for name, kind in KINDS.items()}
 
 
+class Terminal(io.StringIO):
+    """A stream that says that it is one."""
+
+    def isatty(self) -> bool:
+        return True
+
+
 # -- reports -----------------------------------------------------------------------------------------------------
 
 
-def test_the_exit_code_is_the_severity() -> None:
-    """0 for notes, 1 for warnings, 3 for errors; 2 is left to wrong usage."""
+def test_the_exit_code_says_whether_something_is_wrong() -> None:
+    """0 for notes, 1 for warnings and errors; 2 is left to wrong usage, as with every verb."""
     findings = {severity: found("nobody", severity=severity) for severity in Severity}
-    assert [report.exit_code([findings[severity]]) for severity in Severity] == [0, 0, 1, 3]
+    assert [report.exit_code([findings[severity]]) for severity in Severity] == [0, 0, 1, 1]
     assert report.exit_code([]) == 0
-    assert report.exit_code(list(findings.values())) == 3
+    assert report.exit_code(list(findings.values())) == 1
 
 
 def test_the_json_has_findings_and_facts() -> None:
@@ -474,18 +484,27 @@ def test_the_json_has_findings_and_facts() -> None:
     assert judge(msgspec.convert(document["facts"], Facts)) == judge(facts)
 
 
-def test_the_text_is_grouped_and_says_what_to_do() -> None:
-    """People read the groups, the signs, and behind an arrow what to do; no colours unless asked for."""
+def test_the_text_is_grouped_and_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """People read the groups, the signs, and behind an arrow what to do: in colour and within its width on a terminal,
+    each in one line in a pipe."""
+    monkeypatch.setenv("TERM", "xterm")
+    for name in ("NO_COLOR", "FORCE_COLOR", "COLUMNS"):
+        monkeypatch.delenv(name, raising=False)
     facts = healthy()
     _down(facts, reach="refused")
-    text = report.as_text(judge(facts), facts, colours=False)
+    blocks = list(shown(judge(facts), facts))
+    text = terminal.drawn(blocks, io.StringIO())
     assert text.splitlines()[0] == "Routers"
     assert f"  warning  {facts.endpoints[1].endpoint}: nobody listens there" in text.splitlines()
     assert "           → start the router there, or correct host and port" in text.splitlines()
     assert text.splitlines()[-1].startswith("1 warning; measured with ")
     assert "\033" not in text
-    assert max(map(len, text.splitlines())) <= report.WIDTH
-    assert "\033[33m" in report.as_text(judge(facts), facts, colours=True)
+    monkeypatch.setenv("COLUMNS", "60")
+    in_colour = terminal.drawn(blocks, Terminal())
+    assert "\033[33m" in in_colour
+    shown_lines = re.sub("\033\\[[0-9;]*m", "", in_colour).splitlines()
+    assert max(map(len, shown_lines)) <= 60
+    assert "".join("".join(shown_lines).split()) == "".join(text.split())
 
 
 def test_the_worst_finding_counts() -> None:
@@ -523,18 +542,18 @@ def test_an_endpoint_may_bring_its_own_tls_settings() -> None:
 
 def test_whose_rights_are_tried() -> None:
     """The settings say who somebody is, or --as does; what is nobody is refused."""
-    assert str(Who.of(Settings())) == ""
-    assert str(Who.of(Settings(robot=RobotSettings(id=7)))) == "ros/7"
-    assert str(Who.of(Settings(gateway=GatewaySettings(block=3)))) == "gateway/3"
-    assert str(Who.of(Settings(gateway=GatewaySettings(blocks=[4, 5])))) == "gateway/4"
-    assert str(Who.of(Settings(operator=OperatorSettings(id=5)))) == "operator/5"
-    assert Who.parse("gateway/1").agent == (2, 511)
-    assert Who.parse("ros/7").agent == (1, 7)
-    assert not Who.parse("observer").joins
-    assert Who.parse("operator/5").calls
+    assert str(Principal.of(Settings())) == ""
+    assert str(Principal.of(Settings(robot=RobotSettings(id=7)))) == "ros/7"
+    assert str(Principal.of(Settings(gateway=GatewaySettings(block=3)))) == "gateway/3"
+    assert str(Principal.of(Settings(gateway=GatewaySettings(blocks=[4, 5])))) == "gateway/4"
+    assert str(Principal.of(Settings(operator=OperatorSettings(id=5)))) == "operator/5"
+    assert Principal.parse("gateway/1").agent == (2, 511)
+    assert Principal.parse("ros/7").agent == (1, 7)
+    assert not Principal.parse("observer").joins
+    assert Principal.parse("operator/5").calls
     for text in ("robot", "ros/", "gateway/256", "ros/65536", "1/x", "drone/1"):
         with pytest.raises(UsageError):
-            Who.parse(text)
+            Principal.parse(text)
 
 
 def test_a_pong_of_another_version_is_read() -> None:
