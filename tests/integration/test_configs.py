@@ -7,6 +7,7 @@ import asyncio
 import configparser
 import datetime as dt
 import json
+import os
 import re
 import shlex
 import shutil
@@ -305,7 +306,8 @@ def test_an_image_is_made_of_what_exists(path: Path) -> None:
     assert [name for name in copied if not (ROOT / name).exists()] == []
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     packages = {pattern.rstrip("*") for pattern in project["tool"]["setuptools"]["packages"]["find"]["include"]}
-    assert {*packages, "pyproject.toml", project["project"]["readme"]} <= copied
+    links = {os.path.relpath(link.resolve(), ROOT) for link in (ROOT / "bridge" / "data").iterdir()}
+    assert {*packages, *links, "pyproject.toml", "setup.py", "README.md"} <= copied
     (install,) = re.findall(r"pip install --no-cache-dir (\S+)", path.read_text(encoding="utf-8"))
     extras = re.findall(r"\w+", install)
     assert set(extras) <= set(project["project"]["optional-dependencies"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -22,20 +23,35 @@ SETTINGS = ["macs.toml", "one-host/robot.toml", "systemd/macs-robot.service", "s
 INTERFACES = ["as2_ca_msgs/package.xml", "as2_ca_msgs/msg/InterAgentMessage.msg"]
 
 
-SOURCES = ["bridge", "macs_zenoh", "config", "interfaces", "pyproject.toml", "README.md", "LICENSE"]
+SOURCES = ["bridge", "macs_zenoh", "config", "interfaces", "pyproject.toml", "setup.py", "README.md", "LICENSE"]
+VERSION = "1.2.3rc1"
 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with wheel and sdist of this checkout, built beside it: an old build/ must not help."""
     sources, folder = tmp_path_factory.mktemp("sources"), tmp_path_factory.mktemp("dist")
+    copy_sources(sources)
+    environment = {"SETUPTOOLS_SCM_PRETEND_VERSION_FOR_MACS_ZENOH": VERSION}
+    build("sdist", sources, folder, **environment)
+    (sdist,) = folder.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(folder, filter="data")
+    build("wheel", folder / sdist.name.removesuffix(".tar.gz"), folder)  # the sdist knows its version
+    return folder
+
+
+def copy_sources(into: Path) -> None:
     for name in SOURCES:
         copy = shutil.copy if (ROOT / name).is_file() else partial(shutil.copytree, symlinks=True)
-        copy(ROOT / name, sources / name)
-    build = f"from setuptools import build_meta as b; b.build_sdist({str(folder)!r}); b.build_wheel({str(folder)!r})"
-    done = subprocess.run([sys.executable, "-c", build], cwd=sources, capture_output=True, text=True, check=False)
+        copy(ROOT / name, into / name)
+
+
+def build(kind: str, sources: Path, into: Path, **environment: str) -> None:
+    """Build an sdist or a wheel, with what is installed here."""
+    code = f"from setuptools import build_meta; build_meta.build_{kind}({str(into)!r})"
+    done = run(sys.executable, "-c", code, cwd=sources, **environment)
     assert done.returncode == 0, done.stderr[-2000:]
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +91,48 @@ def test_wheel_and_sdist_have_the_shipped_files(built: Path) -> None:
     wanted += ["bridge/py.typed", "macs_zenoh/py.typed"]
     assert [name for name in wanted if name not in in_wheel] == []
     assert [name for name in wanted if name not in in_sdist] == []
+
+
+def test_a_link_of_the_readme_leads_to_the_repository(built: Path) -> None:
+    """PyPI shows the README alone, so none of its links is relative."""
+    (wheel,) = built.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        headers, _, page = archive.read(metadata).decode().partition("\n\n")
+    assert f"\nVersion: {VERSION}\n" in headers
+    links = re.findall(r"\]\(([^)]+)\)", page)
+    assert len(links) > 10
+    assert [link for link in links if not link.startswith("https://")] == []
+
+
+def test_the_version_is_the_tag(tmp_path: Path) -> None:
+    """A checkout at a tag is that version; without a tag and without git it is a development version."""
+    copy_sources(tmp_path)
+    git = ["git", "-c", "user.name=test", "-c", "user.email=test@example.org", "-c", "commit.gpgsign=false"]
+    ask = [sys.executable, "-m", "setuptools_scm"]
+    assert run(*ask, cwd=tmp_path).stdout.strip() == "0.1.0.dev0"
+    for words in (["init", "--quiet"], ["add", "."], ["commit", "--quiet", "-m", "one"]):
+        assert run(*git, *words, cwd=tmp_path).returncode == 0
+    assert re.fullmatch(r"0\.1\.0\.dev\d+\+g\w+", run(*ask, cwd=tmp_path).stdout.strip())
+    assert run(*git, "tag", "v0.2.0", cwd=tmp_path).returncode == 0
+    assert run(*ask, cwd=tmp_path).stdout.strip() == "0.2.0"
+
+
+def test_the_program_says_its_version(macs: Path, tmp_path: Path) -> None:
+    """On the command line and in Python it is the wheel's."""
+    assert run(macs, "--version", cwd=tmp_path).stdout == f"macs-zenoh {VERSION}\n"
+    says = "import macs_zenoh; print(macs_zenoh.__version__)"
+    assert run(macs.parent / "python", "-c", says, cwd=tmp_path).stdout == f"{VERSION}\n"
+
+
+def test_a_whole_round(macs: Path, tmp_path: Path) -> None:
+    """Router, gateway, robot and headset out of the wheel alone: data comes, commands move the robot."""
+    pytest.importorskip("rclpy")
+    ros = os.environ.get("AMENT_PREFIX_PATH") or sys.prefix
+    done = run(
+        macs, *["up", "--demo", "--once", "--port", "0", "--router-port", "0"], cwd=tmp_path, AMENT_PREFIX_PATH=ros
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_the_installed_program_is_the_wheel(macs: Path, tmp_path: Path) -> None:
