@@ -25,6 +25,7 @@ from macs_zenoh.protocol.messages import (
     encode_management,
 )
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.streams import Streams
 
 from .worker import say
 
@@ -61,8 +62,9 @@ class Robot:
         message = encode_message(metadata.encode(), (CDR + bytes(size))[:size])
         targets = StreamData({str(UNITY): sorted(self.registrants)})
         frame = encode_frame(ROS, management=encode_management(targets), message=message)
+        streams = Streams(self.agent)
         for _ in range(count):
-            self.agent.publish_stream(self.node.node_name, frame)
+            streams.publish(self.node.node_name, frame)
             await asyncio.sleep(pause_s)
         return {"frame_bytes": len(frame), "message_bytes": len(message)}
 

@@ -19,14 +19,16 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import NamedTuple
 
-from .config import MeshSettings, Priority, TrafficRule, changed
-from .errors import CallTimeout, OutOfRange, Unreachable, UsageError, WireError
+from .config import MeshSettings, TrafficRule, changed
+from .errors import CallTimeout, Closed, OutOfRange, Unreachable, UsageError, WireError
+from .handles import Callbacks, Handle
 from .identity import Identity
 from .mesh import Aged, Mesh, Sample, Subscription, Traffic
 from .presence import Presence
+from .protocol.agent_id import AgentId
 from .protocol.directory import AgentInfo, Change, Directory
 from .protocol.guard import Guard
-from .protocol.keyexpr import BROADCAST, CALL, GROUP, STREAM, type_name, type_number
+from .protocol.keyexpr import BROADCAST, CALL, GROUP, type_name, type_number
 from .protocol.messages import BROADCAST as EVERYBODY
 from .protocol.messages import Metadata, NodeType
 from .protocol.reading import Message, Reader
@@ -57,7 +59,7 @@ OnId = Callable[[int, int], None]
 
 
 class Agent:
-    """One agent. Made by `join`; all methods belong to its event loop, except `publish_stream`.
+    """One agent. Made by `join`; all methods belong to its event loop.
 
     ``drops`` counts by name what was lost: ``inbox_full`` (received faster than taken; the oldest goes),
     ``bad_frame``, ``no_destination``, ``unknown_agent`` (sent to an id that is not online).
@@ -76,15 +78,15 @@ class Agent:
         self._identity = Identity(mesh, self._presence, agent_type, group, listen=self._listen, on_id=self._id_changed)
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
         self._reader = Reader(self._layout, self._bad_frame)
-        self._stream_keys: dict[str, str] = {}
         self._inbox: deque[Message] = deque()
         self._arrived = asyncio.Event()
         self._on_message: OnMessage = self._keep_message
         self._closed = False
         self._declared: list[Subscription] = []
-        self._on_presence: list[OnPresence] = []
-        self._on_id: list[OnId] = []
-        self._served: list[tuple[Callable[[], Subscription], Subscription]] = []
+        self._on_presence: Callbacks[OnPresence] = Callbacks()
+        self._on_id: Callbacks[OnId] = Callbacks()
+        self._served: dict[Handle, tuple[Callable[[], Subscription], Subscription]] = {}
+        """What makes it anew, for another id, and what there is now."""
         self._warned: set[tuple[int, int]] = set()
 
     @property
@@ -98,7 +100,7 @@ class Agent:
         return self._presence.directory
 
     def __repr__(self) -> str:
-        return f"<Agent {self.type}/{self.id} group {self.group}>"
+        return f"<Agent {AgentId(self.type_number, self.id)} group {self.group}>"
 
     # -- send ----------------------------------------------------------------------------------------------------
 
@@ -106,50 +108,43 @@ class Agent:
         self,
         data: bytes,
         *,
-        to: str,
+        to: str | int,
         ids: Sequence[int] = (),
         groups: Sequence[int] = (),
         metadata: Metadata | None = None,
     ) -> None:
-        """Send to agents of one type (``"ros"``, ``"unity"``), by id, by group or both. Returns at once.
+        """Send to agents of one type (``"ros"``, ``"unity"`` or its number), by id, by group or both.
 
-        An agent named by id and by group gets one copy. Raises TooManyDestinations, OutOfRange, UsageError.
+        Returns at once; `drain` waits. An agent named by id and by group gets one copy. Raises TooManyDestinations,
+        OutOfRange, UsageError, Closed.
         """
         if not ids and not groups:
             raise UsageError("send to whom? give ids or groups, or use broadcast")
         self._send(type_number(to), tuple(ids), tuple(groups), data, metadata)
 
+    def reply(self, message: Message, data: bytes, *, metadata: Metadata | None = None) -> None:
+        """Send to who sent ``message``, with its request id, by which the sender may know what is answered."""
+        metadata = metadata or Metadata(request_id=message.metadata.request_id)
+        self.send(data, to=message.sender_type, ids=[message.sender_id], metadata=metadata)
+
     def broadcast(self, data: bytes, *, metadata: Metadata | None = None) -> None:
         """Send to every agent of every type, except this one."""
         self._send(EVERYBODY, (), (), data, metadata)
 
-    def publish_stream(self, node: str, frame: bytes) -> None:
-        """Put topic data on this agent's stream key, once for all registrants. From any thread.
+    async def drain(self) -> None:
+        """Wait until all that was sent is in the hands of Zenoh, which sends it before the agent leaves the mesh.
 
-        ``frame`` is a whole frame whose management data lists who gets it (StreamData).
+        To send much, wait after each piece: `send` returns at once, and what waits is bounded. Above that it is lost
+        and counted by the mesh as ``backlog``.
         """
-        self.mesh.put(self._stream_key(node), frame, Traffic.STREAM)
-
-    def prioritise_stream(self, node: str, priority: Priority | None) -> None:
-        """Put a node's topic data at this priority; None: at the usual one. From any thread."""
-        self.mesh.prioritise(self._stream_key(node), priority)
-
-    def keep_stream(self, node: str, frames: int | None) -> bool:
-        """Keep so many frames of a node's topic data for gateways that miss some; None: as the traffic rules say.
-        Returns whether any are kept. From any thread."""
-        return self.mesh.keep(self._stream_key(node), frames)
-
-    def _stream_key(self, node: str) -> str:
-        key = self._stream_keys.get(node)
-        if key is None:
-            key = self._stream_keys[node] = STREAM.of(type=self.type_number, id=self.id, node=node)
-        return key
+        self._check_open()
+        await self.mesh.drain()
 
     def _send(
         self, to: int, ids: tuple[int, ...], groups: tuple[int, ...], data: bytes, metadata: Metadata | None
     ) -> None:
-        if isinstance(data, str):
-            raise UsageError("data is bytes, not text: send(text.encode(), ...)")
+        self._check_open()
+        check_bytes(data)
         stamped = self._stamp(metadata or Metadata())
         frame = encode_frame(to, ids, groups, message=encode_message(stamped.encode(), data), layout=self._layout)
         traffic = Traffic.COMMAND if stamped.node_type == NodeType.PUBLISHER else Traffic.CALL
@@ -174,10 +169,9 @@ class Agent:
     # -- receive -------------------------------------------------------------------------------------------------
 
     async def receive(self) -> Message:
-        """The next message sent to this agent's id, its group or everybody. Raises Unreachable once closed."""
+        """The next message sent to this agent's id, its group or everybody. Raises Closed once it is."""
         while not self._inbox:
-            if self._closed:
-                raise Unreachable(repr(self), "it has left the mesh")
+            self._check_open()
             self._arrived.clear()
             await self._arrived.wait()
         return self._inbox.popleft()
@@ -187,14 +181,23 @@ class Agent:
         while True:
             try:
                 yield await self.receive()
-            except Unreachable:
+            except Closed:
                 return
 
-    def on_message(self, handler: OnMessage) -> None:
-        """Pass messages to ``handler``, on the loop, instead of keeping them for `receive`; it should not raise."""
+    def on_message(self, handler: OnMessage) -> Handle:
+        """Pass messages to ``handler``, on the loop, instead of keeping them for `receive`; it should not raise.
+
+        There is one handler at a time: another one takes its place. Closed, messages are kept again.
+        """
         self._on_message = handler
         while self._inbox:
             handler(self._inbox.popleft())
+
+        def end() -> None:
+            if self._on_message is handler:
+                self._on_message = self._keep_message
+
+        return Handle(end)
 
     def _keep_message(self, message: Message) -> None:
         if len(self._inbox) >= self.INBOX:
@@ -232,7 +235,7 @@ class Agent:
 
     async def call(
         self,
-        to: str,
+        to: str | int,
         id: int,  # noqa: A002 - what everybody calls it
         verb: str,
         data: bytes = b"",
@@ -243,9 +246,12 @@ class Agent:
         """Ask one agent to do ``verb`` and return its answer.
 
         Raises Refused with the other side's reason, Unreachable when it is not there or does not serve the verb,
-        CallTimeout.
+        CallTimeout, which is a TimeoutError, UsageError, Closed.
         """
+        self._check_open()
+        check_bytes(data)
         kind = type_number(to)
+        target = f"{AgentId(kind, id)} {verb}"
         stamped = self._stamp(metadata or Metadata())
         key, frame = call((kind, id), verb, (self.type_number, self.id), data, stamped, self._layout)
         deadline = time.monotonic() + timeout_s
@@ -253,15 +259,16 @@ class Agent:
             try:
                 return await self.mesh.query(key, frame, timeout_s=max(0.001, deadline - time.monotonic()))
             except CallTimeout:
-                raise CallTimeout(f"{to}/{id} {verb}", timeout_s) from None
+                raise CallTimeout(target, timeout_s) from None
             except Unreachable as error:
                 # an agent that has just come is online a moment before it serves
                 if (kind, id) not in self.directory or time.monotonic() + RETRY_S > deadline:
-                    raise Unreachable(f"{to}/{id} {verb}", error.why) from None
+                    raise Unreachable(target, error.why) from None
             await asyncio.sleep(RETRY_S)
 
-    def serve(self, verb: str, handler: CallHandler, *, first: CallFirst | None = None) -> Subscription:
-        """Answer calls of ``verb`` with ``await handler(call)``; raise Refused in it to refuse with a reason.
+    def serve(self, verb: str, handler: CallHandler, *, first: CallFirst | None = None) -> Handle:
+        """Answer calls of ``verb`` with ``await handler(call)``, until the handle is closed; raise Refused in it to
+        refuse with a reason.
 
         ``first(call)`` is called before that, in a thread of Zenoh's, whatever the loop is busy with; it may refuse.
         It takes a moment until the whole mesh knows; callers who see this agent online ask again meanwhile.
@@ -284,9 +291,15 @@ class Agent:
             at_once = None if first is None else lambda key, payload: first(read(key, payload))
             return self.mesh.serve(self._calls_of(verb), answer, first=at_once, gate=self._guard)
 
+        self._check_open()
         serving = serve()
-        self._served.append((serve, serving))
-        return self._keep(serving)
+        handle = Handle(lambda: self._end_serving(handle))
+        self._served[handle] = (serve, serving)
+        return handle
+
+    def _end_serving(self, handle: Handle) -> None:
+        _, serving = self._served.pop(handle)
+        serving.close()
 
     def _calls_of(self, verb: str) -> str:
         return CALL.every(type=self.type_number, id=self.id, verb=verb)
@@ -297,20 +310,21 @@ class Agent:
         """Everybody on the mesh now, this agent included, by type and id."""
         return list(self.directory)
 
-    def on_presence(self, callback: OnPresence) -> None:
+    def on_presence(self, callback: OnPresence) -> Handle:
         """Call ``callback(agent, online)`` when somebody comes, changes group or leaves; now for all who are here."""
-        self._on_presence.append(callback)
+        handle = self._on_presence.add(callback)
         for agent in self.directory:
             callback(agent, True)
+        return handle
 
-    def on_id(self, callback: OnId) -> None:
+    def on_id(self, callback: OnId) -> Handle:
         """Call ``callback(old, new)`` when the id has had to change; then ``id`` is the new one already.
 
         That happens to agents that took a free id, when two parts of a mesh meet in which two took the same. What
         this agent receives, serves and sends goes on under the new id. What others registered here was for the old
         one, which is somebody else's now.
         """
-        self._on_id.append(callback)
+        return self._on_id.add(callback)
 
     def _presence_changed(self, changes: list[Change]) -> None:
         for agent, online in changes:
@@ -321,10 +335,8 @@ class Agent:
 
     def _id_changed(self, old: int, new: int) -> None:
         self.id = new
-        self._stream_keys = {}
-        for serve, serving in self._served:
-            if serving.is_open:
-                serving.become(serve())
+        for serve, serving in self._served.values():
+            serving.become(serve())
         for callback in self._on_id:
             callback(old, new)
 
@@ -348,15 +360,29 @@ class Agent:
         self._declared.append(declared)
         return declared
 
+    def _check_open(self) -> None:
+        if self._closed:
+            raise Closed(str(AgentId(self.type_number, self.id)))
+
     def close(self) -> None:
         """Leave: the agent is offline at once. The mesh stays open."""
         self._closed = True
         self._identity.close()
+        for handle in reversed(list(self._served)):
+            handle.close()
         for declared in reversed(self._declared):
             declared.close()
         self._declared.clear()
         self._presence.close()
         self._arrived.set()
+
+
+def check_bytes(data: object) -> None:
+    """Raise UsageError for what is no bytes, text above all."""
+    if isinstance(data, str):
+        raise UsageError("data is bytes, not text: write text.encode(), and data.decode() on the other side")
+    if not isinstance(data, bytes | bytearray | memoryview):
+        raise UsageError(f"data is bytes, not {type(data).__name__}")
 
 
 async def _echo(call: Call) -> bytes:
@@ -392,7 +418,7 @@ async def join(
         UsageError: the id is taken or out of range, the type unknown.
         ConfigError: Zenoh does not accept the settings.
     """
-    kind = type_number(str(agent_type))
+    kind = type_number(agent_type)
     if not 0 <= group <= 255:
         raise OutOfRange("group", group, 0, 255)
     settings = settings or MeshSettings()

@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 from .agent import Agent
 from .errors import Refused, Unreachable, UsageError, WireError
+from .handles import Callbacks, Handle
 from .mesh import Mesh, Sample, Subscription, Token, Traffic
 from .protocol import ids as blocks
 from .protocol import named
@@ -123,7 +124,7 @@ class Awareness:
         self._per_type: dict[str, list[Subscription]] = {}
         self._asking: set[str] = set()
         self._warned: set[tuple[str, str]] = set()
-        self._on_change: list[Callable[[str], None]] = []
+        self._on_change: Callbacks[Callable[[str], None]] = Callbacks()
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -136,9 +137,9 @@ class Awareness:
         """Everybody with a name except this one."""
         return [agent for agent in self.names if agent.name != self.name]
 
-    def on_change(self, callback: Callable[[str], None]) -> None:
+    def on_change(self, callback: Callable[[str], None]) -> Handle:
         """Call ``callback(name)`` when an agent comes, leaves, or takes other types than before."""
-        self._on_change.append(callback)
+        return self._on_change.add(callback)
 
     async def wait_for(self, name: str, message_type: str | None = None, *, timeout_s: float) -> None:
         """Wait until an agent is there (and takes a type). Raises Unreachable."""
@@ -492,9 +493,10 @@ async def join(
         reliable=reliable,
         max_message_bytes=max_message_bytes,
     )
-    agent.on_id(lambda old, new: awareness.change_id(new))
+    following_id = agent.on_id(lambda old, new: awareness.change_id(new))
     try:
         await awareness.start()
         yield awareness
     finally:
+        following_id.close()
         awareness.close()

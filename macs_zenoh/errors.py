@@ -19,8 +19,10 @@
     ├── MissingExtra              this installation
     ├── Refused                   the other end answered, and said no
     │   └── HeldByAnother
+    ├── Closed                    what was used has been closed here
     └── Unreachable               the world
-        └── CallTimeout
+        ├── NotServed
+        └── CallTimeout           (also a TimeoutError)
 
 Numbers are attributes; the text is made from them.
 """
@@ -162,6 +164,14 @@ class HeldByAnother(Refused):
         self.holder = holder
 
 
+class Closed(MacsError):
+    """What was used has been closed on this side."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what} is closed")
+        self.what = what
+
+
 class Unreachable(MacsError):
     """A router or an agent cannot be reached."""
 
@@ -178,7 +188,7 @@ class NotServed(Unreachable):
         super().__init__(target, "nobody there answers this call")
 
 
-class CallTimeout(Unreachable):
+class CallTimeout(Unreachable, TimeoutError):
     """A call was not answered in time."""
 
     def __init__(self, target: str, timeout_s: float) -> None:

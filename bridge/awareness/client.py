@@ -28,6 +28,7 @@ from std_msgs.msg import String
 
 from bridge.awareness.node import AGENTS_TOPIC, LATCHED, QOS, UNDELIVERED_TOPIC
 from bridge.awareness.registrar import LOOK_S, Entry, Registrar
+from macs_zenoh.handles import Callbacks, Handle
 
 log = logging.getLogger("macs.awareness")
 
@@ -84,7 +85,7 @@ class GatewayClient:
         self._modules: list[Module] = []
         self._held: deque[Any] = deque()
         self._agents: dict[str, list[str]] = {}
-        self._on_undelivered: list[OnUndelivered] = []
+        self._on_undelivered: Callbacks[OnUndelivered] = Callbacks()
         self._registrar = Registrar(node, service)
         # typed callbacks of one client never run at the same time, and never wait for the registrations
         self._group = MutuallyExclusiveCallbackGroup()
@@ -218,13 +219,13 @@ class GatewayClient:
         with self._lock:
             return sorted(n for n, types in self._agents.items() if message_type is None or message_type in types)
 
-    def on_undelivered(self, callback: OnUndelivered) -> None:
+    def on_undelivered(self, callback: OnUndelivered) -> Handle:
         """Call ``callback(agent, message_type, why)`` for messages of this robot that were not delivered. Without any
         such callback they are logged.
 
         ``why`` is a text as ``no such agent`` or ``not registered``.
         """
-        self._on_undelivered.append(callback)
+        return self._on_undelivered.add(callback)
 
     def _take_agents(self, message: Any) -> None:
         agents = {name: list(agent["takes"]) for name, agent in json.loads(message.data).items()}

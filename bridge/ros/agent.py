@@ -36,6 +36,7 @@ from macs_zenoh.protocol.messages import AddNode, FunctionalityRequest, Metadata
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.registrations import check_own
 from macs_zenoh.protocol.wire import Layout
+from macs_zenoh.streams import Streams
 
 log = logging.getLogger("macs.ros")
 
@@ -73,21 +74,22 @@ class RobotAgent:
         self._loop_thread = threading.get_ident()
         self.agent = agent
         self.session = session
+        self.streams = Streams(agent)
         robot = Robot(
             session,
             agent.id,
-            agent.publish_stream,
+            self.streams.publish,
             Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots),
             send=self._send,
             rules=Rules(settings),
             group_of=self._group_of,
             is_online=lambda agent: agent in self.agent.directory,
-            prioritise_stream=agent.prioritise_stream,
-            keep_stream=agent.keep_stream,
+            prioritise_stream=self.streams.prioritise,
+            keep_stream=self.streams.keep,
         )
         self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
         self.checked = CheckedSettings(robot.rules, robot.drops)
-        self.offers = Offers(robot, agent.publish_stream, self._graph_changed)
+        self.offers = Offers(robot, self.streams.publish, self._graph_changed)
         self._answering: dict[asyncio.Task[None], Registrant] = {}
         self._sessions: dict[Registrant, tuple[str, int]] = {}
         """Who has an id, or had it last."""
@@ -263,7 +265,7 @@ class RobotAgent:
         self.nodes.forget_all()
         self.offers.close()
         self.nodes.robot.agent_id = new
-        self.offers = Offers(self.nodes.robot, self.agent.publish_stream, self._graph_changed)
+        self.offers = Offers(self.nodes.robot, self.streams.publish, self._graph_changed)
 
     def _link(self, up: bool) -> None:
         """Without a router nobody is seen to leave, and no command comes: after a lease all commanders count as gone.

@@ -14,6 +14,7 @@ import zenoh
 import zenoh.ext
 
 from macs_zenoh.config import Priority
+from macs_zenoh.handles import Callbacks, Handle
 from macs_zenoh.protocol.keyexpr import NAMED_ALL, STREAM
 from macs_zenoh.protocol.policing import Policer, Policy
 
@@ -94,7 +95,7 @@ class Outgoing:
         self._outlets_lock = threading.Lock()
         self._fresh: OrderedDict[tuple[str, bool], int] = OrderedDict()
         """How often keys were put with that have no publisher yet, by key and whether apart."""
-        self._on_room: list[Callable[[], None]] = []
+        self._on_room: Callbacks[Callable[[], None]] = Callbacks()
         self._sender = Sender(backlog_bytes, arrivals.put, lambda: from_thread(self._room))
 
     def link_changed(self, linked: bool) -> None:
@@ -182,9 +183,13 @@ class Outgoing:
         """Whether so much waits to be sent that callers should slow down; `on_room` tells when it is over."""
         return self._sender.backlogged
 
-    def on_room(self, callback: Callable[[], None]) -> None:
+    def on_room(self, callback: Callable[[], None]) -> Handle:
         """Call ``callback`` whenever a backlog has gone."""
-        self._on_room.append(callback)
+        return self._on_room.add(callback)
+
+    def when_sent(self, callback: Callable[[], None]) -> None:
+        """Call ``callback``, from any thread, when Zenoh has all that was put before."""
+        self._sender.when_sent(callback)
 
     def _room(self) -> None:
         for callback in self._on_room:
@@ -301,7 +306,8 @@ class Sender:
         self._limit_bytes = limit_bytes
         self._on_room = on_room
         self._bytes = 0
-        self._queue: deque[tuple[Outlet, Payload]] = deque()
+        self._queue: deque[tuple[Outlet, Payload] | Callable[[], None]] = deque()
+        """What is to be put, and who is to be told that all before it has been."""
         self._wake = threading.Condition()
         self._thread: threading.Thread | None = None
         self._closing = False
@@ -325,6 +331,14 @@ class Sender:
             self._wake.notify()
         return True
 
+    def when_sent(self, callback: Callable[[], None]) -> None:
+        """Call ``callback``, in any thread, when all that is queued now has been put."""
+        with self._wake:
+            if not self.idle:
+                self._queue.append(callback)
+                return
+        callback()
+
     def close(self, timeout_s: float) -> None:
         """Send what is queued, for at most ``timeout_s``, and end."""
         with self._wake:
@@ -340,7 +354,11 @@ class Sender:
                     if self._closing:
                         return
                     self._wake.wait()
-                publisher, payload = self._queue.popleft()
+                entry = self._queue.popleft()
+            if not isinstance(entry, tuple):
+                entry()
+                continue
+            publisher, payload = entry
             self._put(publisher, payload)
             with self._wake:
                 self._bytes -= len(payload)

@@ -26,6 +26,7 @@ from macs_zenoh.errors import (
     Refused,
     Unreachable,
 )
+from macs_zenoh.handles import Callbacks, Handle
 from macs_zenoh.protocol import ping
 from macs_zenoh.protocol.directory import published
 from macs_zenoh.protocol.guard import Gate
@@ -112,8 +113,8 @@ class Mesh:
         self.away: Callable[[], list[tuple[int, int]]] = list
         """(type, id) of a gateway's agents that are silent."""
         self._linked_with: set[str] = set()
-        self._on_link: list[Callable[[bool], None]] = []
-        self._on_router: list[Callable[[str], None]] = []
+        self._on_link: Callbacks[Callable[[bool], None]] = Callbacks()
+        self._on_router: Callbacks[Callable[[str], None]] = Callbacks()
         self._tasks: set[asyncio.Task[None]] = set()
         # links, not transports, and directly: Zenoh tells of a lost link before it tells that everybody behind it
         # left, and of the lost transport only after that
@@ -235,13 +236,13 @@ class Mesh:
         """Zenoh ids of the routers connected now."""
         return sorted(str(zid) for zid in self._session.info.routers_zid())
 
-    def on_link(self, callback: Callable[[bool], None]) -> None:
+    def on_link(self, callback: Callable[[bool], None]) -> Handle:
         """Call ``callback(up)`` whenever the connection to the routers is lost or back."""
-        self._on_link.append(callback)
+        return self._on_link.add(callback)
 
-    def on_router(self, callback: Callable[[str], None]) -> None:
+    def on_router(self, callback: Callable[[str], None]) -> Handle:
         """Call ``callback(zid)`` whenever a connection to a router has come about, or has come back."""
-        self._on_router.append(callback)
+        return self._on_router.add(callback)
 
     def _link_changed(self, event: zenoh.LinkEvent) -> None:
         self._from_thread(self._set_link, str(event.link.zid), event.kind == zenoh.SampleKind.PUT)
@@ -264,6 +265,18 @@ class Mesh:
         for state in [False, True] if not up and self.linked else [up]:
             for callback in self._on_link:
                 callback(state)
+
+    async def drain(self) -> None:
+        """Wait until Zenoh has all that was put here before: what is large, or follows it, waits for a thread. How
+        much of it has left this machine Zenoh does not tell."""
+        sent: asyncio.Future[None] = self._loop.create_future()
+
+        def tell() -> None:
+            if not sent.done():
+                sent.set_result(None)
+
+        self._outgoing.when_sent(lambda: self._from_thread(tell))
+        await sent
 
     # -- publish and subscribe -----------------------------------------------------------------------------------
 

@@ -20,6 +20,7 @@ from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol import named
 from macs_zenoh.protocol.keyexpr import NAMED, PRESENCE, STREAM
 from macs_zenoh.protocol.messages import OPERATOR
+from macs_zenoh.streams import Streams
 
 RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
 USERS = ("robot-7", "gateway-1", "observer")
@@ -98,7 +99,7 @@ async def test_what_the_rules_allow_works(as_user: Callable[[str], MeshSettings]
 
         headset.mesh.subscribe(STREAM.every(type=1, id=7), take)
         await headset.call("ros", 7, "ask")  # by its answer the robot knows of the subscription
-        robot.publish_stream("nd__pose", b"topic data")
+        Streams(robot).publish("nd__pose", b"topic data")
         assert await asyncio.wait_for(streamed.get(), 5) == b"topic data"
 
 

@@ -24,6 +24,7 @@ from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_
 from macs_zenoh.protocol.outbox import Chunk, Outbox
 from macs_zenoh.protocol.tcp_agent import TcpAgent
 from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.streams import Streams
 from tests.integration.conftest import StartGateway, until
 
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy" fixture is deprecated')
@@ -113,7 +114,7 @@ async def test_topic_data_goes_past_the_loop(start_gateway: StartGateway, robot:
     ids = [headset.id for headset in headsets]
     await registered(gateway, ids)
     for i in range(60):
-        robot.publish_stream(TOPIC.name, image(ids, i, 400 + 4 * (i % 5)))
+        Streams(robot).publish(TOPIC.name, image(ids, i, 400 + 4 * (i % 5)))
         await asyncio.sleep(0.005)
     for headset in headsets:
         got: list[int] = []
@@ -134,7 +135,7 @@ async def test_a_headset_that_reads_late_gets_whole_messages(
     await registered(gateway, [slow.id])
     count = 300
     for i in range(count):  # about 20 MB, more than the sockets hold
-        robot.publish_stream(TOPIC.name, image([slow.id], i, 70_000))
+        Streams(robot).publish(TOPIC.name, image([slow.id], i, 70_000))
         await asyncio.sleep(0.002)
     await asyncio.sleep(0.2)
     assert len(sent_now) > 10
@@ -181,10 +182,10 @@ async def test_both_ways_into_one_socket_keep_messages_apart(
     asking, reading = asyncio.to_thread(ask), asyncio.to_thread(read)
     tasks = asyncio.gather(asking, reading)
     for i in range(400):
-        robot.publish_stream(TOPIC.name, image([headset.id], i, 60_000))
+        Streams(robot).publish(TOPIC.name, image([headset.id], i, 60_000))
         await asyncio.sleep(0.004)
     stop.set()
-    robot.publish_stream(TOPIC.name, image([headset.id], 400, 60_000))
+    Streams(robot).publish(TOPIC.name, image([headset.id], 400, 60_000))
     await tasks
     topic = [data for metadata, data in seen if IMAGE in metadata]
     answers = [data for metadata, data in seen if IMAGE not in metadata]
@@ -204,7 +205,7 @@ async def test_descriptors_are_given_back(start_gateway: StartGateway, robot: Ag
         headset = await asyncio.to_thread(Raw, gateway.port)
         await registered(gateway, [headset.id])
         for i in range(10):
-            robot.publish_stream(TOPIC.name, image([headset.id], i, 60_000))
+            Streams(robot).publish(TOPIC.name, image([headset.id], i, 60_000))
             await asyncio.sleep(0.002)
             if i == round_ % 10:
                 headset.socket.close()

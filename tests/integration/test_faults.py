@@ -10,6 +10,7 @@ import macs_zenoh
 from bridge.headset.client import Headset
 from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.streams import Streams
 from tests.programs import Program, free_port
 
 
@@ -49,7 +50,7 @@ async def test_the_router_is_killed_and_comes_back() -> None:
             for stream in chatters:
                 arrived = asyncio.ensure_future(stream.__anext__())
                 while not arrived.done():
-                    robot.publish_stream("nd__chatter", chatter([first.id, second.id], b"y"))
+                    Streams(robot).publish("nd__chatter", chatter([first.id, second.id], b"y"))
                     await asyncio.wait([arrived], timeout=0.05)
 
         await asyncio.wait_for(works(), 10)

@@ -25,6 +25,7 @@ from macs_zenoh.protocol.messages import (
     encode_management,
 )
 from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.streams import Streams
 from tests.integration.conftest import Connect, StartGateway, until
 
 METADATA = Metadata(message_manager="Greeting").encode()
@@ -278,7 +279,7 @@ async def test_a_stalled_headset_is_let_go(router: str, start_gateway: StartGate
         robot.on_presence(lambda agent, online: left.set() if agent.id == stalled.id and not online else None)
         received = 0
         while not left.is_set():
-            robot.publish_stream("nd__image", image)
+            Streams(robot).publish("nd__image", image)
             with suppress(asyncio.TimeoutError):  # until the registration is there, nobody listens
                 message = await asyncio.wait_for(images.__anext__(), 0.1)
                 assert len(message.data) == 200_000

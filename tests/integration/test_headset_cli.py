@@ -33,6 +33,7 @@ from macs_zenoh.protocol.messages import (
     node_name,
 )
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.streams import Streams
 from macs_zenoh.typed import Types, request_of, response_of
 
 ROOT = Path(__file__).parents[2]
@@ -80,7 +81,7 @@ class EchoRobot:
         metadata = Metadata(1, self.agent.id, 0, StreamData.manager, NodeType.SUBSCRIBER, node, data_type)
         management = encode_management(StreamData({"2": sorted(registrants)}))
         message = encode_message(metadata.encode(), cdr)
-        self.agent.publish_stream(node, encode_frame(1, management=management, message=message))
+        Streams(self.agent).publish(node, encode_frame(1, management=management, message=message))
 
     async def registered(self, kind: NodeType, node: str, count: int = 1) -> list[int]:
         """Wait until so many headsets are registered on a node; their ids."""

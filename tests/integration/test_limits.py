@@ -26,6 +26,7 @@ from macs_zenoh.protocol.messages import (
     encode_management,
 )
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.streams import Streams
 from tests.integration.conftest import Connect, StartGateway, until
 from tests.programs import Program, free_port
 
@@ -106,7 +107,7 @@ async def test_a_stalled_headset_costs_its_limit() -> None:
         before = memory_bytes(gateway.pid)
         arrived = 0
         while arrived < 1000:
-            sender.publish_stream("nd__image", image)
+            Streams(sender).publish("nd__image", image)
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(images.__anext__(), 0.2)
                 arrived += 1

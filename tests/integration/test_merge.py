@@ -42,6 +42,7 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.registrations import AgentKey, Task
 from macs_zenoh.protocol.wire import Layout, MessageDecoder, encode_frame, encode_message, split_message
 from macs_zenoh.registration_calls import RobotCalls
+from macs_zenoh.streams import Streams
 from tests.integration.conftest import until
 from tests.links import Link, counted
 from tests.programs import Program, macs
@@ -157,7 +158,7 @@ class Robot:
         registrants = sorted(self.registrants.get((NodeType.SUBSCRIBER, "nd__chatter"), ()))
         management = encode_management(StreamData({"2": registrants}))
         frame = encode_frame(1, management=management, message=encode_message(metadata.encode(), text))
-        self.agent.publish_stream("nd__chatter", frame)
+        Streams(self.agent).publish("nd__chatter", frame)
 
     async def _add(self, call: macs_zenoh.Call) -> bytes:
         node = decode_data(AddNode, call.data)
@@ -435,7 +436,7 @@ async def test_two_agents_have_leased_the_same_id(sites: Sites, caplog: pytest.L
     streamed: list[str] = []
     watching = other.mesh.subscribe("macs/from/**", lambda batch: streamed.extend(key for key, _ in batch))
     while not streamed:
-        two.publish_stream("nd__x", b"")
+        Streams(two).publish("nd__x", b"")
         await asyncio.sleep(0.05)
     watching.close()
     assert set(streamed) == {"macs/from/ros/2/nd__x"}

@@ -31,6 +31,7 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.routing import call, unicast_key
 from macs_zenoh.protocol.wire import PROBE, encode_frame, encode_message
+from macs_zenoh.streams import Streams
 from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_gateway import Socket, socket
 
@@ -174,12 +175,12 @@ async def test_topic_data_only_for_whom_registered_it(
         true = await of_eight.subscribe("/chatter", "std_msgs/String", agents=[8])
         for headset in (of_seven, of_eight):
             await headset.online()  # the gateway knows of the registrations
-        seven.publish_stream("nd__chatter", data(8, "nd__chatter", b"forged"))
-        seven.publish_stream("nd__other", data(7, "nd__chatter", b"under another node's key"))
-        seven.publish_stream("nd__other", data(7, "nd__other", b"seven's"))
+        Streams(seven).publish("nd__chatter", data(8, "nd__chatter", b"forged"))
+        Streams(seven).publish("nd__other", data(7, "nd__chatter", b"under another node's key"))
+        Streams(seven).publish("nd__other", data(7, "nd__other", b"seven's"))
         heard = await asyncio.wait_for(other.__anext__(), 5)
         assert bytes(heard.data) == b"seven's"
-        eight.publish_stream("nd__chatter", data(8, "nd__chatter", b"eight's"))
+        Streams(eight).publish("nd__chatter", data(8, "nd__chatter", b"eight's"))
         heard = await asyncio.wait_for(true.__anext__(), 5)
         assert (bytes(heard.data), heard.metadata.sender_agent_id) == (b"eight's", 8)
         heard = await asyncio.wait_for(chatter.__anext__(), 5)
@@ -209,7 +210,7 @@ async def test_topic_data_stops_when_the_registration_does(
         metadata = Metadata(ROS, 7, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__chatter", "std_msgs/String")
         management = encode_management(StreamData({"2": [left.id, stays.id]}))
         message = encode_message(metadata.encode(), TEXT)
-        robot.publish_stream("nd__chatter", encode_frame(ROS, management=management, message=message))
+        Streams(robot).publish("nd__chatter", encode_frame(ROS, management=management, message=message))
         assert (await stays.message())[1] == TEXT
         robot.broadcast(b"next")
         assert (await left.message())[1] == b"next"

@@ -30,6 +30,7 @@ from macs_zenoh.protocol.keyexpr import NAMED_ALL
 from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, StreamData, decode_data, encode_management
 from macs_zenoh.protocol.named import Outcome
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.streams import Streams
 from tests.integration.conftest import until
 from tests.programs import free_port
 from tests.routers import Router
@@ -286,7 +287,7 @@ class Robot:
             management=encode_management(StreamData({"2": sorted(self.registrants)})),
             message=encode_message(metadata.encode(), number.to_bytes(8, "big")),
         )
-        self.agent.publish_stream("nd__log", frame)
+        Streams(self.agent).publish("nd__log", frame)
 
 
 async def test_a_headset_gets_every_message(routers: Routers) -> None:

@@ -31,6 +31,7 @@ from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.protocol.named import Outcome
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.streams import Streams
 from tests.integration.conftest import until
 from tests.integration.test_reliable import Numbers, Stream
 from tests.programs import ROOT, Program, ended, free_port, macs
@@ -358,7 +359,7 @@ async def test_a_stolen_gateway_certificate_is_no_robot(site: Site) -> None:
             other.mesh.put_unasked("macs/to/unity/2/513/unity/514", b"forged")
             real.send(b"command", to="ros", ids=[7])
             assert (await asyncio.wait_for(robot.receive(), 5)).data == b"command"
-            robot.publish_stream("nd__x", b"true")
+            Streams(robot).publish("nd__x", b"true")
             robot.send(b"true", to="unity", ids=[513])
             assert (await asyncio.wait_for(headset.receive(), 5)).data == b"true"
             await until(lambda: stream)
@@ -734,7 +735,7 @@ async def test_our_programs_work_with_the_generated_files(site: Site) -> None:
         management = encode_management(StreamData({"2": [headset.id]}))
         frame = encode_frame(1, management=management, message=encode_message(metadata.encode(), b"topic data"))
         while True:
-            robot.publish_stream("nd__pose", frame)  # until it knows of the subscription
+            Streams(robot).publish("nd__pose", frame)  # until it knows of the subscription
             with suppress(asyncio.TimeoutError):
                 message = await asyncio.wait_for(topic.__anext__(), 0.1)
                 break

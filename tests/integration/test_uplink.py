@@ -7,6 +7,7 @@ import asyncio
 import macs_zenoh
 from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.streams import Streams
 from tests.integration.conftest import Connect, StartGateway
 from tests.links import counted
 
@@ -35,7 +36,7 @@ async def test_one_copy_for_any_number_of_headsets(router: str, start_gateway: S
             """Publish until every one of ``count`` headsets has a message: registrations take their way."""
             arriving = [asyncio.ensure_future(stream.__anext__()) for stream in images[:count]]
             while not all(arrival.done() for arrival in arriving):
-                robot.publish_stream("nd__image", image(count))
+                Streams(robot).publish("nd__image", image(count))
                 await asyncio.wait(arriving, timeout=0.2)
 
         await asyncio.wait_for(deliver(20), 20)
@@ -43,7 +44,7 @@ async def test_one_copy_for_any_number_of_headsets(router: str, start_gateway: S
         for count in (1, 20):
             before = link.up_bytes
             for _ in range(10):
-                robot.publish_stream("nd__image", image(count))
+                Streams(robot).publish("nd__image", image(count))
                 for stream in images[:count]:
                     received = await asyncio.wait_for(stream.__anext__(), 5)
                     assert len(received.data) == IMAGE_BYTES

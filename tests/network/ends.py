@@ -33,6 +33,7 @@ from macs_zenoh.protocol.messages import (
     node_name,
 )
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.streams import Streams
 
 TYPE = "std_msgs/String"
 HEADER = b"\0\1\0\0"
@@ -135,7 +136,7 @@ class RobotEnd(_End):
         metadata = Metadata(1, self._agent.id, 0, StreamData.manager, NodeType.SUBSCRIBER, node, TYPE)
         management = encode_management(StreamData({"2": sorted(self._registrants[node])}))
         message = encode_message(metadata.encode(), cdr)
-        self._agent.publish_stream(node, encode_frame(1, management=management, message=message))
+        Streams(self._agent).publish(node, encode_frame(1, management=management, message=message))
 
     async def _add(self, call: macs_zenoh.Call) -> bytes:
         node = decode_data(AddNode, call.data)

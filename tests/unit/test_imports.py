@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib.util
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import macs_zenoh
+from macs_zenoh import errors
 
 ROOT = Path(__file__).parents[2]
 CORE = sorted((ROOT / "macs_zenoh").rglob("*.py"))
@@ -20,9 +22,11 @@ PURE = sorted((ROOT / "macs_zenoh" / "protocol").glob("*.py"))
 WITH_ZENOH = set((ROOT / "macs_zenoh" / "mesh").glob("*.py"))
 WITH_ASYNCIO = WITH_ZENOH | {
     ROOT / "macs_zenoh" / name
-    for name in ("agent.py", "awareness.py", "identity.py", "presence.py", "registration_calls.py")
+    for name in ("agent.py", "awareness.py", "identity.py", "presence.py", "registration_calls.py", "streams.py")
 }
 NEEDED_FROM_OUTSIDE = {"msgspec", "zenoh", "tomli"}
+OFFERED = ROOT / "macs_zenoh" / "__init__.py"
+"""It names what users import, of the bridge as well, for the type checker; it loads that when it is used."""
 INPUT_OUTPUT = {
     "socket",
     "socketserver",
@@ -76,7 +80,7 @@ def test_there_is_something_to_walk() -> None:
 @pytest.mark.parametrize("path", CORE, ids=lambda path: path.name)
 def test_the_core_imports_no_input_or_output(path: Path) -> None:
     """In macs_zenoh: no bridge, no ROS, no sockets; asyncio and zenoh only where they are said to be."""
-    used = roots(path)
+    used = {name.partition(".")[0] for name, at_once in imported(path) if at_once or path != OFFERED}
     assert not used & INPUT_OUTPUT
     assert "zenoh" not in used or path in WITH_ZENOH
     assert "asyncio" not in used or path in WITH_ASYNCIO
@@ -85,7 +89,8 @@ def test_the_core_imports_no_input_or_output(path: Path) -> None:
 @pytest.mark.parametrize("path", CORE, ids=lambda path: path.name)
 def test_the_core_needs_only_what_it_declares(path: Path) -> None:
     """Everything macs_zenoh imports is the standard library, itself or a declared dependency."""
-    assert roots(path) <= sys.stdlib_module_names | NEEDED_FROM_OUTSIDE | {"macs_zenoh"}
+    offered = {"bridge"} if path == OFFERED else set()
+    assert roots(path) <= sys.stdlib_module_names | NEEDED_FROM_OUTSIDE | {"macs_zenoh"} | offered
 
 
 @pytest.mark.parametrize(
@@ -131,11 +136,36 @@ def test_the_protocol_stands_alone(path: Path) -> None:
 def test_the_public_names_are_there() -> None:
     """Each name that macs_zenoh lists can be had, errors among them, and it knows its version."""
     for name in macs_zenoh.__all__:
-        assert getattr(macs_zenoh, name).__module__.startswith("macs_zenoh.")
-    assert {"MacsError", "UsageError", "ConfigError", "CallTimeout", "OutOfRange"} <= set(macs_zenoh.__all__)
+        if importlib.util.find_spec("as2_ca_msgs") or ("Gateway" not in name and name != "Mode"):
+            assert getattr(macs_zenoh, name).__module__.startswith(("macs_zenoh.", "bridge."))
     assert isinstance(macs_zenoh.__version__, str)
     with pytest.raises(AttributeError, match="nothing_of_ours"):
         _ = macs_zenoh.nothing_of_ours  # type: ignore[attr-defined]
+
+
+def test_every_error_can_be_caught() -> None:
+    """Whatever is raised is offered by name; an answer that does not come in time is a TimeoutError to everybody."""
+    of_errors = {name for name, kind in vars(errors).items() if isinstance(kind, type)}
+    assert of_errors | {"BadCdr", "BadValue", "UnknownType"} <= set(macs_zenoh.__all__)
+    late = macs_zenoh.CallTimeout("ros/7 look", 2.0)
+    assert isinstance(late, TimeoutError)
+    assert isinstance(late, macs_zenoh.Unreachable)
+    assert str(late) == "ros/7 look cannot be reached: no answer within 2 s"
+    assert late.timeout_s == 2.0
+
+
+def test_what_is_listed_is_what_the_type_checker_sees() -> None:
+    """Each public name is imported for the type checker, from where it is loaded."""
+    tree = ast.parse(OFFERED.read_text(encoding="utf-8"))
+    seen = {
+        alias.name: f"{'macs_zenoh.' if node.level else ''}{node.module}"
+        for scope in ast.walk(tree)
+        if isinstance(scope, ast.If) and runs_later(scope)
+        for node in scope.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert seen == macs_zenoh._MODULES
 
 
 def test_help_needs_no_zenoh() -> None:
