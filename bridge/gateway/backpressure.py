@@ -1,14 +1,13 @@
 """Holding senders back while what they send to is full.
 
-Only for a moment: an existing headset freezes when nobody reads from it. A receiver that is merely slower than a
-burst gets the time it needs; one that has stopped reading costs each sender this moment once, and then its own limits
-decide.
+Only for a moment at a time: an existing headset freezes when nobody reads from it. A receiver that is merely slower
+gets the time it needs, with some frames in between; one that has stopped reading costs each sender this moment once,
+and then its own limits decide.
 """
 
 from __future__ import annotations
 
 import asyncio
-import time
 from typing import Protocol
 
 HOLD_S = 0.25
@@ -28,29 +27,29 @@ class Backpressure:
     """One bottleneck, and the senders that wait for it."""
 
     def __init__(self) -> None:
-        self._full_since: float | None = None
+        self._moved: object = None
+        """How far the bottleneck was when senders were held last."""
         self._held: set[Sender] = set()
         self._timer: asyncio.TimerHandle | None = None
 
-    def hold(self, sender: Sender) -> None:
-        """Hold a sender back until `release`, but not beyond ``HOLD_S`` since the bottleneck became full."""
-        now = time.monotonic()
-        if self._full_since is None:
-            self._full_since = now
-            self._timer = asyncio.get_running_loop().call_later(HOLD_S, self._let_go)
-        if now - self._full_since < HOLD_S and sender not in self._held:
+    def hold(self, sender: Sender, moved: object) -> bool:
+        """Hold a sender back until `release`, but not longer than ``HOLD_S``, and not again before the bottleneck has
+        moved, which ``moved`` tells: it is another one then. Returns whether it is held."""
+        if self._timer is None:
+            if moved == self._moved:
+                return False
+            self._moved = moved
+            self._timer = asyncio.get_running_loop().call_later(HOLD_S, self.release)
+        if sender not in self._held:
             self._held.add(sender)
             sender.pause()
+        return True
 
     def release(self) -> None:
-        """There is room again."""
-        if self._full_since is not None:
-            self._full_since = None
-            if self._timer is not None:
-                self._timer.cancel()
-            self._let_go()
-
-    def _let_go(self) -> None:
+        """There is room again, or they have waited long enough."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
         held, self._held = self._held, set()
         for sender in held:
             sender.resume()

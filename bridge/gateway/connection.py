@@ -130,6 +130,7 @@ class Connection(asyncio.BufferedProtocol):
         self._rest = b""
         """What the socket did not take of a message sent past the loop: nothing else may come before it."""
         self._paused_at: float | None = None
+        self._resumed = 0
         self._timer: asyncio.TimerHandle | None = None
         self._complained: set[str] = set()
         self._nodes: dict[str, set[int]] = {}
@@ -246,7 +247,8 @@ class Connection(asyncio.BufferedProtocol):
             while self._outbox and self._paused_at is None:  # writing may pause us again
                 self._write(self._outbox.take(WRITE_BUFFER_BYTES))
         self._account()
-        if self.congested and not self._outbox:
+        self._resumed += 1
+        if not self._outbox:
             self.congested = False
             self.backpressure.release()
 
@@ -320,12 +322,23 @@ class Connection(asyncio.BufferedProtocol):
             self._account()
         self.congested = self._outbox.bytes > self._outbox.limit_bytes // 4
 
-    def send_stream(self, node: str, messages: Sequence[Chunk]) -> None:
-        """Send topic data of a node; the registration's buffer size bounds what waits."""
+    @property
+    def full(self) -> bool:
+        """Whether what is sent now has to wait."""
+        return self._paused_at is not None
+
+    @property
+    def moved(self) -> object:
+        """Another one whenever the agent has taken some of what is on its way to it."""
+        return self._resumed, self._transport.get_write_buffer_size() >> 18
+
+    def send_stream(self, node: str, messages: Sequence[Chunk], *, keep: bool = False) -> None:
+        """Send topic data of a node; the registration's buffer size bounds what waits, unless it is to be kept since
+        its sender is held back."""
         if self._paused_at is None:
             self._gather(messages)
             return
-        depth, drop_new = self.owner.stream_depth(self, node)
+        depth, drop_new = (sys.maxsize, False) if keep else self.owner.stream_depth(self, node)
         for message in messages:
             if self._has_room(len(message)):
                 self._outbox.put_stream(node, message, depth=depth, drop_new=drop_new)

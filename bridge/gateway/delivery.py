@@ -144,6 +144,7 @@ class Delivery:
             stream = self.streams.get(key)
             if stream is None:
                 continue  # the last registrant has just left
+            robot = self._agents.find(*stream.robot)
             for frame, metadata in self._read(key, payload, stream.robot):
                 registered = stream.registrants if stream.carries(metadata) else NOBODY
                 fits, messages = frame.carries(CDR, least_bytes(metadata)), frame.messages
@@ -152,10 +153,11 @@ class Delivery:
                     if connection is None:
                         continue
                     if registrant in registered:
+                        keep = connection.full and self._holds_robot(robot, connection)
                         if connection.existing and not fits:
-                            self._send_fitting(connection, frame, metadata, topic_data(metadata), stream.node)
+                            self._send_fitting(connection, frame, metadata, topic_data(metadata), stream.node, keep)
                         else:
-                            connection.send_stream(stream.node, messages)
+                            connection.send_stream(stream.node, messages, keep=keep)
                     else:
                         self._unregistered(connection, frame, metadata)
         self.flush()
@@ -240,7 +242,13 @@ class Delivery:
         connection.complain(verdict.name, f"{verdict.why} (sent by {_who(metadata)})", frame.count)
 
     def _send_fitting(
-        self, connection: Connection, frame: Frame, metadata: Metadata, data: Data, stream: str | None = None
+        self,
+        connection: Connection,
+        frame: Frame,
+        metadata: Metadata,
+        data: Data,
+        stream: str | None = None,
+        keep: bool = False,
     ) -> None:
         """Send what has data that the agent survives; with ``stream`` as topic data of that node."""
         messages, others = fitting(frame, data, metadata)
@@ -253,7 +261,7 @@ class Delivery:
         if stream is None:
             connection.send_calls(messages)
         else:
-            connection.send_stream(stream, messages)
+            connection.send_stream(stream, messages, keep=keep)
 
     def _unregistered(self, connection: Connection, frame: Frame, metadata: Metadata) -> None:
         """Topic data for who did not register it there: a forged list; or it is older than the agent, which has
@@ -298,7 +306,18 @@ class Delivery:
         """Slow down a sender on this gateway. Those elsewhere are slowed by nobody: the outbox's limit decides."""
         for receiver in receivers:
             if receiver.congested and (connection := self._agents.find(*sender)) is not None:
-                receiver.backpressure.hold(connection)
+                receiver.backpressure.hold(connection, receiver.moved)
+
+    def _holds_robot(self, robot: Connection | None, receiver: Connection) -> bool:
+        """Slow down a robot program on this gateway, for a receiver that is full. Not while anybody else who
+        registered there could take more: a headset that reads slowly must not slow down the others' topics."""
+        if robot is None:
+            return False
+        for registrant in robot.robot_nodes.registrants():
+            other = self._agents.find(registrant.agent_type, registrant.agent_id)
+            if other is not receiver and (other is None or not other.full):
+                return False
+        return receiver.backpressure.hold(robot, receiver.moved)
 
     def _read_registrants(self, key: str, frame: Frame) -> list[AgentKey]:
         """Each registrant, once. The list changes only with registrations, so each is read once."""

@@ -469,7 +469,7 @@ class Gateway:
                 self._put(route.keys, newest, COMMAND)
             self._waited.clear()
         if self.mesh.backlogged:
-            self._backpressure.hold(connection)
+            self._backpressure.hold(connection, self.mesh.backlog_sent)
 
     def _put_run(self) -> None:
         """Put frames that go the same way as one sample: a put costs more than a frame."""
@@ -480,6 +480,7 @@ class Gateway:
     def _put(self, keys: list[str], payload: Payload, traffic: Traffic) -> None:
         for key in keys:
             self.mesh.put(key, payload, traffic)
+            self.mesh.make_room()
 
     def handle(self, connection: Connection, event: Event) -> None:
         """One thing a TCP agent did."""
@@ -487,7 +488,7 @@ class Gateway:
         if isinstance(event, Streamed):
             key = STREAM.of(type=ROS, id=connection.agent_id, node=event.metadata.node_name or "_")
             for frame in event.frame.each() if self.mesh.limited(key) else [event.frame]:
-                self.mesh.put(key, frame.data, Traffic.STREAM)
+                self._put([key], frame.data, Traffic.STREAM)
         elif isinstance(event, Joined):
             self._joined(connection, event)
             connection.charge()

@@ -14,13 +14,14 @@ import zenoh
 
 from macs_zenoh.protocol.guard import Gate
 
-from .declared import Aged, AtOnce, OnAged, OnBatch, OnNumbered, Outlet, Payload, Sample
-from .panics import end_if_panic
+from .declared import Aged, AtOnce, OnAged, OnBatch, OnNumbered, Payload, Sample
+from .loopback import Loopback
 from .threads import keep_attached
 
 log = logging.getLogger("macs.mesh")
 
 URGENT = zenoh.Priority.REAL_TIME
+TOPICS, MAY_DROP = zenoh.Priority.DATA, zenoh.CongestionControl.DROP
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 """It goes on while the machine is suspended: what waited meanwhile is as old as it is."""
 
@@ -35,7 +36,10 @@ class Arrivals:
     sender sent on several keys is handled in the order in which it came.
 
     When the loop is behind, the delivering thread waits a moment, then drops: Zenoh must not be held up for long,
-    or other programs' messages wait too.
+    or other programs' messages wait too. Topic data is dropped before that, without waiting.
+
+    What the loop's own thread puts cannot wait there: who puts much on the loop makes room after each put, and then
+    none of it is dropped.
 
     A single sample need not go to the loop at all: to wake it takes longer than to pass a message on. It is offered
     to whoever takes samples *at once*, in the thread that brought it. Whoever handles samples has the *turn*, this
@@ -44,6 +48,10 @@ class Arrivals:
     """
 
     LIMIT = 16_384
+    TOPICS_LIMIT = LIMIT // 4 * 3
+    """From so many on, topic data is dropped."""
+    LOOPED = 2048
+    """So many that the loop's own thread has put may wait before `make_room` hands them over."""
     LARGE_BYTES = 16 << 10
     LIMIT_BYTES = 128 << 20
     """Of payloads that are large; the others are bounded by their number."""
@@ -62,13 +70,20 @@ class Arrivals:
     """So long after the one before, a sample counts as a single one."""
 
     def __init__(
-        self, loop: asyncio.AbstractEventLoop, wake: Callable[[Callable[[], None]], None], drops: Counter[str]
+        self,
+        loop: asyncio.AbstractEventLoop,
+        wake: Callable[[Callable[[], None]], None],
+        drops: Counter[str],
+        loopback: Loopback,
     ) -> None:
         self._drops = drops
         self._loop = loop
         self._loop_thread = threading.get_ident()
         self._wake = wake
-        self._queue: deque[tuple[Callable[[Iterator[Any]], None], tuple[Any, ...]]] = deque()
+        self._queue: deque[tuple[Callable[[Iterator[Any]], None], tuple[Any, ...], bool]] = deque()
+        """For whom, the sample, and whether the loop's own thread has put it."""
+        self._looped = 0
+        """How many of these the loop's own thread has put."""
         self._waiting = False
         self._handled: tuple[Any, ...] | None = None
         """The sample that is being handled."""
@@ -78,30 +93,9 @@ class Arrivals:
         self._busy_until = 0.0
         self.asked: deque[zenoh.Query] = deque()
         """Queries on their way to the loop: an emergency stop can be among them, so no sample overtakes them."""
-        self._own = threading.local()
+        self._own = loopback.own
         self.stirred = False
-        """Whether a message or a question has come or gone since somebody took this back."""
-
-    def put(self, publisher: Outlet, payload: Payload) -> None:
-        """Publish. Zenoh calls our own subscriptions back within this, and they take the payload as it is."""
-        self._put(publisher, payload, payload)
-
-    def put_here(self, publisher: Outlet, payload: Payload) -> None:
-        """Publish to our own subscriptions only: Zenoh finds them, and is given nothing to copy."""
-        self._put(publisher, payload, b"")
-
-    def _put(self, publisher: Outlet, payload: Payload, zenohs: Payload) -> None:
-        self.stirred = True
-        self._own.payload = payload
-        try:
-            publisher.put(zenohs)
-        except zenoh.ZError as error:  # the session is closed
-            log.debug("put: %s", error)
-        except BaseException as error:
-            end_if_panic(error)
-            raise
-        finally:
-            self._own.payload = None
+        """Whether a message or a question has come since somebody took this back."""
 
     def receiver(
         self,
@@ -114,34 +108,34 @@ class Arrivals:
         """What Zenoh calls, in whatever thread, for each sample of one subscription; whether there was room for it.
         Samples that their source has numbered go to ``on_numbered``, if it is given; others are offered to
         ``at_once`` first. Heartbeats do not count as messages: they do not ``stir``."""
-        queue, limit, large, own = self._queue, self.LIMIT, self.LARGE_BYTES, self._own
+        queue, limit, large, own = self._queue, self.TOPICS_LIMIT, self.LARGE_BYTES, self._own
 
         def receive(sample: zenoh.Sample) -> bool:
             if stirs:
                 self.stirred = True
-            if len(queue) >= limit and not self._has_room():
-                self._drops["loop_behind"] += 1
-                return False
             try:
                 payload = own.payload
             except AttributeError:  # the first in this thread
                 payload = own.payload = None
                 keep_attached()
             elsewhere = payload is None
+            looped = not elsewhere and threading.get_ident() == self._loop_thread
+            if (self._looped if looped else len(queue)) >= limit and not self._has_room(sample, looped):
+                return False
             if elsewhere:
                 payload = sample.payload.to_bytes()
             key = str(sample.key_expr)
             info = sample.source_info if on_numbered is not None else None
             if at_once is not None and elsewhere and info is None and self._taken_at_once(at_once, key, payload):
                 return True
-            if len(payload) > large and not self._has_room_for(len(payload)):
-                self._drops["loop_behind"] += 1
+            if len(payload) > large and not self._has_room_for(len(payload), looped):
                 return False
+            self._looped += looped
             if info is None or on_numbered is None:
-                queue.append((on_batch, (key, payload)))
+                queue.append((on_batch, (key, payload), looped))
             else:
                 source = f"{info.source_id.zid}/{info.source_id.eid}"
-                queue.append((on_numbered, (key, payload, source, info.source_sn)))
+                queue.append((on_numbered, (key, payload, source, info.source_sn), looped))
             if not self._waiting:
                 self._wake_loop()
             return True
@@ -182,9 +176,9 @@ class Arrivals:
                 if size <= self.AT_ONCE_BYTES and self._try(gate.first, key, payload, age_s, now):
                     return
             if len(queue) >= self.LIMIT or not self._takes_room_for(len(payload)):
-                self._drops["loop_behind"] += 1
+                self._behind("loop_behind")
                 return
-            queue.append((handle, (key, payload, age_s, now)))
+            queue.append((handle, (key, payload, age_s, now), False))
             if not self._waiting:
                 self._wake_loop()
 
@@ -199,7 +193,7 @@ class Arrivals:
 
     def mark(self, on_mark: OnBatch) -> None:
         """Call ``on_mark`` on the loop after all that has arrived so far. From any thread."""
-        self._queue.append((on_mark, ("", b"")))
+        self._queue.append((on_mark, ("", b""), False))
         if not self._waiting:
             self._wake_loop()
 
@@ -224,12 +218,18 @@ class Arrivals:
             self._busy_until = time.monotonic()
             self._turn.release()
 
+    def make_room(self) -> None:
+        """Hand over what waits, if much of it was put by the loop's own thread, which handles it as well: whoever puts
+        there for others calls this after each put, and goes on when there is room. Not within a handler."""
+        if self._looped > self.LOOPED or (self._looped and self._large_bytes > self.LIMIT_BYTES // 4):
+            self._deliver()
+
     def _deliver(self) -> None:
+        self._waiting = False
         with self._turn:
             self._deliver_batch()
 
     def _deliver_batch(self) -> None:
-        self._waiting = False
         queue, now = self._queue, time.monotonic()
         until = now + self.TURN_S
         while queue and now < until:  # who sends large samples must feel soon where they wait
@@ -248,10 +248,11 @@ class Arrivals:
         out as it is handled."""
         queue, unwatched = self._queue, self.UNWATCHED_BYTES
         while queue:
-            handler, sample = queue[0]
+            handler, sample, looped = queue[0]
             if handler is not on_batch and handler != on_batch:
                 return
             queue.popleft()
+            self._looped -= looped
             size = len(sample[1])
             if size > self.LARGE_BYTES:
                 with self._large_lock:
@@ -293,16 +294,39 @@ class Arrivals:
                     return asked
                 asked = True
 
-    def _has_room(self) -> bool:
-        return self._patiently(lambda: len(self._queue) < self.LIMIT)
+    def _has_room(self, sample: zenoh.Sample, looped: bool) -> bool:
+        """Whether there is room for one more. Topic data does not wait for it, nor can the loop's own thread."""
+        if looped:
+            room = self._looped < self.LIMIT
+        elif sample.priority == TOPICS and sample.congestion_control == MAY_DROP:
+            self._behind("topics_behind")
+            return False
+        else:
+            room = self._patiently(lambda: len(self._queue) < self.LIMIT)
+        if not room:
+            self._behind("loop_behind")
+        return room
 
-    def _has_room_for(self, size: int) -> bool:
-        """Take room for a large payload."""
-        if not self._patiently(lambda: self._large_bytes == 0 or self._large_bytes + size <= self.LIMIT_BYTES):
+    def _has_room_for(self, size: int, looped: bool) -> bool:
+        """Take room for a large payload; for the loop's own thread there is as much again."""
+        most = self.LIMIT_BYTES - size
+        if looped:
+            room = self._large_bytes <= most + self.LIMIT_BYTES
+        else:
+            room = self._patiently(lambda: self._large_bytes == 0 or self._large_bytes <= most)
+        if not room:
+            self._behind("loop_behind")
             return False
         with self._large_lock:
             self._large_bytes += size
         return True
+
+    def _behind(self, name: str) -> None:
+        """Count a sample for which there was no room."""
+        self._drops[name] += 1
+        if self._drops[name] == 1:
+            what = "topic data comes" if name == "topics_behind" else "messages come"
+            log.warning("%s faster than this program handles it: dropped (logged once, counted as %s)", what, name)
 
     def _takes_room_for(self, size: int) -> bool:
         """The same without waiting, for any payload."""
@@ -315,10 +339,10 @@ class Arrivals:
         return True
 
     def _patiently(self, there_is_room: Callable[[], bool]) -> bool:
-        """Wait a moment for room, unless this is the loop's own thread, which would have to make it."""
+        """Wait a moment for room, in a thread that is not the loop's, which has to make it."""
         deadline = time.monotonic() + self.PATIENCE_S
         while not there_is_room():
-            if threading.get_ident() == self._loop_thread or time.monotonic() > deadline:
+            if time.monotonic() > deadline:
                 return False
             time.sleep(0.001)
         return True

@@ -18,8 +18,8 @@ from macs_zenoh.handles import Callbacks, Handle
 from macs_zenoh.protocol.keyexpr import NAMED_ALL, STREAM
 from macs_zenoh.protocol.policing import Policer, Policy
 
-from .arrivals import Arrivals
 from .declared import Outlet, Payload, Traffic
+from .loopback import Loopback
 from .panics import call, unwatched
 
 log = logging.getLogger("macs.mesh")
@@ -75,7 +75,7 @@ class Outgoing:
     def __init__(
         self,
         session: zenoh.Session,
-        arrivals: Arrivals,
+        loopback: Loopback,
         policer: Policer,
         drops: Counter[str],
         *,
@@ -87,7 +87,7 @@ class Outgoing:
         self.linked = linked
         self.drops = drops
         self._session = session
-        self._arrivals = arrivals
+        self._loopback = loopback
         self._outlets: dict[Traffic, OrderedDict[str, _Outlet]] = {kind: OrderedDict() for kind in Traffic}
         self._priorities: dict[str, Priority] = {}
         self._kept: dict[str, int] = {}
@@ -96,7 +96,7 @@ class Outgoing:
         self._fresh: OrderedDict[tuple[str, bool], int] = OrderedDict()
         """How often keys were put with that have no publisher yet, by key and whether apart."""
         self._on_room: Callbacks[Callable[[], None]] = Callbacks()
-        self._sender = Sender(backlog_bytes, arrivals.put, lambda: from_thread(self._room))
+        self._sender = Sender(backlog_bytes, loopback.put, lambda: from_thread(self._room))
 
     def link_changed(self, linked: bool) -> None:
         """A router came or went: who listens is unknown again."""
@@ -121,7 +121,7 @@ class Outgoing:
         if not (self.linked or kept):
             self.drops["no_route"] += 1
         if traffic is not CALL or (self._sender.idle and len(payload) <= self.LARGE_BYTES):
-            self._arrivals.put(publisher, payload)
+            self._loopback.put(publisher, payload)
         elif kept:  # one publisher numbers them all
             if not self._sender.put(publisher, payload):
                 self.drops["backlog"] += 1
@@ -183,6 +183,11 @@ class Outgoing:
         """Whether so much waits to be sent that callers should slow down; `on_room` tells when it is over."""
         return self._sender.backlogged
 
+    @property
+    def backlog_sent(self) -> int:
+        """How many of what had to wait were sent."""
+        return self._sender.sent
+
     def on_room(self, callback: Callable[[], None]) -> Handle:
         """Call ``callback`` whenever a backlog has gone."""
         return self._on_room.add(callback)
@@ -204,7 +209,7 @@ class Outgoing:
 
     def _put_apart(self, apart: _Apart, payload: Payload) -> None:
         """Our own subscriptions get the payload as it is, now; the sender copies it for others, if any listen."""
-        self._arrivals.put_here(apart.here, payload)
+        self._loopback.put_here(apart.here, payload)
         if time.monotonic() > apart.settled_at and not apart.away.matching_status.matching:  # type: ignore[attr-defined]
             return
         if not self._sender.put(apart.away, payload):
@@ -303,6 +308,7 @@ class Sender:
     def __init__(self, limit_bytes: int, put: Callable[[Outlet, Payload], None], on_room: Callable[[], None]) -> None:
         self._put = put
         self.backlogged = False
+        self.sent = 0
         self._limit_bytes = limit_bytes
         self._on_room = on_room
         self._bytes = 0
@@ -361,6 +367,7 @@ class Sender:
             publisher, payload = entry
             self._put(publisher, payload)
             with self._wake:
+                self.sent += 1
                 self._bytes -= len(payload)
                 relieved = self.backlogged and self._bytes < self._limit_bytes // 8
                 if relieved:

@@ -38,6 +38,7 @@ from macs_zenoh.versions import installed
 from .arrivals import Arrivals, now_s
 from .cpu_latency import Awake
 from .declared import AtOnce, Handler, OnAged, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
+from .loopback import Loopback
 from .outgoing import Outgoing
 from .panics import call, end_if_panic, end_on_panics, last_words, watched
 from .reliable import Recovered
@@ -60,7 +61,8 @@ class Mesh:
     """One program's place on the mesh. Made by `open`; an async context manager.
 
     ``drops`` counts, by name, what was lost here: ``no_route`` (put while no router was connected), ``backlog``
-    (more waiting to be sent than ``backlog_bytes``), ``loop_behind`` (samples came faster than they were handled),
+    (more waiting to be sent than ``backlog_bytes``), ``loop_behind`` (samples came faster than they were handled; of
+    topics, which are dropped before others, ``topics_behind``),
     ``failed_sample`` (handling it failed, which is a fault of ours),
     ``over_size``, ``over_rate`` and ``over_budget`` (more than a traffic rule allows), ``missed`` (what a reliable
     source did not have any more, or did not send, when it was asked).
@@ -86,7 +88,8 @@ class Mesh:
         self._session = session = watched(session)
         self._loop = asyncio.get_running_loop()
         end_on_panics(self._loop)
-        self._arrivals = Arrivals(self._loop, self._from_thread, self.drops)
+        self._loopback = Loopback()
+        self._arrivals = Arrivals(self._loop, self._from_thread, self.drops, self._loopback)
         self._awake: Awake | None = None
         self._missed: set[str] = set()
         self._recovered: set[Recovered] = set()
@@ -95,7 +98,7 @@ class Mesh:
         """Whether a router is connected now; always true for a router."""
         self._outgoing = outgoing = Outgoing(
             session,
-            self._arrivals,
+            self._loopback,
             self.policer,
             self.drops,
             linked=self.linked,
@@ -106,6 +109,7 @@ class Mesh:
         self.put, self.put_unasked = outgoing.put, outgoing.put_unasked
         self.limited, self.prioritise, self.keep = outgoing.limited, outgoing.prioritise, outgoing.keep
         self.on_room = outgoing.on_room
+        self.make_room = self._arrivals.make_room
         self.tells: Callable[[], dict[str, int]] = dict
         """What this program tells `macs doctor` of itself, by name: what is so now and should not be."""
         self.address = ""
@@ -176,6 +180,11 @@ class Mesh:
         """Whether so much waits to be sent that callers should slow down; `on_room` tells when it is over."""
         return self._outgoing.backlogged
 
+    @property
+    def backlog_sent(self) -> int:
+        """How many of what had to wait were sent."""
+        return self._outgoing.backlog_sent
+
     def last_words(self, say: Callable[[], None]) -> None:
         """Call ``say``, from any thread, before a panic of Zenoh ends this program, which does not leave the mesh."""
         last_words(say)
@@ -193,7 +202,8 @@ class Mesh:
             self._awake = Awake(self.settings.awake_us, self._stirred, self._loop)
 
     def _stirred(self) -> bool:
-        stirred, self._arrivals.stirred = self._arrivals.stirred, False
+        stirred = self._arrivals.stirred or self._loopback.stirred
+        self._arrivals.stirred = self._loopback.stirred = False
         return stirred
 
     async def __aenter__(self) -> Mesh:

@@ -1,0 +1,171 @@
+"""Who sends over TCP is slowed by what waits for its own frames in the gateway: nothing of them is lost there."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+import threading
+import time
+from collections.abc import AsyncIterator, Iterator
+
+import pytest
+
+from benchmarks import sequence
+from benchmarks.headset import TOPIC, Headset
+from bridge.headset import frames
+from tests.programs import Program, free_port
+
+SETTINGS = """[gateway]
+robots = "any"
+max_commands_per_s = 0
+max_requests_per_s = 0
+"""
+
+
+@pytest.fixture
+async def port(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[int]:
+    """The port of a gateway that is a program of its own."""
+    endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
+    settings = tmp_path_factory.mktemp("gateway") / "settings.toml"
+    settings.write_text(SETTINGS)
+    options = ("--port", str(port), "-e", endpoint, "--settings", str(settings))
+    async with Program("router", "-l", endpoint), Program("gateway", *options):
+        yield port
+
+
+def pieces(frames_: Iterator[bytes]) -> bytes:
+    """Frames as one piece to be sent unpaced."""
+    return b"".join(frames_)
+
+
+class Receiver(threading.Thread):
+    """Reads at most so many bytes per second until it has all, or nothing comes for 5 s."""
+
+    def __init__(self, headset: Headset, wanted: int, bytes_per_s: float = 1e9) -> None:
+        super().__init__(daemon=True)
+        self.numbers: list[tuple[int, int]] = []
+        """(sender, number) of each message."""
+        self._headset, self._wanted, self._bytes_per_s = headset, wanted, bytes_per_s
+
+    def run(self) -> None:
+        sock = self._headset.socket
+        sock.settimeout(5)
+        buffer, began, taken = bytearray(), time.monotonic(), 0
+        try:
+            while len(self.numbers) < self._wanted and (piece := sock.recv(64 << 10)):
+                buffer += piece
+                taken += len(piece)
+                self._cut(buffer)
+                time.sleep(max(0.0, began + taken / self._bytes_per_s - time.monotonic()))
+        except TimeoutError:
+            pass
+
+    def _cut(self, buffer: bytearray) -> None:
+        at = 0
+        while len(buffer) - at >= 4:
+            body_at = at + 4 + struct.unpack_from("<I", buffer, at)[0]
+            if len(buffer) < body_at + 4:
+                break
+            end = body_at + 4 + struct.unpack_from("<I", buffer, body_at)[0]
+            if len(buffer) < end:
+                break
+            if b'"requestId":1' in buffer[at:body_at] or b"nd__bench" in buffer[at:body_at]:
+                sender = int(bytes(buffer[at:body_at]).split(b'"senderAgentId":')[1].split(b",")[0])
+                self.numbers.append((sender, struct.unpack_from("<I", buffer, body_at + 8)[0]))
+            at = end
+        del buffer[:at]
+
+
+def send(headset: Headset, data: bytes) -> threading.Thread:
+    """Send in a thread, as fast as it is taken."""
+    thread = threading.Thread(target=headset.socket.sendall, args=(data,), daemon=True)
+    thread.start()
+    return thread
+
+
+async def ended(*threads: threading.Thread) -> None:
+    """Wait for threads."""
+    for thread in threads:
+        await asyncio.to_thread(thread.join, 60)
+        assert not thread.is_alive()
+
+
+async def test_many_senders_with_destinations_in_turn(port: int) -> None:
+    """Eight headsets that send to two others in turn, unpaced: every message arrives, of each sender in order."""
+    receivers = [Headset.join(port, 0) for _ in range(2)]
+    senders = [Headset.join(port, 0) for _ in range(8)]
+    ways = [{"ids": [receiver.id], "groups": []} for receiver in receivers]
+    await asyncio.sleep(0.5)
+    count = 6000
+    loads = [pieces(sequence.messages(sender.id, 64, count, ways)) for sender in senders]
+    reading = [Receiver(receiver, count // 2 * len(senders)) for receiver in receivers]
+    for thread in reading:
+        thread.start()
+    await ended(*map(send, senders, loads), *reading)
+    for turn, thread in enumerate(reading):
+        for sender in senders:
+            assert [n for who, n in thread.numbers if who == sender.id] == list(range(turn, count, 2))
+
+
+async def test_many_destinations_in_each_message(port: int) -> None:
+    """Of small frames to ten agents each, by two lists in turn, one read is more than may wait: none is lost."""
+    receivers = [Headset.join(port, 0) for _ in range(10)]
+    senders = [Headset.join(port, 0) for _ in range(4)]
+    ids = [receiver.id for receiver in receivers]
+    ways = [{"ids": ids, "groups": []}, {"ids": ids[::-1], "groups": []}]
+    await asyncio.sleep(0.5)
+    count = 3000
+    loads = [pieces(sequence.messages(sender.id, 16, count, ways)) for sender in senders]
+    reading = [Receiver(receiver, count * len(senders)) for receiver in receivers]
+    for thread in reading:
+        thread.start()
+    await ended(*map(send, senders, loads), *reading)
+    for thread in reading:
+        for sender in senders:
+            assert [n for who, n in thread.numbers if who == sender.id] == list(range(count))
+
+
+async def test_a_receiver_that_is_slower_than_its_sender(port: int) -> None:
+    """A headset that reads 15 MB a second gets all 40 MB of one that sends as fast as it can."""
+    receiver, sender = Headset.join(port, 0), Headset.join(port, 0)
+    await asyncio.sleep(0.5)
+    count = 40_000_000 // (64 << 10)
+    load = pieces(sequence.messages(sender.id, 64 << 10, count, [{"ids": [receiver.id], "groups": []}]))
+    reading = Receiver(receiver, count, 15e6)
+    reading.start()
+    await ended(send(sender, load), reading)
+    assert [n for _, n in reading.numbers] == list(range(count))
+
+
+async def test_a_robot_program_that_streams_unpaced(port: int) -> None:
+    """One headset that registered on a robot program gets every message of its topic, in order."""
+    robot, receiver = Headset.join(port, 0, robot=True), Headset.join(port, 0)
+    await registered(robot, [receiver])
+    count = 20_000
+    load = pieces(sequence.topic(robot.id, 1024, count, [receiver.id], TOPIC))
+    reading = Receiver(receiver, count, 6e6)
+    reading.start()
+    await ended(send(robot, load), reading)
+    assert [n for _, n in reading.numbers] == list(range(count))
+
+
+async def test_a_headset_that_does_not_read_slows_down_nobody(port: int) -> None:
+    """Of two headsets on a robot program's topic one reads nothing: the other gets every message."""
+    robot, receiver, stalled = Headset.join(port, 0, robot=True), Headset.join(port, 0), Headset.join(port, 0)
+    await registered(robot, [receiver, stalled])
+    count = 2000
+    load = pieces(sequence.topic(robot.id, 8192, count, [receiver.id, stalled.id], TOPIC))
+    reading = Receiver(receiver, count)
+    reading.start()
+    await ended(send(robot, load), reading)
+    assert [n for _, n in reading.numbers] == list(range(count))
+
+
+async def registered(robot: Headset, headsets: list[Headset]) -> None:
+    """Wait until the robot was told of each registration on its topic."""
+    for headset in headsets:
+        headset.socket.sendall(frames.registration(headset.id, TOPIC, [robot.id], []))
+    told = bytearray()
+    robot.socket.settimeout(10)
+    while told.count(b"nd__bench") < len(headsets):
+        told += await asyncio.to_thread(robot.socket.recv, 65536)
