@@ -1,5 +1,5 @@
 # make run    a headset, a mesh and a robot on this machine, without hardware
-# make test   the tests;  make test-all   and those that take minutes, as CI;  make lint   ruff and mypy
+# make test   the tests;  make test-all   and those that take minutes, as CI;  make lint   ruff, mypy and codespell
 # make bench  the speed ratios;  make clean
 # make attacks    every attack on a running site, as a table;  make chaos   an hour of kills, floods and cuts
 # make docs   the pages as a site, in build/docs;  make docs-links   and whether the links out of it still lead somewhere
@@ -69,6 +69,7 @@ lint: install
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
+	@$(BIN)/codespell
 
 format: install
 	@$(BIN)/ruff check --fix .

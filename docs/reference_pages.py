@@ -35,6 +35,7 @@ COPIED = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
     "SECURITY.md": "reporting.md",
+    "CODE_OF_CONDUCT.md": "conduct.md",
 }
 """Pages that live beside docs/, and what they are called in docs/generated/."""
 MADE_FROM = {
