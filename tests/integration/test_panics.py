@@ -11,15 +11,10 @@ from contextlib import suppress
 
 import pytest
 
+from tests.panicking import panicking
 from tests.programs import ROOT, Program, free_port
 
 PANICKED = 70
-
-
-def panicking(where: str) -> dict[str, str]:
-    """The environment of a program whose Zenoh panics."""
-    path = os.pathsep.join([str(ROOT / "tests" / "panicking"), str(ROOT), os.environ.get("PYTHONPATH", "")])
-    return {"PYTHONPATH": path, "MACS_TEST_PANIC": where}
 
 
 @pytest.fixture

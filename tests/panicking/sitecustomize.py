@@ -1,4 +1,5 @@
-"""Put before everything else on a program's path: its Zenoh really panics, two seconds after it joined a mesh.
+"""Put before everything else on a program's path: its Zenoh really panics, two seconds after it joined a mesh, or as
+soon as there is a file that ``MACS_TEST_PANIC_WHEN`` names.
 
 ``MACS_TEST_PANIC`` says where: in a ``call`` of the program, in a ``callback`` of its loop, or ``hidden``, in a place
 from which nobody hears of it.
@@ -6,6 +7,7 @@ from which nobody hears of it.
 
 import os
 from contextlib import suppress
+from pathlib import Path
 
 from macs_zenoh.mesh import Mesh, panics
 
@@ -29,7 +31,16 @@ def _joined(self, *args, **options):  # type: ignore[no-untyped-def]
             with suppress(BaseException):
                 session.liveliness().declare_token(LONG)
 
-    self._loop.call_later(2.0, panic)
+    def look(when: Path) -> None:
+        if when.exists():
+            panic()
+        else:
+            self._loop.call_later(0.02, look, when)
+
+    if "MACS_TEST_PANIC_WHEN" in os.environ:
+        look(Path(os.environ["MACS_TEST_PANIC_WHEN"]))
+    else:
+        self._loop.call_later(2.0, panic)
 
 
 if "MACS_TEST_PANIC" in os.environ:

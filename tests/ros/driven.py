@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -100,10 +100,12 @@ class Site:
     settings: Path
     domain: int
 
-    def robot(self, number: int = 1, *argv: str, router: str = "") -> Program:
+    def robot(self, number: int = 1, *argv: str, router: str = "", env: Mapping[str, str] | None = None) -> Program:
         """A robot agent, not started yet."""
         common = ("-e", router or self.router.endpoint, "--settings", str(self.settings))
-        return Program("agent", "--id", str(number), *common, *argv, env={"ROS_DOMAIN_ID": str(self.domain)})
+        return Program(
+            "agent", "--id", str(number), *common, *argv, env={"ROS_DOMAIN_ID": str(self.domain), **(env or {})}
+        )
 
     def headset(self, number: int = 300) -> Any:
         """An agent like a headset, to be entered."""

@@ -15,6 +15,8 @@ from ros_peer import Peer, until
 
 from macs_zenoh import join
 from macs_zenoh.config import MeshSettings
+from macs_zenoh.mesh.panics import PANICKED
+from tests.panicking import panicking
 from tests.programs import ROOT, Program, free_port
 
 LONG = """
@@ -49,6 +51,26 @@ async def test_a_signal_stops_the_robot(domain: int, peer: Peer, tmp_path: Path,
         async with driving(driver, 1):
             await moves(heard)
             assert await robot.stop(number) == 0
+            await until(lambda: heard.last == STOPPED)
+            await asyncio.sleep(0.3)
+            assert heard.last == STOPPED
+
+
+@pytest.mark.parametrize("where", ["call", "callback", "hidden"])
+async def test_a_panic_of_zenoh_stops_the_robot(domain: int, peer: Peer, tmp_path: Path, where: str) -> None:
+    """Commands flow, and the agent's Zenoh panics, wherever: the agent ends by itself, and the stop message is the
+    last on the topic, though nothing of Zenoh can be relied on any more."""
+    heard, now = await hear(peer), tmp_path / "now"
+    async with (
+        site(domain, tmp_path, LONG) as place,
+        place.headset() as driver,
+        place.robot(env=panicking(where, now)) as robot,
+    ):
+        await may_command(driver, 1)
+        async with driving(driver, 1):
+            await moves(heard)
+            now.touch()
+            assert await asyncio.wait_for(robot.wait(), 40) == PANICKED
             await until(lambda: heard.last == STOPPED)
             await asyncio.sleep(0.3)
             assert heard.last == STOPPED
