@@ -285,11 +285,14 @@ class RobotAgent:
         agent_key = Registrant(agent.type, agent.id)
         if not online:
             self.nodes.rights.changed()
-            self._forget(agent_key)
+            self._forget(agent_key, for_good=agent_key not in self._sessions)
             return
         before = self._sessions.pop(agent_key, None)
-        if len(self._sessions) >= SESSIONS:
-            del self._sessions[next(iter(self._sessions))]
+        if len(self._sessions) >= SESSIONS:  # whoever has the id next could not be told from who had it
+            gone = next(iter(self._sessions))
+            del self._sessions[gone]
+            if gone not in self.agent.directory:
+                self._forget(gone, for_good=True)
         self._sessions[agent_key] = agent.session
         if before == agent.session:
             self.nodes.returned(agent_key)
