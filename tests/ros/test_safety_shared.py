@@ -13,6 +13,7 @@ import pytest
 from driven import STOPPED, driving, hear, may_command, send_bool, site
 from hypothesis import given
 from hypothesis import strategies as st
+from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_peer import Peer, until
 from std_msgs.msg import Bool
@@ -164,7 +165,9 @@ async def test_a_stop_holds_when_its_node_ends_at_once(domain: int, peer: Peer, 
 
 
 def press_and_go(peer: Peer, button: Any) -> None:
+    """What has not been acknowledged when its writer ends is lost in DDS."""
     button.publish(Bool(data=True))
+    button.wait_for_all_acked(Duration(seconds=10))
     peer.session.node.destroy_publisher(button)
 
 
