@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from importlib.metadata import version as version_of
 from pathlib import Path
+from typing import Any
 
 from sphinx.application import Sphinx
 
@@ -29,10 +31,9 @@ html_theme_options = {
 
 myst_enable_extensions = ["deflist", "attrs_block"]
 myst_heading_anchors = 4
-# A settings file with "…" in it, or JSON with a comment, is shown as it is.
-suppress_warnings = ["misc.highlighting_failure"]
+# A settings file with "…" in it, or JSON with a comment, is shown as it is; an annotation `type` may be many things.
+suppress_warnings = ["misc.highlighting_failure", "ref.python"]
 
-default_role = "code"  # docstrings write `name`, without saying what it is
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
@@ -55,6 +56,17 @@ def lead_inside(app: Sphinx, name: str, source: list[str]) -> None:
     source[0] = reference_pages.links_of_site(source[0], name)
 
 
+def code_as_written(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
+    """Docstrings write `name` for code, also before letters (`advertise`d), where reStructuredText wants a space."""
+    text = re.sub(r"(?<![`:\w])`([^`\n]+)`(?!`)(\w?)", lambda code: _code(*code.groups()), "\n".join(lines))
+    lines[:] = text.split("\n")
+
+
+def _code(code: str, letter: str) -> str:
+    return f"``{code}``" + (f"\\ {letter}" if letter else "")
+
+
 def setup(app: Sphinx) -> None:
+    app.connect("autodoc-process-docstring", code_as_written)
     app.connect("builder-inited", write_pages)
     app.connect("source-read", lead_inside)

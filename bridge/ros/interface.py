@@ -32,7 +32,7 @@ from macs_zenoh.protocol.wire import MACS, Layout
 log = logging.getLogger("macs.ros")
 
 PublishStream = Callable[[str, bytes], None]
-"""Node name and whole frame; called in the ROS thread."""
+"""Node name and whole frame; from any thread."""
 SendTo = Callable[["Registrant", Metadata, bytes], None]
 """To one agent, on the loop."""
 

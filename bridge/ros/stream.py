@@ -14,7 +14,8 @@ _U32 = struct.Struct("<I")
 class StreamFraming:
     """Puts topic data into frames: one concatenation per message, as only two sizes ever change.
 
-    ``registrants`` are (agent type, agent id). Made anew when the registrants change. Called in the ROS thread only.
+    ``registrants`` are (agent type, agent id). Made anew when the registrants change. Called in any thread: with a
+    rate limit the intake's and ROS's frame messages of one topic, so size and bytes are replaced together.
     """
 
     def __init__(self, metadata: Metadata, registrants: Iterable[tuple[int, int]], layout: Layout = MACS) -> None:
@@ -30,20 +31,21 @@ class StreamFraming:
         self._empty = frame
         self._message_size_at = layout.header_bytes - 4
         self._empty_message_bytes = _U32.unpack_from(frame, self._message_size_at)[0]
-        self._prefix = frame
-        self._cdr_bytes = 0
+        self._sized = (0, frame)
+        """Size of the last message, and what stands in front of one of that size."""
 
     def __call__(self, cdr: bytes) -> bytes:
-        if len(cdr) != self._cdr_bytes:
-            self._resize(len(cdr))
-        return self._prefix + cdr
+        cdr_bytes, prefix = self._sized
+        if len(cdr) != cdr_bytes:
+            prefix = self._resized(len(cdr))
+        return prefix + cdr
 
-    def _resize(self, cdr_bytes: int) -> None:
+    def _resized(self, cdr_bytes: int) -> bytes:
         prefix = bytearray(self._empty)
         _U32.pack_into(prefix, self._message_size_at, self._empty_message_bytes + cdr_bytes)
         _U32.pack_into(prefix, len(prefix) - 4, cdr_bytes)
-        self._prefix = bytes(prefix)
-        self._cdr_bytes = cdr_bytes
+        self._sized = (cdr_bytes, bytes(prefix))
+        return self._sized[1]
 
 
 class Fanout:

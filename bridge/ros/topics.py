@@ -1,7 +1,7 @@
 """Interface nodes for topics: a robot's topic to headsets (type 1), and headsets to a robot's topic (type 2).
 
-Topic data crosses as bytes, never decoded: from the ROS thread straight into the mesh, from the loop straight into a
-publisher.
+Topic data crosses as bytes, never decoded: from the intake's thread straight into the mesh, and from the thread that
+brought it from the mesh, or the loop, straight into a publisher.
 """
 
 from __future__ import annotations

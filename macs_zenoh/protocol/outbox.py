@@ -32,8 +32,8 @@ class Outbox:
         return bool(self._calls or self._streams)
 
     def put_call(self, message: Chunk) -> bool:
-        """Keep a message in order. False when the limit is reached even without any topic data: the agent has
-        to be disconnected, because what comes next would be missed silently."""
+        """Keep a message in order. False when the limit is reached even without any topic data: this message is
+        dropped and counted, and those that wait stay."""
         self._make_room(len(message))
         if self._over(len(message)):
             self.drops["outbox_full"] += 1

@@ -36,7 +36,7 @@ def test_the_protocol_page_has_every_manager() -> None:
 
 
 def test_the_protocol_page_has_every_node_type() -> None:
-    """The four node types are in the table."""
+    """Each node type is in the table, the extension as well."""
     rows = re.findall(r"^\| (\d) \| ROS", page("docs/protocol.md"), re.MULTILINE)
     assert [int(number) for number in rows] == sorted(NodeType)
 
