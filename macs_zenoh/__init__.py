@@ -47,6 +47,9 @@ if TYPE_CHECKING:
     from .protocol.messages import Metadata as Metadata
     from .protocol.messages import NodeType as NodeType
     from .protocol.reading import Message as Message
+    from .topics import TopicMessage as TopicMessage
+    from .topics import TopicPublisher as TopicPublisher
+    from .topics import TopicSubscription as TopicSubscription
     from .typed import BadCdr as BadCdr
     from .typed import BadValue as BadValue
     from .typed import Types as Types
@@ -88,6 +91,7 @@ _WHERE = {
     "macs_zenoh.protocol.directory": ("AgentInfo",),
     "macs_zenoh.protocol.messages": ("Metadata", "NodeType"),
     "macs_zenoh.protocol.reading": ("Message",),
+    "macs_zenoh.topics": ("TopicMessage", "TopicPublisher", "TopicSubscription"),
     "macs_zenoh.typed": ("BadCdr", "BadValue", "Types", "UnknownType", "request_of", "response_of"),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}

@@ -17,13 +17,14 @@ from collections import Counter, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, overload
 
 from .config import MeshSettings, TrafficRule, changed
 from .errors import CallTimeout, Closed, OutOfRange, Unreachable, UsageError, WireError
 from .handles import Callbacks, Handle
 from .identity import Identity
 from .mesh import Aged, Mesh, Sample, Subscription, Traffic
+from .nodes import ANSWER_S, Nodes
 from .presence import Presence
 from .protocol.agent_id import AgentId
 from .protocol.directory import AgentInfo, Change, Directory
@@ -34,6 +35,7 @@ from .protocol.messages import Metadata, NodeType
 from .protocol.reading import Message, Reader
 from .protocol.routing import call, inbox, keys_of
 from .protocol.wire import Layout, encode_frame, encode_message, parse_frame
+from .topics import DEPTH, Chosen, TopicPublisher, TopicSubscription, Value
 
 log = logging.getLogger("macs.agent")
 
@@ -88,6 +90,8 @@ class Agent:
         self._served: dict[Handle, tuple[Callable[[], Subscription], Subscription]] = {}
         """What makes it anew, for another id, and what there is now."""
         self._warned: set[tuple[int, int]] = set()
+        self._nodes: Nodes | None = None
+        """What it uses of robots, once it does."""
 
     @property
     def type(self) -> str:
@@ -95,12 +99,17 @@ class Agent:
         return type_name(self.type_number)
 
     @property
+    def key(self) -> AgentId:
+        """What identifies it: type and id."""
+        return AgentId(self.type_number, self.id)
+
+    @property
     def directory(self) -> Directory:
         """Who is online."""
         return self._presence.directory
 
     def __repr__(self) -> str:
-        return f"<Agent {AgentId(self.type_number, self.id)} group {self.group}>"
+        return f"<Agent {self.key} group {self.group}>"
 
     # -- send ----------------------------------------------------------------------------------------------------
 
@@ -210,7 +219,8 @@ class Agent:
         me = (self.type_number, self.id)
         for key, payload in batch:
             for message in self._reader.read(key, payload, me, by_group=by_group):
-                self._on_message(message)
+                if self._nodes is None or not self._nodes.take(message):
+                    self._on_message(message)
 
     def _receive_judged(self, batch: Iterator[Aged], *, guard: Guard, by_group: bool = False) -> None:
         me = (self.type_number, self.id)
@@ -304,6 +314,98 @@ class Agent:
     def _calls_of(self, verb: str) -> str:
         return CALL.every(type=self.type_number, id=self.id, verb=verb)
 
+    # -- what robots have ----------------------------------------------------------------------------------------
+
+    async def subscribe(
+        self,
+        topic: str,
+        *,
+        robot: Chosen = (),
+        group: Chosen = (),
+        type: str | None = None,  # noqa: A002 - what everybody calls it
+        depth: int = DEPTH,
+        timeout_s: float = ANSWER_S,
+    ) -> TopicSubscription:
+        """Receive a topic of robots, until the subscription is closed, as a headset does.
+
+        Args:
+            topic: its name on the robot, as ``/pose``.
+            robot: the id of a robot, or several.
+            group: all robots of a group, or of several.
+            type: as ``geometry_msgs/PoseStamped``; without one, what the robots that are online call it.
+            depth: how many messages the robot holds, and the subscription for who takes them too slowly.
+            timeout_s: how long the robots may take to answer.
+
+        It holds for robots that come later or come back as well. Several subscriptions of one topic share what goes
+        over the mesh. Of what a latched topic holds, only the first gets its share.
+
+        Raises Refused with the robot's reason when none of those online lets it, CallTimeout, Unreachable when no
+        robot tells its type, UsageError, Closed.
+        """
+        return await self._robot_nodes().subscribe(topic, robot, group, type, depth, timeout_s)
+
+    async def advertise(
+        self,
+        topic: str,
+        *,
+        robot: Chosen = (),
+        group: Chosen = (),
+        type: str | None = None,  # noqa: A002
+        timeout_s: float = ANSWER_S,
+    ) -> TopicPublisher:
+        """Be able to publish to a topic of robots, until the publisher is closed. As of `subscribe`."""
+        return await self._robot_nodes().advertise(topic, robot, group, type, timeout_s)
+
+    async def publish(
+        self,
+        topic: str,
+        data: bytes | Value,
+        *,
+        robot: Chosen = (),
+        group: Chosen = (),
+        type: str | None = None,  # noqa: A002
+        timeout_s: float = ANSWER_S,
+    ) -> None:
+        """Publish one message, as CDR or as a value, to a topic of robots: it may move them.
+
+        It stays advertised until the agent is closed; `advertise` gives more say. Raises what `subscribe` raises, and
+        MissingExtra, UnknownType and BadValue for what cannot be written.
+        """
+        await self._robot_nodes().publish(topic, data, robot, group, type, timeout_s)
+
+    @overload
+    async def call_service(
+        self, service: str, request: bytes, *, robot: int, type: str | None = None, timeout_s: float = ANSWER_S
+    ) -> bytes: ...
+
+    @overload
+    async def call_service(
+        self, service: str, request: Value, *, robot: int, type: str | None = None, timeout_s: float = ANSWER_S
+    ) -> dict[str, Any]: ...
+
+    async def call_service(
+        self,
+        service: str,
+        request: bytes | Value,
+        *,
+        robot: int,
+        type: str | None = None,  # noqa: A002
+        timeout_s: float = ANSWER_S,
+    ) -> bytes | dict[str, Any]:
+        """Call a service that runs on a robot: CDR for CDR, a value for a value.
+
+        Raises Refused with the reason of the robot or the service, Unreachable when it is not there, CallTimeout,
+        UsageError, Closed, and what cannot be written or read: MissingExtra, UnknownType, BadValue, BadCdr.
+        """
+        answer: bytes | dict[str, Any] = await self._robot_nodes().call(service, request, robot, type, timeout_s)
+        return answer
+
+    def _robot_nodes(self) -> Nodes:
+        self._check_open()
+        if self._nodes is None:
+            self._nodes = Nodes(self, self._layout)
+        return self._nodes
+
     # -- presence ------------------------------------------------------------------------------------------------
 
     def online(self) -> list[AgentInfo]:
@@ -327,7 +429,10 @@ class Agent:
         return self._on_id.add(callback)
 
     def _presence_changed(self, changes: list[Change]) -> None:
-        for agent, online in changes:
+        for change in changes:
+            agent, online = change
+            if self._nodes is not None:
+                self._nodes.presence(change)
             if agent.zid != self.mesh.zid:
                 log.info("%s/%d %s", agent.type_name, agent.id, "is online" if online else "has left")
             for callback in self._on_presence:
@@ -337,6 +442,8 @@ class Agent:
         self.id = new
         for serve, serving in self._served.values():
             serving.become(serve())
+        if self._nodes is not None:
+            self._nodes.id_changed((self.type_number, old), new)
         for callback in self._on_id:
             callback(old, new)
 
@@ -362,11 +469,13 @@ class Agent:
 
     def _check_open(self) -> None:
         if self._closed:
-            raise Closed(str(AgentId(self.type_number, self.id)))
+            raise Closed(str(self.key))
 
     def close(self) -> None:
         """Leave: the agent is offline at once. The mesh stays open."""
         self._closed = True
+        if self._nodes is not None:
+            self._nodes.close()
         self._identity.close()
         for handle in reversed(list(self._served)):
             handle.close()

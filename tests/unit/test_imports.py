@@ -22,7 +22,16 @@ PURE = sorted((ROOT / "macs_zenoh" / "protocol").glob("*.py"))
 WITH_ZENOH = set((ROOT / "macs_zenoh" / "mesh").glob("*.py"))
 WITH_ASYNCIO = WITH_ZENOH | {
     ROOT / "macs_zenoh" / name
-    for name in ("agent.py", "awareness.py", "identity.py", "presence.py", "registration_calls.py", "streams.py")
+    for name in (
+        "agent.py",
+        "awareness.py",
+        "identity.py",
+        "nodes.py",
+        "presence.py",
+        "registration_calls.py",
+        "streams.py",
+        "topics.py",
+    )
 }
 NEEDED_FROM_OUTSIDE = {"msgspec", "zenoh", "tomli"}
 OFFERED = ROOT / "macs_zenoh" / "__init__.py"
