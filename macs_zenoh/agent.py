@@ -276,12 +276,22 @@ class Agent:
                     raise Unreachable(target, error.why) from None
             await asyncio.sleep(RETRY_S)
 
-    def serve(self, verb: str, handler: CallHandler, *, first: CallFirst | None = None) -> Handle:
+    def serve(
+        self,
+        verb: str,
+        handler: CallHandler,
+        *,
+        first: CallFirst | None = None,
+        stand_in: bool = False,
+        mesh: Mesh | None = None,
+    ) -> Handle:
         """Answer calls of ``verb`` with ``await handler(call)``, until the handle is closed; raise Refused in it to
         refuse with a reason.
 
         ``first(call)`` is called before that, in a thread of Zenoh's, whatever the loop is busy with; it may refuse.
-        It takes a moment until the whole mesh knows; callers who see this agent online ask again meanwhile.
+        ``mesh`` is another session that serves it for this agent; with ``stand_in`` it is served here only as long as
+        no other session does. It takes a moment until the whole mesh knows; callers who see this agent online ask
+        again meanwhile.
         """
 
         def read(key: str, payload: bytes) -> Call:
@@ -299,7 +309,8 @@ class Agent:
 
         def serve() -> Subscription:
             at_once = None if first is None else lambda key, payload: first(read(key, payload))
-            return self.mesh.serve(self._calls_of(verb), answer, first=at_once, gate=self._guard)
+            serving = mesh or self.mesh
+            return serving.serve(self._calls_of(verb), answer, stand_in=stand_in, first=at_once, gate=self._guard)
 
         self._check_open()
         serving = serve()

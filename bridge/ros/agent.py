@@ -24,11 +24,13 @@ from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.requests import STATUS, ControlReply, ControlRequest, control, status
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
+from bridge.ros.stop_line import StopLine
 from macs_zenoh import managers
 from macs_zenoh.agent import Agent, Call
 from macs_zenoh.config import RobotSettings, Settings
 from macs_zenoh.errors import MacsError, Refused, WireError
 from macs_zenoh.managers import Asker, Managers
+from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.guard import Guard, Limits
 from macs_zenoh.protocol.keyexpr import type_name, type_number
@@ -93,6 +95,7 @@ class RobotAgent:
         self._answering: dict[asyncio.Task[None], Registrant] = {}
         self._sessions: dict[Registrant, tuple[str, int]] = {}
         """Who has an id, or had it last."""
+        self.stop_line: StopLine | None = None
 
     def _graph_changed(self, topics: NamesAndTypes, services: NamesAndTypes) -> None:
         """In the ROS thread."""
@@ -120,7 +123,9 @@ class RobotAgent:
             ("control", self._control),
         ):
             self.agent.serve(verb, handler)
-        self.agent.serve("stop", self._stopped, first=self._stop)
+        self.agent.serve("stop", self._stopped, first=self._stop, stand_in=True)
+        if self.nodes.stop is not None and self.agent.mesh.settings.mode == "client":
+            self.stop_line = StopLine(self.agent.mesh.settings, self._serve_stop)
         self.agent.on_message(self._receive)
         if self._guard is not None:
             self._guard.on_dropped = self.nodes.drops.note
@@ -141,7 +146,7 @@ class RobotAgent:
             # a message that hits a fault of ours must not make the robot deaf for all that follow
             log.exception("a message from %s/%d failed", message.sender_type, message.sender_id)
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """End everything that is open."""
         if self._guard is not None:
             self._guard.on_command = _ignore
@@ -150,6 +155,8 @@ class RobotAgent:
         for answer in self._answering:
             answer.cancel()
         self.nodes.close()
+        if self.stop_line is not None:
+            await self.stop_line.close()
 
     # -- plain requests ------------------------------------------------------------------------------------------
 
@@ -232,6 +239,9 @@ class RobotAgent:
 
     async def _control(self, call: Call) -> bytes:
         return encode_data(self._controlled(Registrant(type_number(call.sender_type), call.sender_id), call.data))
+
+    def _serve_stop(self, mesh: Mesh) -> None:
+        self.agent.serve("stop", self._stopped, first=self._stop, mesh=mesh)
 
     def _stop(self, call: Call) -> None:
         """The emergency stop with an answer: data ``true`` or ``false``, as on its topic. In a thread of Zenoh's."""
@@ -362,7 +372,7 @@ async def open_robot(
             try:
                 yield ros_agent
             finally:
-                ros_agent.close()
+                await ros_agent.close()
                 await asyncio.sleep(STOP_MESSAGES_S)
     finally:
         await asyncio.to_thread(session.close)

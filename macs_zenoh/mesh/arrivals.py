@@ -164,9 +164,9 @@ class Arrivals:
                 keep_attached()
             key, now, age_s = str(sample.key_expr), now_s(), 0.0
             if payload is None:
-                encoded = sample.payload
+                encoded, urgent = sample.payload, sample.priority == URGENT
                 size = len(encoded)
-                if not gate.admits(key, size, sample.priority == URGENT, now):
+                if not gate.admits(key, size, urgent, now):
                     if size <= self.AT_ONCE_BYTES:
                         self._try(gate.rescue, key, encoded.to_bytes(), now)
                     return
@@ -175,6 +175,8 @@ class Arrivals:
                     age_s = gate.age(key, stamp.get_id(), stamp.get_time_as_ntp64().as_secs_f64(), now)
                 if size <= self.AT_ONCE_BYTES and self._try(gate.first, key, payload, age_s, now):
                     return
+                if urgent and not gate.admits(key, size, False, now):
+                    return  # it is no command, whatever its priority says
             if len(queue) >= self.LIMIT or not self._takes_room_for(len(payload)):
                 self._behind("loop_behind")
                 return

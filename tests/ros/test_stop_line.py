@@ -1,0 +1,103 @@
+"""The emergency stop has a session of its own: nothing that is put to the robot is in front of it."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import Any
+
+import pytest
+from ros_peer import until
+
+from bridge.ros.agent import open_robot
+from bridge.ros.stop_line import apart
+from macs_zenoh import join
+from macs_zenoh.config import MeshSettings, RobotSettings, Settings
+from macs_zenoh.protocol.guard import Guard
+from tests.routers import Router
+
+ROBOT = 7
+
+
+def settings(router: Router, *overrides: str) -> Settings:
+    mesh = MeshSettings(connect=[router.endpoint], overrides=list(overrides))
+    return Settings(mesh=mesh, robot=RobotSettings(id=ROBOT))
+
+
+async def test_a_stop_takes_effect_while_the_robot_receives_something_else(
+    domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread that receives for the robot is stuck with a sample of somebody's: a stop is carried out and answered
+    all the same, and so is the next one."""
+    free, stuck = threading.Event(), threading.Event()
+    admits = Guard.admits
+
+    def slow(guard: Guard, key: str, *args: Any) -> bool:
+        if key.endswith("unity/666") and "/to/" in key:
+            stuck.set()
+            free.wait(30)
+        return admits(guard, key, *args)
+
+    monkeypatch.setattr(Guard, "admits", slow)
+    async with Router() as router:
+        mesh = MeshSettings(connect=[router.endpoint])
+        async with (
+            open_robot(settings(router), domain_id=domain) as robot,
+            join("operator", id=5, settings=mesh) as operator,
+            join("unity", id=666, settings=mesh) as flooder,
+        ):
+            await until(lambda: robot.stop_line is not None and robot.stop_line.is_open)
+            await until(lambda: all((1, ROBOT) in agent.directory for agent in (operator, flooder)))
+            await operator.call("ros", ROBOT, "status")  # the routes are known
+            try:
+                flooder.send(b"", to="ros", ids=[ROBOT])
+                await until(stuck.is_set)
+                for stop in (True, False, True):
+                    answer = await operator.call("ros", ROBOT, "stop", json.dumps(stop).encode(), timeout_s=20)
+                    assert json.loads(answer)["stopped"] is stop
+                    assert robot.nodes.robot.stop.stopped is stop
+            finally:
+                free.set()
+
+
+@pytest.mark.parametrize("override", [[], ['id:"abc123"']], ids=["any id", "an id of its own"])
+async def test_the_stop_is_served_before_and_after_its_session(domain: int, override: list[str]) -> None:
+    """Also where the settings give the robot a Zenoh id, which only one session can have; and where that session is
+    gone, the robot's own serves the stop."""
+    async with (
+        Router() as router,
+        open_robot(settings(router, *override), domain_id=domain) as robot,
+        join("operator", id=5, settings=MeshSettings(connect=[router.endpoint])) as operator,
+    ):
+        await until(lambda: (1, ROBOT) in operator.directory)
+        await operator.call("ros", ROBOT, "stop", b"true", timeout_s=20)
+        line = robot.stop_line
+        assert line is not None
+        await until(lambda: line.is_open)
+        await operator.call("ros", ROBOT, "stop", b"false", timeout_s=20)
+        assert not robot.nodes.robot.stop.stopped
+        await line.close()
+        await operator.call("ros", ROBOT, "stop", b"true", timeout_s=20)
+        assert robot.nodes.robot.stop.stopped
+
+
+async def test_no_emergency_stop_needs_no_session(domain: int) -> None:
+    """A robot without one has one session."""
+    async with Router() as router:
+        mesh = MeshSettings(connect=[router.endpoint])
+        without = Settings(mesh=mesh, robot=RobotSettings(id=ROBOT, stop_topic=""))
+        async with open_robot(without, domain_id=domain) as robot:
+            assert robot.stop_line is None
+
+
+def test_a_second_session_has_another_id() -> None:
+    """Whether Zenoh's id is in the overrides, or in a file; where it is in neither, Zenoh chooses."""
+    plain = MeshSettings(connect=["tcp/127.0.0.1:1"])
+    assert apart(plain) is plain
+    for chosen in (
+        MeshSettings(connect=["tcp/127.0.0.1:1"], overrides=['id:"abc"', "scouting/delay:1"]),
+        MeshSettings(config_file="zenoh.json5", overrides=["scouting/delay:1"]),
+    ):
+        one, other = apart(chosen).overrides, apart(chosen).overrides
+        assert one != other
+        assert [kept for kept in one if not kept.startswith("id:")] == ["scouting/delay:1"]
