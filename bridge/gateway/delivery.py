@@ -15,15 +15,17 @@ from macs_zenoh.errors import WireError
 from macs_zenoh.mesh import Payload, Sample
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import Directory
-from macs_zenoh.protocol.existing import CDR, PASS, Data, Verdict, fitting, least_bytes, readable, refuses, topic_data
+from macs_zenoh.protocol.existing import CDR, PASS, Data, Verdict, fitting, least_bytes, refuses, topic_data
+from macs_zenoh.protocol.judging import Judge
 from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue
-from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, correct_sender, decode_management
+from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, decode_management
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.routing import takes_group_copy
 from macs_zenoh.protocol.wire import Frame, Layout, is_probe, parse_frame, parse_frames
 
 from .agents import Agents
 from .connection import Connection
+from .judged import JudgedFrames, Read
 from .stead import Stead
 
 log = logging.getLogger("macs.gateway")
@@ -32,7 +34,10 @@ ANSWERS = frozenset((NodeType.CLIENT, NodeType.ACTION))
 """Nodes of headsets to which robots answer."""
 
 KNOWN = 4096
-"""How many keys, metadata and registrant lists are remembered as already read."""
+"""How many keys and registrant lists are remembered as already read."""
+
+SENDERS, KNOWN_EACH = 512, 32
+"""Of how many senders metadata is remembered as already judged, and how many of each."""
 
 KNOWN_BYTES = 4096
 """Longer ones are read each time: what others choose must not decide how much is kept here."""
@@ -75,7 +80,9 @@ class Delivery:
     What an agent must not get is counted at its connection.
     """
 
-    def __init__(self, agents: Agents, directory: Directory, layout: Layout, stead: Stead) -> None:
+    def __init__(
+        self, agents: Agents, directory: Directory, layout: Layout, stead: Stead, judged: JudgedFrames
+    ) -> None:
         self.drops: Counter[str] = Counter()
         self._agents = agents
         self._directory = directory
@@ -84,7 +91,8 @@ class Delivery:
         self.streams: dict[str, Stream] = {}
         """By their keys."""
         self._targets: dict[str, tuple[Connection, AgentKey]] = {}
-        self._metadata: dict[bytes, Metadata] = {}
+        self._judged = judged
+        self._judges: dict[AgentKey, Judge] = {}
         self._registrants: dict[bytes, list[AgentKey]] = {}
         self._seen: dict[tuple[str, int], Seen] = {}
         self._dirty: list[Connection] = []
@@ -191,14 +199,14 @@ class Delivery:
             frame = parse_frame(payload, self._layout)
         except WireError:
             return None
-        metadata, registrants = self._metadata.get(frame.metadata), self._registrants.get(frame.management)
-        if metadata is None or registrants is None or not stream.carries(metadata):
-            return None
-        if stream.robot != (metadata.sender_agent_type, metadata.sender_agent_id):
+        judging = self._judges.get(stream.robot)
+        judged = judging.known(frame.metadata) if judging is not None else None
+        registrants = self._registrants.get(frame.management)
+        if judged is None or not judged.readable or registrants is None or not stream.carries(judged.metadata):
             return None
         if len(self._seen) >= SEEN:
             self._seen.clear()
-        if not frame.carries(CDR, least_bytes(metadata)):
+        if judged.true != frame.metadata or not frame.carries(CDR, least_bytes(judged.metadata)):
             return None
         seen = self._seen[key, len(payload)] = Seen(frame.beginning + CDR, frame.message_at, registrants)
         return seen
@@ -333,47 +341,38 @@ class Delivery:
             self._registrants[frame.management] = registrants
         return registrants
 
-    def _read(self, key: str, payload: bytes | bytearray, sender: AgentKey) -> list[tuple[Frame, Metadata]]:
-        """The frames of a sample with their metadata; those that no agent must see are left out."""
+    def _read(self, key: str, payload: bytes | bytearray, sender: AgentKey) -> Read:
+        """The frames of a sample with their metadata; those that no agent must see are left out. What this gateway
+        judged when it came in is not judged again."""
+        if (known := self._judged.take(payload)) is not None:
+            return known
         try:
             frames = parse_frames(payload, self._layout, runs=True)
         except WireError as error:
             self._bad(key, error)
             return []
-        known = self._metadata
-        from_type, from_id = sender
-        read = []
-        for frame in frames:
-            metadata = known.get(frame.metadata)
-            if metadata and metadata.sender_agent_id == from_id and metadata.sender_agent_type == from_type:
-                read.append((frame, metadata))
-            elif (judged := self._judge(key, frame, sender)) is not None:
-                read.append(judged)
-        return read
+        judging = self._judges.get(sender)
+        if judging is None:
+            if len(self._judges) >= SENDERS:
+                self._judges.clear()
+            judging = self._judges[sender] = Judge(*sender, limit=KNOWN_EACH)
+        return [judged for frame in frames if (judged := self._judge(key, frame, judging)) is not None]
 
-    def _judge(self, key: str, frame: Frame, sender: AgentKey) -> tuple[Frame, Metadata] | None:
-        """A frame with its true sender, and its metadata, which is remembered if it was true already."""
+    def _judge(self, key: str, frame: Frame, judging: Judge) -> tuple[Frame, Metadata] | None:
+        """A frame with its true sender, and its metadata."""
         raw = frame.metadata
         try:
-            metadata = Metadata.decode(raw)
-            named = (metadata.sender_agent_type, metadata.sender_agent_id)
-            # written as we write it, there is nothing in it that another reader may take for the sender
-            if named != sender or metadata.encode() != raw:
-                true = correct_sender(raw, *sender)
-                if true is not raw and named != sender:
-                    self._wrong_sender(key, named, frame.count)
-                if not readable(true):
-                    true = metadata.sent_by(*sender).encode()
-                if true is not raw:
-                    return frame.with_metadata(true), metadata.sent_by(*sender)
+            metadata, true, readable = judging(raw)
+            if readable and (true is raw or true == raw):
+                return frame, metadata
+            named = Metadata.decode(raw)
+            sender = (metadata.sender_agent_type, metadata.sender_agent_id)
+            if (named.sender_agent_type, named.sender_agent_id) != sender:
+                self._wrong_sender(key, (named.sender_agent_type, named.sender_agent_id), frame.count)
         except WireError as error:
             self._bad(key, error)
             return None
-        if len(raw) <= KNOWN_BYTES:
-            if len(self._metadata) >= KNOWN:
-                self._metadata.clear()
-            self._metadata[raw] = metadata
-        return frame, metadata
+        return frame.with_metadata(true if readable else metadata.encode()), metadata
 
     def _wrong_sender(self, key: str, named: tuple[int | None, int | None], count: int) -> None:
         if not self.drops["wrong_sender"]:

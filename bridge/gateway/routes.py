@@ -31,6 +31,10 @@ class Route(NamedTuple):
     """Destinations that were too many strangers."""
     to_robots: bool = False
     """Whether robots are among those it goes to."""
+    name: str = ""
+    """Equal for routes with the same keys."""
+    apart: bool = False
+    """Whether it is one agent, by its id: frames on another such route reach nobody that this one does."""
 
 
 class Routes:
@@ -54,7 +58,9 @@ class Routes:
         # type 0 goes to everybody, whatever ids it names
         agents = [(header.agent_type, agent_id) for agent_id in header.ids] if header.agent_type else []
         limited = any(self._is_limited(key) for key in keys)
-        route = Route(keys, agents, limited, left_out, header.agent_type in (ROS, EVERYBODY))
+        to_robots = header.agent_type in (ROS, EVERYBODY)
+        apart = len(keys) == 1 and len(agents) > 0
+        route = Route(keys, agents, limited, left_out, to_robots, " ".join(keys), apart)
         if not left_out:
             if len(self._known) >= KNOWN_ROUTES:
                 self._known.clear()

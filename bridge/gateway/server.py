@@ -1,6 +1,6 @@
 """The gateway: all sockets of one process, and their place on the mesh.
 
-A frame from a headset: socket → `Connection` → `TcpAgent` (whole? allowed? from whom?) → `forward` → routing → mesh.
+A frame from a headset: socket → `Connection` → `TcpAgent` (whole? allowed? from whom?) → `Forwarding` → routing → mesh.
 A frame to a headset: mesh → `Delivery` (for whom?) → `Connection` → socket. It never turns back: two headsets on one
 gateway talk through the mesh as well, inside this process's own Zenoh session.
 """
@@ -12,7 +12,6 @@ import logging
 import time
 from collections import Counter
 from contextlib import suppress
-from dataclasses import dataclass, field
 
 from msgspec import structs
 
@@ -20,14 +19,12 @@ from bridge.listening import bound, for_others
 from macs_zenoh.config import GatewaySettings
 from macs_zenoh.errors import Refused, Unreachable, UsageError
 from macs_zenoh.managers import Asker, Managers
-from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Payload, Subscription, Traffic
+from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Subscription
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.addresses import joined
-from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.budget import Budget
 from macs_zenoh.protocol.credit import Credits
 from macs_zenoh.protocol.directory import Change
-from macs_zenoh.protocol.existing import asks
 from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM, UNICAST
 from macs_zenoh.protocol.limits import (
     NAMED_EACH,
@@ -50,7 +47,7 @@ from macs_zenoh.protocol.messages import (
     Refusal,
     encode_data,
 )
-from macs_zenoh.protocol.rate_limit import Pace, Passing
+from macs_zenoh.protocol.rate_limit import Pace
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.tcp_agent import (
     Asked,
@@ -60,7 +57,6 @@ from macs_zenoh.protocol.tcp_agent import (
     Limits,
     Registering,
     RegistrationRefused,
-    Sent,
     Streamed,
     TcpAgent,
 )
@@ -69,25 +65,21 @@ from macs_zenoh.registration_calls import RobotCalls, StreamChanges
 
 from .admission import Admission
 from .agents import Agents, Group
-from .backpressure import Backpressure
 from .connection import Connection
 from .declarations import AgentDeclarations
 from .delivery import Delivery, Stream
+from .forwarding import Forwarding
+from .judged import JudgedFrames
 from .leases import Leases
 from .listener import BACKLOG, Listener, descriptors
 from .memory import Memory
 from .renumbering import Renumbering
 from .robot_ids import RobotIds
-from .routes import Route, Routes
 from .stead import Stead
 from .waiting import NAMED_S, WaitingRoom
 
 log = logging.getLogger("macs.gateway")
 
-PUBLISHER = int(NodeType.PUBLISHER)
-STOP_TYPES = frozenset({"std_msgs/Bool", "std_msgs/msg/Bool"})
-"""Of emergency stops, which no limit here concerns: what a robot's is called, only the robot knows."""
-COMMAND, CALL = Traffic.COMMAND, Traffic.CALL  # looked up by a Python call otherwise, for each message
 OTHER_DESCRIPTORS = 64
 """What a gateway has open besides its connections, of which each takes up to two."""
 FLUSH_S = 1.0
@@ -99,19 +91,6 @@ OVERLAP_S = 0.1
 """How long an agent is seen in its former group as well: in no moment it seems to be gone."""
 
 NO_MANAGERS: Managers = {}
-
-
-@dataclass
-class Run:
-    """Frames of one connection that go the same way, gathered within one read of its socket."""
-
-    route: Route
-    traffic: Traffic
-    frames: list[bytes | bytearray] = field(default_factory=list)
-    bytes: int = 0
-
-
-NO_RUN = Run(Route([], []), Traffic.CALL)
 
 
 class Gateway:
@@ -147,19 +126,17 @@ class Gateway:
         self._memory = Memory(settings.outbox_bytes, settings.max_frame_bytes)
         self._numbers = 0
         self._waiting = WaitingRoom(settings.handshake_timeout_s, self._no_id)
-        self._routes: dict[Connection, Routes] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._listeners: list[Listener | asyncio.AbstractServer] = []
-        self._run = NO_RUN
-        self._waited: dict[tuple[bytes, str], tuple[Route, bytes | bytearray]] = {}
-        """Commands that have waited in their connection, the newest of each kind, until all that came is seen."""
-        self._backpressure = Backpressure()
-        mesh.on_room(self._backpressure.release)
         self.directory = self._presence.directory
         """Who is online."""
         self._robot_ids = RobotIds(settings.robots)
         stead = Stead(mesh, self._layout)
-        self._delivery = Delivery(self.agents, self.directory, self._layout, stead)
+        judged = JudgedFrames()
+        self._delivery = Delivery(self.agents, self.directory, self._layout, stead, judged)
+        self._forwarding = forwarding = Forwarding(mesh, self.directory, judged)
+        # what agents sent goes straight there: it is called for every message
+        self.forward, self.received = forwarding.forward, forwarding.finish
         self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
         self._leases = Leases(
             mesh,
@@ -320,7 +297,7 @@ class Gateway:
                 closed_groups=self._admission.closed_groups(connection.host),
             )
             self.agents.enter(agent_id, connection)
-            self._routes[connection] = Routes(self.directory, self.mesh.limited, time.monotonic())
+            self._forwarding.enter(connection)
             connection.greet(peer)
 
     def _is_elsewhere(self, agent_id: int) -> bool:
@@ -344,8 +321,7 @@ class Gateway:
     def _id_changes(self, connection: Connection) -> None:
         """A connection is about to have another id."""
         self._online_reply = b""
-        self._put_run()
-        self._routes[connection].forget()
+        self._forwarding.forget(connection)
         self._delivery.forget()
 
     def closed(self, connection: Connection) -> None:
@@ -359,7 +335,7 @@ class Gateway:
             if self._drops["zenoh_program"] == 1:
                 what = "%s is a Zenoh program: it wants a router, and this is a gateway (logged once, counted as %s)"
                 log.warning(what, connection.address, "zenoh_program")
-        self._routes.pop(connection, None)
+        self._forwarding.leave(connection)
         self._online_reply = b""
         self._drops += connection.all_drops()
         self._delivery.forget()
@@ -398,98 +374,17 @@ class Gateway:
 
     # -- from a TCP agent to the mesh ----------------------------------------------------------------------------
 
-    def forward(self, connection: Connection, sent: Sent) -> None:
-        """Put a frame on the keys of its destinations."""
-        frame = sent.frame
-        destination = frame.destination
-        routes = self._routes[connection]
-        route = routes.find(destination)
-        if route is None:
-            route = routes.work_out(frame, connection.key, time.monotonic())
-            if route.left_out:
-                problem = "it sends to many agents that are not online, or groups that it never named: left out"
-                connection.complain("too_many_strangers", problem, route.left_out)
-                if not route.keys:
-                    return
-        if not route.keys:
-            connection.complain("no_destination", "a message names no agent and no group", frame.count)
-            return
-        for agent in route.agents:
-            if agent not in self.directory:
-                problem = f"a message goes to {AgentId(*agent)}, not online"
-                connection.complain("unknown_agent", problem, frame.count)
-        metadata = sent.metadata
-        traffic = COMMAND if metadata.node_type == PUBLISHER else CALL
-        if traffic is CALL and (metadata.node_type or metadata.message_manager) and asks(metadata):
-            connection.asks(metadata, frame.header)
-        if route.to_robots and not self._may_go(connection, sent, route, traffic):
-            return
-        if route.limited:
-            self._put_run()
-            for single in frame.each():
-                self._put(route.keys, single.data, traffic)
-            return
-        run = self._run
-        if run.route is not route or run.traffic is not traffic or run.bytes + len(frame.data) > Mesh.LARGE_BYTES:
-            self._put_run()
-            run = self._run = Run(route, traffic)
-        run.frames.append(frame.data)
-        run.bytes += len(frame.data)
-
     def pace(self) -> Pace:
         """For a new connection."""
         return Pace(self.settings.max_commands_per_s, self.settings.max_requests_per_s, time.monotonic())
 
-    def _may_go(self, connection: Connection, sent: Sent, route: Route, traffic: Traffic) -> bool:
-        """Whether a frame to robots goes on now; a command that has waited may, after all that came with it."""
-        now, count, metadata = time.monotonic(), sent.frame.count, sent.metadata
-        if traffic is COMMAND:
-            passing = connection.pace.command(count, now, may_stop=metadata.data_exchange_type in STOP_TYPES)
-        else:
-            passing = connection.pace.request(count, now)
-        if passing is Passing.NOW:
-            return True
-        if passing is Passing.FLOODED:
-            connection.complain("flooded", "it sends robots more than one agent may", count)
-            return False
-        *_, newest = sent.frame.each()
-        held = (sent.frame.destination, metadata.node_name)
-        older = count - 1 + (self._waited.pop(held, None) is not None)
-        self._waited[held] = (route, newest.data)
-        if older:
-            connection.complain("too_old", "commands that waited with newer ones", older)
-        return False
-
-    def received(self, connection: Connection) -> None:
-        """All that one read of a socket brought is forwarded or handled."""
-        if self._run.frames:
-            self._put_run()
-        if self._waited:
-            for route, newest in self._waited.values():
-                self._put(route.keys, newest, COMMAND)
-            self._waited.clear()
-        if self.mesh.backlogged:
-            self._backpressure.hold(connection, self.mesh.backlog_sent)
-
-    def _put_run(self) -> None:
-        """Put frames that go the same way as one sample: a put costs more than a frame."""
-        run, self._run = self._run, NO_RUN
-        if run.frames:
-            self._put(run.route.keys, run.frames[0] if len(run.frames) == 1 else b"".join(run.frames), run.traffic)
-
-    def _put(self, keys: list[str], payload: Payload, traffic: Traffic) -> None:
-        for key in keys:
-            self.mesh.put(key, payload, traffic)
-            self.mesh.make_room()
-
     def handle(self, connection: Connection, event: Event) -> None:
         """One thing a TCP agent did."""
-        self._put_run()
         if isinstance(event, Streamed):
-            key = STREAM.of(type=ROS, id=connection.agent_id, node=event.metadata.node_name or "_")
-            for frame in event.frame.each() if self.mesh.limited(key) else [event.frame]:
-                self._put([key], frame.data, Traffic.STREAM)
-        elif isinstance(event, Joined):
+            self._forwarding.stream(connection, event)
+            return
+        self._forwarding.flush()
+        if isinstance(event, Joined):
             self._joined(connection, event)
             connection.charge()
         elif isinstance(event, Registering):

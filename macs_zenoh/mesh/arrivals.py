@@ -82,7 +82,7 @@ class Arrivals:
         self._wake = wake
         self._queue: deque[tuple[Callable[[Iterator[Any]], None], tuple[Any, ...], bool]] = deque()
         """For whom, the sample, and whether the loop's own thread has put it."""
-        self._looped = 0
+        self.looped = 0
         """How many of these the loop's own thread has put."""
         self._waiting = False
         self._handled: tuple[Any, ...] | None = None
@@ -120,7 +120,7 @@ class Arrivals:
                 keep_attached()
             elsewhere = payload is None
             looped = not elsewhere and threading.get_ident() == self._loop_thread
-            if (self._looped if looped else len(queue)) >= limit and not self._has_room(sample, looped):
+            if (self.looped if looped else len(queue)) >= limit and not self._has_room(sample, looped):
                 return False
             if elsewhere:
                 payload = sample.payload.to_bytes()
@@ -130,7 +130,7 @@ class Arrivals:
                 return True
             if len(payload) > large and not self._has_room_for(len(payload), looped):
                 return False
-            self._looped += looped
+            self.looped += looped
             if info is None or on_numbered is None:
                 queue.append((on_batch, (key, payload), looped))
             else:
@@ -223,7 +223,7 @@ class Arrivals:
     def make_room(self) -> None:
         """Hand over what waits, if much of it was put by the loop's own thread, which handles it as well: whoever puts
         there for others calls this after each put, and goes on when there is room. Not within a handler."""
-        if self._looped > self.LOOPED or (self._looped and self._large_bytes > self.LIMIT_BYTES // 4):
+        if self.looped > self.LOOPED or (self.looped and self._large_bytes > self.LIMIT_BYTES // 4):
             self._deliver()
 
     def _deliver(self) -> None:
@@ -254,7 +254,7 @@ class Arrivals:
             if handler is not on_batch and handler != on_batch:
                 return
             queue.popleft()
-            self._looped -= looped
+            self.looped -= looped
             size = len(sample[1])
             if size > self.LARGE_BYTES:
                 with self._large_lock:
@@ -299,7 +299,7 @@ class Arrivals:
     def _has_room(self, sample: zenoh.Sample, looped: bool) -> bool:
         """Whether there is room for one more. Topic data does not wait for it, nor can the loop's own thread."""
         if looped:
-            room = self._looped < self.LIMIT
+            room = self.looped < self.LIMIT
         elif sample.priority == TOPICS and sample.congestion_control == MAY_DROP:
             self._behind("topics_behind")
             return False

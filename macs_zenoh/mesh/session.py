@@ -181,6 +181,11 @@ class Mesh:
         return self._outgoing.backlogged
 
     @property
+    def looped(self) -> int:
+        """How many samples wait here that were put in the loop's own thread."""
+        return self._arrivals.looped
+
+    @property
     def backlog_sent(self) -> int:
         """How many of what had to wait were sent."""
         return self._outgoing.backlog_sent

@@ -126,6 +126,10 @@ class Metadata(Struct, frozen=True, rename="camel", forbid_unknown_fields=True):
             return self
         return msgspec.structs.replace(self, sender_agent_type=agent_type, sender_agent_id=agent_id)
 
+    def numbered(self, request_id: int) -> Metadata:
+        """The same with another request id."""
+        return msgspec.structs.replace(self, request_id=request_id)
+
 
 _metadata_decoder = msgspec.json.Decoder(Metadata)
 

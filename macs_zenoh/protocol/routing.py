@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from .keyexpr import BROADCAST, CALL, GROUP, UNICAST, block_of
+from .keyexpr import BROADCAST, CALL, GROUP, STREAM, UNICAST, block_of
 from .messages import BROADCAST as EVERYBODY
 from .messages import Metadata
 from .wire import MACS, Header, Layout, encode_frame, encode_message
@@ -33,6 +33,12 @@ def keys_of(header: Header, from_type: int, from_id: int) -> list[str]:
 def unicast_key(agent_type: int, agent_id: int, from_type: int, from_id: int) -> str:
     """The inbox key of one agent, for one sender."""
     return UNICAST.of(type=agent_type, block=block_of(agent_id), id=agent_id, from_type=from_type, from_id=from_id)
+
+
+@lru_cache(maxsize=4096)
+def stream_key(agent_type: int, agent_id: int, node: str) -> str:
+    """The key of one robot's topic data under one node."""
+    return STREAM.of(type=agent_type, id=agent_id, node=node)
 
 
 def call(

@@ -23,6 +23,7 @@ from msgspec import Struct, structs
 from ..errors import BadField, BadJson, NotAllowed, TooFast, UnknownManager, WireError
 from . import greetings
 from .credit import Credit
+from .judging import Judge
 from .limits import (
     CONFIGURATION_BYTES,
     MANAGEMENT_BYTES,
@@ -50,7 +51,6 @@ from .messages import (
     RemoveNode,
     StreamData,
     Welcome,
-    correct_sender,
     decode_data,
     decode_management,
     encode_data,
@@ -96,13 +96,15 @@ class Joined(NamedTuple):
 
 
 class Sent:
-    """A frame for other agents, or a run of them. Its sizes add up and its sender is true."""
+    """A frame for other agents, or a run of them. Its sizes add up and its sender is true. ``readable``: existing
+    programs find in its metadata what we find."""
 
-    __slots__ = ("frame", "metadata")
+    __slots__ = ("frame", "metadata", "readable")
 
-    def __init__(self, frame: Frame, metadata: Metadata) -> None:
+    def __init__(self, frame: Frame, metadata: Metadata, readable: bool = False) -> None:
         self.frame = frame
         self.metadata = metadata
+        self.readable = readable
 
 
 class Streamed(NamedTuple):
@@ -110,6 +112,7 @@ class Streamed(NamedTuple):
 
     frame: Frame
     metadata: Metadata
+    readable: bool
     targets: list[tuple[int, int]]
 
 
@@ -162,9 +165,9 @@ class TcpAgent:
     ``drops`` counts, by name, what was not passed on; ``corrected`` counts frames whose sender had to be put right.
     """
 
-    METADATA_CACHE = 512
-    CACHED_BYTES = 1024
-    """Longer metadata is judged each time: a peer chooses it, and no existing one needs half of that."""
+    TOPICS = 128
+    TOPIC_BYTES = 1024
+    """So many lists of a topic's registrants are remembered, if they are not longer."""
 
     def __init__(
         self,
@@ -206,11 +209,9 @@ class TcpAgent:
         self._heard_at = now
         self._partial_since: float | None = None
         self._partial_begun = 0
-        # headsets repeat the same metadata for every message of a topic: decode and correct each one once
-        self._metadata: dict[bytes, tuple[Metadata, bytes | None]] = {}
-        self._usual: Sent | None = None
-        self._usual_bytes = 0
-        self._usual_beginning = b""
+        self._judge = Judge(0, agent_id)
+        self._topics: dict[bytes, StreamData] = {}
+        """Of a robot: management data that was read, by its bytes."""
 
     def __repr__(self) -> str:
         return f"agent {self.agent_id} ({self.state.value})"
@@ -232,8 +233,7 @@ class TcpAgent:
         """From now on the agent has another id. `welcome` tells it; until it has read that it uses the former one."""
         self.former_ids.add(self.agent_id)
         self.agent_id = agent_id
-        self._metadata.clear()
-        self._usual_bytes = 0
+        self._judge = Judge(self.agent_type, agent_id)
 
     # -- in ------------------------------------------------------------------------------------------------------
 
@@ -245,9 +245,6 @@ class TcpAgent:
         """``size`` bytes were received into `space`."""
         if self.state is GONE:
             return []
-        if size == self._usual_bytes and (again := self._again(size)) is not None:
-            self._heard_at = now
-            return [again]
         self._heard_at = now
         events: list[Event] = []
         decoder, limited = self._decoder, self._limits.frames_per_s
@@ -277,22 +274,7 @@ class TcpAgent:
         if decoder.error is not None:
             self.drops["FrameTooLarge"] += 1
             events += [Rejected(decoder.error), self._leave("its next frame cannot be found")]
-        elif len(events) == 1 and type(sent := events[0]) is Sent and len(sent.frame.data) == size:
-            self._remember(sent)
         return events
-
-    def _remember(self, sent: Sent) -> None:
-        """A read brought this one frame and nothing else; the next may bring one like it. One whose sender had to be
-        put right does not begin as it came, so none is ever like it."""
-        if sent.frame.count == 1 and not self._limits.frames_per_s:
-            self._usual, self._usual_bytes = sent, len(sent.frame.data)
-            self._usual_beginning = sent.frame.beginning
-
-    def _again(self, size: int) -> Sent | None:
-        """What was received, if it differs from what was remembered in its data only."""
-        data = self._decoder.again(size, self._usual_beginning)
-        usual = self._usual
-        return Sent(usual.frame.with_data_of(data), usual.metadata) if data is not None and usual is not None else None
 
     def receive(self, data: bytes, now: float) -> list[Event]:
         """The same for bytes that are already somewhere."""
@@ -374,8 +356,17 @@ class TcpAgent:
         raise error
 
     def _management(self, frame: Frame) -> Management | Custom:
+        raw = frame.management
+        topic = self._topics.get(raw)
+        if topic is not None:
+            return topic
         most = CONFIGURATION_BYTES if self.state is GREETED else MANAGEMENT_BYTES
-        return decode_management(frame.management, self._custom, most)
+        management = decode_management(raw, self._custom, most)
+        if isinstance(management, StreamData) and len(raw) <= self.TOPIC_BYTES:
+            if len(self._topics) >= self.TOPICS:
+                self._topics.clear()
+            self._topics[raw] = management
+        return management
 
     def _read_management(self, frame: Frame, events: list[Event]) -> Management | Custom:
         """The same; who meant to register hears why it cannot be read."""
@@ -436,6 +427,8 @@ class TcpAgent:
             return
         self.state = ONLINE
         self._decoder.runs = not self._limits.frames_per_s  # a rate limit is for each frame
+        if kind != self.agent_type:
+            self._judge = Judge(kind, self.agent_id)
         self.agent_type, self.group = kind, group
         events.append(Joined(kind, group, configuration.functionality))
         while self._held:
@@ -483,32 +476,17 @@ class TcpAgent:
         if self.agent_type != ROS:
             raise NotAllowed("only a robot sends topic data")
         sent = self._sent(frame)
-        return Streamed(sent.frame, sent.metadata, stream.targets())
+        return Streamed(sent.frame, sent.metadata, sent.readable, stream.targets())
 
     def _sent(self, frame: Frame) -> Sent:
         raw = frame.metadata
-        known = self._metadata.get(raw)
-        if known is None:
-            known = self._judge(raw)
-        metadata, corrected = known
-        if corrected is not None:
-            self.corrected += frame.count
-            frame = frame.with_metadata(corrected)
-        return Sent(frame, metadata)
-
-    def _judge(self, raw: bytes) -> tuple[Metadata, bytes | None]:
         if not raw:
             raise BadField("metadata", "a message for other agents needs metadata")
-        metadata = Metadata.decode(raw)
-        true = correct_sender(raw, self.agent_type, self.agent_id)
-        corrected = None if true is raw else true
-        if corrected is not None:
-            metadata = Metadata.decode(corrected)
-        if len(raw) <= self.CACHED_BYTES:
-            if len(self._metadata) >= self.METADATA_CACHE:
-                self._metadata.clear()
-            self._metadata[raw] = (metadata, corrected)
-        return metadata, corrected
+        judged = self._judge(raw)
+        if judged.true is not raw and judged.true != raw:
+            self.corrected += frame.count
+            frame = frame.with_metadata(judged.true)
+        return Sent(frame, judged.metadata, judged.readable)
 
     def _decode(self, frame: Frame) -> Metadata:
         raw = frame.metadata

@@ -481,13 +481,6 @@ class FrameDecoder:
             return self._cut(begun, len(begun))
         return self._cut(self._received, size)
 
-    def again(self, size: int, beginning: bytes) -> bytes | None:
-        """`advance` for bytes that are a whole frame of this size with this `Frame.beginning`. None when they are
-        not, or when they may not be a frame at all: then nothing has happened."""
-        if self._wanted or self._partial or self._skip or self.error or self._scratch[: len(beginning)] != beginning:
-            return None
-        return bytes(self._scratch[:size])
-
     def _cut(self, data: bytearray, end: int) -> list[Frame]:
         """Cut whole frames off ``data`` up to ``end`` and keep the rest as the beginning of the next one. What is kept
         is copied, once."""

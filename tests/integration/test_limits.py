@@ -52,9 +52,9 @@ async def site(*options: str) -> AsyncIterator[tuple[str, Program]]:
         yield endpoint, gateway
 
 
-async def answers(headset: Headset) -> None:
+async def answers(headset: Headset, timeout_s: float = 5.0) -> None:
     """The gateway still answers this headset."""
-    assert headset.id in (await headset.online()).unity_agent_ids
+    assert headset.id in (await headset.online(timeout_s)).unity_agent_ids
 
 
 async def test_declared_sizes_cost_nothing() -> None:
@@ -128,7 +128,7 @@ async def test_large_frames_leave_nothing() -> None:
                     await writer.drain()
         for _, writer in connections:
             writer.close()
-        await answers(headset)
+        await answers(headset, 60)  # behind all that was sent to it
 
         async def given_back() -> None:
             while memory_bytes(gateway.pid) - before > 80 << 20:

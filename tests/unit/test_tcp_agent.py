@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import BY_NAME, RECORDINGS, Recording, one_by_one, reading
 
@@ -474,84 +474,6 @@ def test_a_true_message_is_not_touched() -> None:
     events = peer.receive(raw * 3, 1.0)
     assert [bytes(event.frame.data) for event in singles(events) if isinstance(event, Sent)] == [raw] * 3
     assert peer.corrected == 0
-
-
-def told(event: Event) -> tuple[Any, ...]:
-    """An event with all that others are told of a frame."""
-    if not isinstance(event, Sent):
-        return said(event)
-    return said(event), event.metadata, event.frame.metadata, event.frame.count, bytes(event.frame.data)
-
-
-@settings(max_examples=300, deadline=None)
-@given(
-    sent=st.lists(
-        st.tuples(
-            st.sampled_from([b"one", b"two", b"other"]),  # data
-            st.sampled_from([(5,), (6,), (5, 6)]),  # whom it is for
-            st.sampled_from([7, 8]),  # whom it says it is from
-            st.sampled_from([None, None, None, 0, 39, 43, -5]),  # the byte that is changed, if any
-            st.sampled_from([1, 1, 1, 2]),  # how many of it one read brings
-            st.sampled_from([0, 0, 0, 0, 1, 60]),  # bytes that come later
-        ),
-        max_size=12,
-    )
-)
-@example([(b"one", (5,), 7, None, 1, 0), (b"one", (5,), 8, None, 1, 0)])
-@example([(b"one", (5,), 7, None, 1, 0), (b"one", (5,), 7, 39, 1, 0)])
-@example([(b"one", (5,), 7, None, 1, 0), (b"", (5,), 7, None, 1, 1), (b"one", (5,), 7, None, 1, 1)])
-def test_frames_like_the_one_before_say_the_same(sent: list[Any]) -> None:
-    """An agent that knows the usual frame hears of each what one hears that has never seen it."""
-    peer, fresh = online(), online()
-    late = b""
-    for data, ids, sender, changed, count, later in sent:
-        raw = bytearray(message(sender=(UNITY, sender), data=data, ids=ids))
-        if changed is not None:
-            raw[changed] ^= 1
-        read = late + bytes(raw) * count
-        read, late = read[: len(read) - later], read[len(read) - later :]
-        heard = peer.receive(read, 1.0)
-        fresh._usual_bytes = 0
-        assert [told(event) for event in heard] == [told(event) for event in fresh.receive(read, 1.0)]
-        assert peer.corrected == fresh.corrected
-        assert peer.drops == fresh.drops
-
-
-def test_a_read_of_two_frames_is_not_the_usual_one() -> None:
-    """Of two alike in one read, only the first one's beginning would be looked at the next time."""
-    peer = online()
-    peer.receive(message() * 2, 1.0)
-    events = peer.receive(message() + message(sender=(UNITY, 8)), 1.0)
-    assert [event.frame.metadata for event in singles(events) if isinstance(event, Sent)] == [
-        parse_frame(message()).metadata
-    ] * 2
-
-
-@pytest.mark.parametrize("begun", [50, 10])
-def test_in_the_middle_of_a_frame_nothing_is_usual(begun: int) -> None:
-    """As many bytes as the usual frame has, or even the same ones, are a part of the frame that has begun."""
-    peer, fresh = online(), online()
-    usual, large = message(), message(data=message() * 10)
-    inside = [large[:begun], large[begun : begun + len(usual)], large[begun + len(usual) :]]
-    alike = [large[:10], usual, usual]
-    for reads in ([usual, *inside, usual], [usual, *alike]):
-        for read in reads:
-            heard = peer.receive(read, 1.0)
-            fresh._usual_bytes = 0
-            assert [told(event) for event in heard] == [told(event) for event in fresh.receive(read, 1.0)]
-
-
-def test_the_usual_frame_is_not_judged_again() -> None:
-    """What differs in its data only is passed on as it came, and is found without looking into it."""
-    peer = online()
-    peer.receive(message(data=b"a"), 1.0)
-    peer._judge = peer._decode = None  # type: ignore[method-assign, assignment]
-    peer._metadata.clear()
-    (sent,) = peer.receive(message(data=b"b"), 2.0)
-    assert isinstance(sent, Sent)
-    assert bytes(sent.frame.data) == message(data=b"b")
-    assert said(sent) == ("Sent", UNITY, (5,), (), b"b")
-    assert peer.next_deadline() == 7.0
 
 
 @pytest.mark.parametrize("sender", [(UNITY, 0), (UNITY, 8), (ROS, 7), (None, None)])

@@ -1,0 +1,184 @@
+"""From TCP agents to the mesh: what a connection sent goes on the keys of its destinations.
+
+Frames that one read of a socket brought and that go the same way are put as one sample, since a put costs more than a
+frame. What agents of this gateway get of it they get as it was judged here.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from macs_zenoh.mesh import Mesh, Payload, Traffic
+from macs_zenoh.protocol.agent_id import AgentId
+from macs_zenoh.protocol.directory import Directory
+from macs_zenoh.protocol.existing import asks
+from macs_zenoh.protocol.messages import ROS, NodeType
+from macs_zenoh.protocol.rate_limit import Passing
+from macs_zenoh.protocol.routing import stream_key
+from macs_zenoh.protocol.tcp_agent import Sent, Streamed
+
+from .backpressure import Backpressure
+from .connection import Connection
+from .judged import JudgedFrames, Read
+from .routes import Route, Routes
+
+PUBLISHER = int(NodeType.PUBLISHER)
+STOP_TYPES = frozenset({"std_msgs/Bool", "std_msgs/msg/Bool"})
+"""Of emergency stops, which no limit here concerns: what a robot's is called, only the robot knows."""
+
+COMMAND, CALL, STREAM = Traffic.COMMAND, Traffic.CALL, Traffic.STREAM  # a Python call otherwise, for each message
+
+
+@dataclass
+class Run:
+    """Frames of one connection that go the same way, gathered within one read of its socket."""
+
+    keys: list[str]
+    traffic: Traffic
+    read: Read = field(default_factory=list)
+    bytes: int = 0
+    readable: bool = True
+    """Whether all of them may go to existing programs as they are."""
+
+
+class Forwarding:
+    """For all connections of a gateway; within one read of a socket, for that connection."""
+
+    def __init__(self, mesh: Mesh, directory: Directory, judged: JudgedFrames) -> None:
+        self._mesh = mesh
+        self._directory = directory
+        self._judged = judged
+        self._routes: dict[Connection, Routes] = {}
+        self._runs: dict[str, Run] = {}
+        """By where they go, in the order in which they began."""
+        self._apart = True
+        """Whether no two of them can have a receiver in common, so that their order does not matter."""
+        self._waited: dict[tuple[bytes, str], tuple[Route, Sent]] = {}
+        """Commands that have waited in their connection, the newest of each kind, until all that came is seen."""
+        self._backpressure = Backpressure()
+        mesh.on_room(self._backpressure.release)
+
+    def enter(self, connection: Connection) -> None:
+        """A connection has an id."""
+        self._routes[connection] = Routes(self._directory, self._mesh.limited, time.monotonic())
+
+    def leave(self, connection: Connection) -> None:
+        """It has ended."""
+        self._routes.pop(connection, None)
+
+    def forget(self, connection: Connection) -> None:
+        """It is about to have another id: what it sent goes under the one that it had."""
+        self.flush()
+        self._routes[connection].forget()
+
+    def forward(self, connection: Connection, sent: Sent) -> None:
+        """Put a frame on the keys of its destinations, at the latest with the next `finish`."""
+        frame = sent.frame
+        route = self._routes[connection].find(frame.destination)
+        if route is None:
+            route = self._work_out(connection, sent)
+        if not route.keys:
+            if not route.left_out:
+                connection.complain("no_destination", "a message names no agent and no group", frame.count)
+            return
+        for agent in route.agents:
+            if agent not in self._directory:
+                problem = f"a message goes to {AgentId(*agent)}, not online"
+                connection.complain("unknown_agent", problem, frame.count)
+        metadata = sent.metadata
+        traffic = COMMAND if metadata.node_type == PUBLISHER else CALL
+        if traffic is CALL and (metadata.node_type or metadata.message_manager) and asks(metadata):
+            connection.asks(metadata, frame.header)
+        if route.to_robots and not self._may_go(connection, sent, route, traffic):
+            return
+        if route.limited:
+            self.flush()
+            self._put_singly(route.keys, sent, traffic)
+        else:
+            self._gather(route.name, route.keys, sent, traffic, apart=route.apart)
+
+    def stream(self, connection: Connection, event: Streamed) -> None:
+        """Put a robot program's topic data where its registrants listen."""
+        key = stream_key(ROS, connection.agent_id, event.metadata.node_name or "_")
+        sent = Sent(event.frame, event.metadata, event.readable)
+        if self._mesh.limited(key):
+            self.flush()
+            self._put_singly([key], sent, STREAM)
+        else:
+            self._gather(key, [key], sent, STREAM, apart=False)
+
+    def finish(self, connection: Connection) -> None:
+        """All that one read of a socket brought is forwarded."""
+        if self._runs:
+            self.flush()
+        if self._waited:
+            for route, newest in self._waited.values():
+                self._put(route.keys, newest.frame.data, COMMAND)
+            self._waited.clear()
+        if self._mesh.backlogged:
+            self._backpressure.hold(connection, self._mesh.backlog_sent)
+
+    def flush(self) -> None:
+        """Put what is gathered."""
+        runs, self._runs, self._apart = self._runs, {}, True
+        for run in runs.values():
+            read = run.read
+            payload = read[0][0].data if len(read) == 1 else b"".join([frame.data for frame, _ in read])
+            self._put(run.keys, payload, run.traffic, read if run.readable else None)
+
+    def _work_out(self, connection: Connection, sent: Sent) -> Route:
+        route = self._routes[connection].work_out(sent.frame, connection.key, time.monotonic())
+        if route.left_out:
+            problem = "it sends to many agents that are not online, or groups that it never named: left out"
+            connection.complain("too_many_strangers", problem, route.left_out)
+        return route
+
+    def _gather(self, name: str, keys: list[str], sent: Sent, traffic: Traffic, *, apart: bool) -> None:
+        size = len(sent.frame.data)
+        run = self._runs.get(name)
+        if run is None or run.traffic is not traffic or run.bytes + size > Mesh.LARGE_BYTES:
+            if self._runs and (run is not None or not (apart and self._apart)):
+                self.flush()
+            run = self._runs[name] = Run(keys, traffic)
+            self._apart = apart
+        run.read.append((sent.frame, sent.metadata))
+        run.bytes += size
+        if not sent.readable:
+            run.readable = False
+
+    def _put_singly(self, keys: list[str], sent: Sent, traffic: Traffic) -> None:
+        """Where a traffic rule limits what goes there, messages count one by one."""
+        for single in sent.frame.each():
+            self._put(keys, single.data, traffic)
+
+    def _put(self, keys: list[str], payload: Payload, traffic: Traffic, read: Read | None = None) -> None:
+        mesh = self._mesh
+        before = mesh.looped
+        for key in keys:
+            mesh.put(key, payload, traffic)
+        copies = mesh.looped - before
+        if copies:
+            if read is not None:
+                self._judged.note(payload, read, copies, alone=not before)
+            mesh.make_room()
+
+    def _may_go(self, connection: Connection, sent: Sent, route: Route, traffic: Traffic) -> bool:
+        """Whether a frame to robots goes on now; a command that has waited may, after all that came with it."""
+        now, count, metadata = time.monotonic(), sent.frame.count, sent.metadata
+        if traffic is COMMAND:
+            passing = connection.pace.command(count, now, may_stop=metadata.data_exchange_type in STOP_TYPES)
+        else:
+            passing = connection.pace.request(count, now)
+        if passing is Passing.NOW:
+            return True
+        if passing is Passing.FLOODED:
+            connection.complain("flooded", "it sends robots more than one agent may", count)
+            return False
+        *_, newest = sent.frame.each()
+        held = (sent.frame.destination, metadata.node_name)
+        older = count - 1 + (self._waited.pop(held, None) is not None)
+        self._waited[held] = (route, Sent(newest, metadata))
+        if older:
+            connection.complain("too_old", "commands that waited with newer ones", older)
+        return False
