@@ -11,6 +11,8 @@ import asyncio
 from typing import Protocol
 
 HOLD_S = 0.25
+ROBOT_HOLD_S = 1.0
+"""Of a robot program, which draws nothing that would freeze, and whose topics would be dropped at once."""
 
 
 class Sender(Protocol):
@@ -32,14 +34,14 @@ class Backpressure:
         self._held: set[Sender] = set()
         self._timer: asyncio.TimerHandle | None = None
 
-    def hold(self, sender: Sender, moved: object) -> bool:
-        """Hold a sender back until `release`, but not longer than ``HOLD_S``, and not again before the bottleneck has
+    def hold(self, sender: Sender, moved: object, most_s: float = HOLD_S) -> bool:
+        """Hold a sender back until `release`, but not longer than ``most_s``, and not again before the bottleneck has
         moved, which ``moved`` tells: it is another one then. Returns whether it is held."""
         if self._timer is None:
             if moved == self._moved:
                 return False
             self._moved = moved
-            self._timer = asyncio.get_running_loop().call_later(HOLD_S, self.release)
+            self._timer = asyncio.get_running_loop().call_later(most_s, self.release)
         if sender not in self._held:
             self._held.add(sender)
             sender.pause()

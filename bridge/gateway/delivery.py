@@ -24,6 +24,7 @@ from macs_zenoh.protocol.routing import takes_group_copy
 from macs_zenoh.protocol.wire import Frame, Layout, is_probe, parse_frame, parse_frames
 
 from .agents import Agents
+from .backpressure import ROBOT_HOLD_S
 from .connection import Connection
 from .judged import JudgedFrames, Read
 from .stead import Stead
@@ -325,7 +326,7 @@ class Delivery:
             other = self._agents.find(registrant.agent_type, registrant.agent_id)
             if other is not receiver and (other is None or not other.full):
                 return False
-        return receiver.backpressure.hold(robot, receiver.moved)
+        return receiver.backpressure.hold(robot, receiver.moved, ROBOT_HOLD_S)
 
     def _read_registrants(self, key: str, frame: Frame) -> list[AgentKey]:
         """Each registrant, once. The list changes only with registrations, so each is read once."""

@@ -1,6 +1,6 @@
 """The gateway: all sockets of one process, and their place on the mesh.
 
-A frame from a headset: socket → `Connection` → `TcpAgent` (whole? allowed? from whom?) → `Forwarding` → routing → mesh.
+A frame from a headset: socket → `Connection` → `TcpAgent` (whole? allowed? from whom?) → `Forwarding` → mesh.
 A frame to a headset: mesh → `Delivery` (for whom?) → `Connection` → socket. It never turns back: two headsets on one
 gateway talk through the mesh as well, inside this process's own Zenoh session.
 """
