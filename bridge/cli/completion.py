@@ -1,7 +1,7 @@
 """Print what a shell has to read so that Tab completes verbs, options, robots' ids and topics.
 
-Robots and topics are asked from the mesh, for at most a second: from the router that -e, the settings or MACS_CONNECT
-name. Where none answers nothing is offered, and nothing is said.
+Robots and topics are looked up on the mesh for at most a second, at the router that -e, the settings or
+MACS_CONNECT name. When none answers, there are no suggestions and no error.
 
 examples:
   eval "$(macs completion bash)"                       in ~/.bashrc

@@ -1,6 +1,6 @@
-"""Run a gateway: existing headsets (and robots) connect here over TCP and are agents on the mesh.
+"""Run a gateway: existing headsets (and robots) connect here over TCP and become agents on the mesh.
 
-Headsets need nothing but this address. Without a router yet, the gateway waits for one.
+Headsets need to know nothing but this address. While no router answers, the gateway waits for one.
 
 examples:
   macs gateway                                             headsets on this machine, router on this machine

@@ -1,10 +1,11 @@
 """List the agents that are online, robots and headsets, whichever gateway they are behind; then gateways and routers.
 
-A headset's session is its gateway's, so headsets with one session share a gateway. Robots are asked for their state:
-STATE says which are stopped, who has control of which topic, and ? for a robot that should answer and does not: it
-hangs, or access rules do not let you ask it ([operator] in the settings, or --as, say who you are). A headset that
-nothing was heard of for 10 s is away: taken off, or out of reach; its gateway lets it go later (idle_timeout_s).
-Of a gateway the address is where headsets connect to it; routers may hide theirs.
+SESSION is the Zenoh session: headsets that have the same one are behind the same gateway. STATE is what a robot
+answers when it is asked: whether it is stopped, and who has control of which topic. A ? means that it should
+answer and does not: it hangs, or access rules do not let you ask it ([operator] in the settings, or --as, say who
+you are). A headset is away when its gateway has heard nothing of it for 10 s: it was taken off, or is out of
+reach. If it stays away, the gateway closes its connection later (idle_timeout_s). The address of a gateway is
+where headsets connect.
 -v adds, for each robot: the emergency stop, who has registered what, control and dead-man of each topic, what was
 lost, and what it offers. Exit code 1 when no router answers, 130 after Ctrl-C.
 

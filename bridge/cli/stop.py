@@ -1,12 +1,12 @@
 """Stop robots: every one that is online, or those named. --release lets them go on.
 
-The emergency stop of a robot is latched: commands and goals are refused until it is released, and what each topic is
-given at a stop is in the robot's settings (docs/robot.md). The call is repeated until the robot says that it holds;
-then the robot is asked once more, a moment later, whether it still does.
-Robots and routers may allow it only to some: the settings ([operator]) or --as say who you are.
+The emergency stop holds until it is released: a robot refuses commands and goals, and publishes the stop messages
+in its settings (docs/robot.md). This command repeats its call until the robot says that it is stopped; a moment
+later it asks once more whether that still holds. Robots and routers may allow it only to some: the settings
+([operator]) or --as say who you are.
 
-Exit code 0 when every robot has confirmed; 1 when one has not, or none is online; 130 after Ctrl-C. A program
-that has to start first, and a network in between, do not replace the button on the robot.
+Exit code 0 when every robot has confirmed; 1 when one has not, or none is online; 130 after Ctrl-C. This does not
+replace the button on the robot: a program has to start first, and there is a network in between.
 
 examples:
   macs stop                                       every robot that is online

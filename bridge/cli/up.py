@@ -6,7 +6,7 @@ front. Ctrl-C stops them all. Without rclpy the robot is left out.
 --demo adds a robot without hardware (a camera image, a pose, /cmd_vel) and a headset that
 shows what it receives and drives it. So that it never moves a real robot, the demo has a ROS
 domain of its own on this machine only, chosen free whatever ROS_DOMAIN_ID says, and a namespace
-of its own on the mesh; both are printed, and where a usual port is taken, the free one it took.
+of its own on the mesh. Both are printed, and so is the free port that it takes where the usual one is in use.
 
 examples:
   macs up --demo
