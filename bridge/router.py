@@ -7,12 +7,11 @@ import logging
 import time
 from collections.abc import Callable
 
-from bridge.doctor.below import tls_settings
-from bridge.doctor.look import at, endpoints_of
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import Mesh, configuration
-from macs_zenoh.protocol.addresses import is_local, of_endpoint
+from macs_zenoh.protocol import endpoints, keyexpr
+from macs_zenoh.protocol.addresses import is_local
 
 log = logging.getLogger("macs.router")
 
@@ -27,13 +26,14 @@ AGAIN_S = 1.0
 def open_to_anybody(settings: MeshSettings) -> list[str]:
     """The endpoints that others than this machine reach, and where nobody has to show who he is."""
     zenoh = configuration(settings)
-    passwords = at(zenoh, "transport/auth/usrpwd/dictionary_file")
-    if passwords or at(zenoh, "access_control/enabled"):
+    passwords = endpoints.value_at(zenoh, "transport/auth/usrpwd/dictionary_file")
+    if passwords or endpoints.value_at(zenoh, "access_control/enabled"):
         return []
     found = []
-    for endpoint in endpoints_of(zenoh, "listen"):
-        protocol, where = endpoint.partition("/")[0], of_endpoint(endpoint)
-        mutual = tls_settings(endpoint, at(zenoh, "transport/link/tls") or {}).get("enable_mtls") in (True, "true")
+    for endpoint in endpoints.configured(zenoh, "listen"):
+        protocol, where = endpoints.protocol_of(endpoint), endpoints.address_of(endpoint)
+        common = endpoints.value_at(zenoh, "transport/link/tls") or {}
+        mutual = endpoints.tls_settings(endpoint, common).get("enable_mtls") in (True, "true")
         proven = protocol in ("tls", "quic") and mutual
         if where is not None and not is_local(where.host) and not proven:
             found.append(endpoint)
@@ -83,7 +83,7 @@ async def _dead_link(mesh: Mesh, known: set[str]) -> str:
         for _ in range(2):
             await asyncio.sleep(SETTLE_S)
             began = time.monotonic()
-            if await mesh.ask_all(f"@/{router}/router", timeout_s=ANSWER_S):
+            if await mesh.ask_all(keyexpr.router(router), timeout_s=ANSWER_S):
                 known.add(router)
                 return
             if time.monotonic() - began > ANSWER_S / 2:

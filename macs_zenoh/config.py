@@ -41,7 +41,7 @@ import msgspec
 from msgspec import Meta
 
 from macs_zenoh.errors import ConfigError, UsageError
-from macs_zenoh.protocol import addresses
+from macs_zenoh.protocol import addresses, endpoints
 from macs_zenoh.protocol.keyexpr import expression_problem, type_name, type_number
 
 if sys.version_info >= (3, 11):
@@ -79,8 +79,6 @@ ROUTER_RETRY_MS = 500
 LOCAL_ROUTER = "tcp/127.0.0.1:7447"
 EVERY_INTERFACE = "tcp/[::]:7447"
 
-IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "quic_datagram", "ws")
-PROTOCOLS = (*IP_PROTOCOLS, "unixsock-stream", "unixpipe", "serial", "vsock")
 """What an endpoint may begin with: the links that Zenoh has. Those over IP need a port."""
 
 
@@ -179,7 +177,9 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def _check(self) -> None:
         for field in ("connect", "listen"):
             for endpoint in getattr(self, field):
-                self._check_endpoint(field, endpoint)
+                problem = endpoints.problem(endpoint, lowest_port=0 if field == "listen" else 1)
+                if problem:
+                    raise self._wrong(field, f"{endpoint!r} {problem}")
         for override in self.overrides:
             if not re.match(r"[^:\s]+:.", override):
                 raise self._wrong("overrides", f"{override!r} is not PATH:JSON5, as in mode:'\"peer\"'")
@@ -187,17 +187,6 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             raise self._wrong("retry_min_ms", f"{self.retry_min_ms} is above retry_max_ms, {self.retry_max_ms}")
         if self.namespace is not None and not re.fullmatch(r"[^/*$?#\s]+(/[^/*$?#\s]+)*", self.namespace):
             raise self._wrong("namespace", f"{self.namespace!r} is not a plain key, as in site1 or site1/hall2")
-
-    def _check_endpoint(self, field: str, endpoint: str) -> None:
-        if re.fullmatch(r"[a-z][a-z0-9_.-]*/\S+", endpoint):
-            problem = _endpoint_problem(endpoint, lowest_port=0 if field == "listen" else 1)
-            if problem:
-                raise self._wrong(field, f"{endpoint!r} {problem}")
-            return
-        hint = (
-            f", write tcp/{endpoint}" if re.fullmatch(r"[\w.\[\]:-]+:\d+", endpoint) else ", as in tcp/10.0.0.1:7447"
-        )
-        raise self._wrong(field, f"{endpoint!r} is not a Zenoh endpoint{hint}")
 
     @property
     def routers(self) -> list[str]:
@@ -251,24 +240,6 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             *([("adminspace/enabled", True, ())] if self.mode == "router" else []),
             *([("namespace", self.namespace, ("namespace",))] if self.namespace else []),
         ]
-
-
-def _endpoint_problem(endpoint: str, *, lowest_port: int) -> str:
-    """Why an endpoint can never work; empty for one that might."""
-    protocol, _, rest = endpoint.partition("/")
-    if protocol not in PROTOCOLS:
-        return f"begins with {protocol!r}, which is no protocol of Zenoh's: {', '.join(PROTOCOLS)}"
-    if protocol not in IP_PROTOCOLS:
-        return ""
-    place = re.split(r"[?#]", rest)[0]
-    found = re.fullmatch(r"(.+):([0-9]+)", place)
-    if found is None:
-        return f"needs a host and a port, as in {protocol}/10.0.0.1:7447"
-    if ":" in found[1] and not re.fullmatch(r"\[.+\]", found[1]):
-        return f"needs brackets around its address: {protocol}/{addresses.joined(found[1], found[2])}"
-    if not lowest_port <= int(found[2]) <= 0xFFFF:
-        return f"has the port {found[2]}, allowed is {lowest_port}..65535"
-    return ""
 
 
 class GatewaySettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -40,8 +40,8 @@ from macs_zenoh.errors import UsageError
 from macs_zenoh.versions import installed
 
 if TYPE_CHECKING:
+    from bridge.doctor.analyze import Finding
     from bridge.doctor.facts import Facts
-    from bridge.doctor.findings import Finding
 
 SUMMARY = "what is wrong with a mesh, and what to do"
 
@@ -60,8 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from bridge.doctor import report
-    from bridge.doctor.findings import judge
-    from bridge.doctor.look import Examination
+    from bridge.doctor.analyze import analyze
+    from bridge.doctor.gather import Probe
 
     if args.timeout <= 0:
         raise UsageError(f"--timeout is {args.timeout:g}, more than 0 is needed")
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
     async def examine() -> int:
         with terminal.progress() as tell:
-            facts = await Examination(
+            facts = await Probe(
                 settings,
                 principal=principal,
                 timeout_s=args.timeout,
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
                 versions=(installed("macs-zenoh"), installed("eclipse-zenoh")),
                 on_progress=lambda step: tell(step, 0, 0),
             ).run()
-        findings = judge(facts)
+        findings = analyze(facts)
         if args.json:
             output.say(report.as_json(findings, facts))
         else:
@@ -118,8 +118,8 @@ def _rows(finding: Finding) -> Iterator[tuple[Cell, Cell]]:
     sign, style = SIGNS[finding.severity.name]
     text = f"{finding.where}: {finding.text}" if finding.where else finding.text
     yield (f"{sign:<{SIGN_WIDTH}}", style), _one_line(text)
-    if finding.todo and finding.severity.name != "OK":
-        yield "", "→ " + _one_line(finding.todo)
+    if finding.remedy and finding.severity.name != "OK":
+        yield "", "→ " + _one_line(finding.remedy)
 
 
 def _one_line(text: str) -> str:

@@ -20,7 +20,7 @@ from msgspec import Struct
 from bridge.principal import Principal
 from macs_zenoh.config import MeshSettings, OperatorSettings
 from macs_zenoh.errors import MacsError, Refused, TooLong, Unreachable
-from macs_zenoh.protocol import ping
+from macs_zenoh.protocol import keyexpr, ping
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import AgentInfo, Directory
 from macs_zenoh.protocol.keyexpr import LEASE, NAME, PING, PRESENCE
@@ -172,7 +172,7 @@ class Operator:
         if self._mesh.settings.namespace:  # what they tell is in none
             return linked
         found = {router.zid: router for router in linked}
-        for _, answer in await self._mesh.ask_all("@/*/router", timeout_s=timeout_s):
+        for _, answer in await self._mesh.ask_all(keyexpr.ROUTERS, timeout_s=timeout_s):
             with suppress(msgspec.MsgspecError):
                 router = msgspec.json.decode(answer, type=Router)
                 found[router.zid] = router
@@ -181,9 +181,8 @@ class Operator:
     async def elsewhere(self) -> Counter[str]:
         """How many agents there are in other namespaces."""
         found: Counter[str] = Counter()
-        for key in set(await self._mesh.tokens("**/" + PRESENCE.every(), timeout_s=self._timeout_s)):
-            namespace, here, _ = key.partition("/macs/live/")
-            if here:
+        for key in set(await self._mesh.tokens(keyexpr.everywhere(PRESENCE), timeout_s=self._timeout_s)):
+            if namespace := keyexpr.namespace_of(PRESENCE, key):
                 found[namespace] += 1
         return found
 

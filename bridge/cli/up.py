@@ -36,6 +36,7 @@ from bridge.listening import bound, for_others
 from bridge.logs import prefix_logs
 from macs_zenoh.config import GatewaySettings, RobotSettings, Settings, changed
 from macs_zenoh.errors import MacsError, Unreachable, UsageError
+from macs_zenoh.protocol import endpoints
 from macs_zenoh.protocol.addresses import EVERYWHERE, joined, reachable
 
 log = logging.getLogger("macs.up")
@@ -121,7 +122,7 @@ class Plan:
         if self.router_port is None:
             return None
         host = "::" if self.gateway.host in EVERYWHERE else self.gateway.host
-        return self._child("router", ["-l", f"tcp/{joined(host, self.router_port)}"])
+        return self._child("router", ["-l", endpoints.written("tcp", host, self.router_port)])
 
     def gateway_child(self) -> Child:
         block = [] if self.gateway.block is None else ["--block", str(self.gateway.block)]
@@ -206,7 +207,7 @@ def _free(host: str, port: int) -> int | None:
 
 
 def _local_router(host: str, port: int | None) -> str:
-    return f"tcp/{joined(reachable(host), port or 0)}"
+    return endpoints.written("tcp", reachable(host), port or 0)
 
 
 async def _up(plan: Plan) -> int:
@@ -272,7 +273,7 @@ async def _when_ready(plan: Plan, programs: list[Child]) -> int:
 def what_next(plan: Plan) -> str:
     """What to type now, and where to point a headset."""
     target = joined(reachable(plan.gateway.host), plan.gateway.port)
-    local = plan.routers == [f"tcp/127.0.0.1:{ROUTER_PORT}"]
+    local = plan.routers == [_local_router("127.0.0.1", ROUTER_PORT)]
     endpoint = "" if local else "".join(f" -e {router}" for router in plan.routers)
     if plan.apart is not None:
         endpoint += f" --namespace {plan.apart.namespace}"

@@ -1,1 +1,1 @@
-"""What is wrong with a mesh: `look` collects facts from where it runs, `findings` judges them, `report` prints."""
+"""What is wrong with a mesh: `gather` collects facts from where it runs, `analyze` judges them, `report` prints."""

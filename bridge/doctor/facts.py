@@ -57,7 +57,7 @@ class Echo(msgspec.Struct, kw_only=True):
     took_s: float
 
 
-class Way(msgspec.Struct, kw_only=True):
+class NetworkPath(msgspec.Struct, kw_only=True):
     """The way to a router or a program."""
 
     round_trips_ms: list[float] = []
@@ -121,7 +121,7 @@ class Endpoint(msgspec.Struct, kw_only=True):
     """Why no Zenoh session opened, in Zenoh's words; empty when one did."""
     router: str = ""
     """Zenoh id of the router; empty without a session."""
-    way: Way = msgspec.field(default_factory=Way)
+    path: NetworkPath = msgspec.field(default_factory=NetworkPath)
     rights: Rights = msgspec.field(default_factory=Rights)
     routers: list[RouterInfo] = []
     """What the admin space shows from here; empty where it is off or hidden."""
@@ -144,7 +144,7 @@ class Program(msgspec.Struct, kw_only=True):
     """As ros/7; a gateway's may be many."""
     blocks: list[int] = []
     pong: Pong | None = None
-    way: Way = msgspec.field(default_factory=Way)
+    path: NetworkPath = msgspec.field(default_factory=NetworkPath)
     called: bool | None = None
     """Whether it answered a call, where the settings' owner makes calls and it is a robot that serves them."""
 
@@ -161,7 +161,7 @@ class Own(msgspec.Struct, kw_only=True):
     id_slots: int = 10
     group_slots: int = 10
     zenoh_settings: dict[str, Any] = {}
-    """The lines of Zenoh's configuration that `findings` judges, by path."""
+    """The lines of Zenoh's configuration that `analyze` judges, by path."""
     certificates: list[Certificate] = []
     """Our own and the CA's, where they can be read."""
 

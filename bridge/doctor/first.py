@@ -15,12 +15,12 @@ from typing import Any
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import configuration
-from macs_zenoh.protocol.addresses import of_endpoint
+from macs_zenoh.protocol import endpoints
 
-from . import below
+from . import transport
+from .analyze import Finding, of_endpoints
 from .facts import Endpoint, Facts, Own
-from .findings import Finding, of_endpoints
-from .look import JUDGED, at, endpoints_of
+from .gather import JUDGED
 
 log = logging.getLogger("macs.mesh")
 
@@ -35,28 +35,34 @@ async def why(settings: MeshSettings, *, timeout_s: float = STEP_S) -> list[Find
         zenoh = configuration(settings)
     except MacsError:
         return []
-    tls = at(zenoh, "transport/link/tls") or {}
-    looking = (asyncio.to_thread(_look, endpoint, tls, timeout_s) for endpoint in dict.fromkeys(endpoints_of(zenoh)))
+    tls = endpoints.value_at(zenoh, "transport/link/tls") or {}
+    looking = (
+        asyncio.to_thread(_look, endpoint, tls, timeout_s) for endpoint in dict.fromkeys(endpoints.configured(zenoh))
+    )
     seen = await asyncio.gather(*looking)
-    own = Own(zenoh_settings={path: at(zenoh, path) for path in JUDGED})
+    own = Own(zenoh_settings={path: endpoints.value_at(zenoh, path) for path in JUDGED})
     return of_endpoints(Facts(at_s=time.time(), own=own, endpoints=list(seen)))
 
 
 def _look(endpoint: str, tls: dict[str, Any], timeout_s: float) -> Endpoint:
     """TCP, TLS, and who answers. Blocking."""
-    facts, where, protocol = Endpoint(endpoint=endpoint), of_endpoint(endpoint), endpoint.partition("/")[0]
+    facts, where, protocol = (
+        Endpoint(endpoint=endpoint),
+        endpoints.address_of(endpoint),
+        endpoints.protocol_of(endpoint),
+    )
     if where is None or protocol not in ("tcp", "tls"):
         return facts
-    facts.reach, facts.reach_detail = below.reach(*where, timeout_s)
+    facts.reach, facts.reach_detail = transport.reach(*where, timeout_s)
     if facts.reach != "ok":
         return facts
     if protocol == "tls":
-        facts.tls = below.tls(*where, below.tls_settings(endpoint, tls), timeout_s)
+        facts.tls = transport.tls(*where, endpoints.tls_settings(endpoint, tls), timeout_s)
     else:
-        facts.speaker = below.answers(*where, timeout_s)
+        facts.speaker = transport.answers(*where, timeout_s)
         if facts.speaker == "gateway":
-            facts.router_beside = below.router_beside(where.host, timeout_s)
-        facts.speaks_tls = facts.speaker not in ("zenoh", "gateway") and below.speaks_tls(*where, timeout_s)
+            facts.router_beside = transport.router_beside(where.host, timeout_s)
+        facts.speaks_tls = facts.speaker not in ("zenoh", "gateway") and transport.speaks_tls(*where, timeout_s)
     return facts
 
 
@@ -66,7 +72,7 @@ def sentence(findings: list[Finding]) -> str:
     parts = []
     for finding in findings:
         # to start what does not run needs no telling
-        what = f"{finding.text} ({finding.todo})" if finding.todo and finding.id != "refused" else finding.text
+        what = f"{finding.text} ({finding.remedy})" if finding.remedy and finding.id != "refused" else finding.text
         parts.append(f"{finding.where}: {what}" if several else what)
     return "; ".join(parts)
 

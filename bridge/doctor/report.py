@@ -8,9 +8,9 @@ from typing import Any
 
 import msgspec
 
+from .analyze import Finding, worst
+from .checks import Severity
 from .facts import Facts
-from .findings import Finding, worst
-from .kinds import Severity
 
 
 def exit_code(findings: Sequence[Finding]) -> int:
@@ -29,7 +29,7 @@ def as_json(findings: Sequence[Finding], facts: Facts) -> str:
                 "severity": finding.severity.name.lower(),
                 "where": finding.where,
                 "what": finding.text,
-                "todo": finding.todo,
+                "remedy": finding.remedy,
             }
             for finding in findings
         ],

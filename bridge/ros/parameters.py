@@ -14,7 +14,8 @@ from rclpy.parameter import Parameter
 
 from macs_zenoh.config import Settings, changed
 from macs_zenoh.errors import ConfigError
-from macs_zenoh.protocol.addresses import bare, joined
+from macs_zenoh.protocol import endpoints
+from macs_zenoh.protocol.addresses import bare
 
 ADDRESS, PORT = "127.0.0.1", 7447
 TYPES = {
@@ -36,7 +37,7 @@ def apply(node: Any, settings: Settings) -> Settings:
             raise ConfigError("ROS parameter router_port", f"{port} is no port")
         address = address or ADDRESS
         try:
-            mesh = changed(mesh, connect=[f"tcp/{joined(bare(address), port or PORT)}"])
+            mesh = changed(mesh, connect=[endpoints.written("tcp", bare(address), port or PORT)])
         except ValueError as error:
             raise ConfigError("ROS parameter router_ip_address", str(error)) from None
     return changed(settings, mesh=mesh, robot=robot)

@@ -19,11 +19,12 @@ from typing import NamedTuple
 
 from bridge.security.plan import Client, Gateway, Operator, Plan, Robot, Router, kind_of
 from macs_zenoh.protocol.keyexpr import (
+    ADMIN,
     BLOCK_SIZE,
     BROADCAST,
     CALL,
+    EVERYTHING,
     GROUP,
-    KEYS,
     LAST,
     LEASE,
     NAME,
@@ -37,6 +38,10 @@ from macs_zenoh.protocol.keyexpr import (
     FieldValue,
     Key,
     block_of,
+    distinct,
+    inside,
+    is_recovery,
+    with_recovery,
 )
 from macs_zenoh.protocol.messages import NOBODY, OPERATOR, ROS, UNITY
 
@@ -57,12 +62,6 @@ MESSAGES = (
 )
 """All that Zenoh's access control knows."""
 
-ADMIN = ("@/*/router", "@/*/router/**")
-"""The admin space of routers, read only: versions, sessions, links."""
-
-RECOVERY = "@adv/**"
-"""Behind a key: what the source of reliable messages and their receivers say about messages that were lost."""
-
 Fields = dict[str, FieldValue]
 
 
@@ -82,33 +81,35 @@ def rules(plan: Plan, client: Client) -> list[Rule]:
     heard = _Heard(plan, client)
     seen = list(_tokens_seen(plan, client))
     found = [
-        Rule("is present", ("liveliness_token",), (INGRESS,), _keys(_own_tokens(plan, client))),
-        Rule("speaks", ("put",), (INGRESS,), _keys(said.puts())),
-        Rule("asks", ("query",), (INGRESS,), _keys([*said.queries(), *heard.recoveries_asked()])),
-        Rule("learns who listens to it", ("declare_subscriber",), (EGRESS,), _keys(said.listeners())),
+        Rule("is present", ("liveliness_token",), (INGRESS,), distinct(_own_tokens(plan, client))),
+        Rule("speaks", ("put",), (INGRESS,), distinct(said.puts())),
+        Rule("asks", ("query",), (INGRESS,), distinct([*said.queries(), *heard.recoveries_asked()])),
+        Rule("learns who listens to it", ("declare_subscriber",), (EGRESS,), distinct(said.listeners())),
         Rule(
-            "learns who answers it", ("declare_queryable",), (EGRESS,), _keys([*said.answerers(), *heard.recovered()])
+            "learns who answers it",
+            ("declare_queryable",),
+            (EGRESS,),
+            distinct([*said.answerers(), *heard.recovered()]),
         ),
-        Rule("is answered", ("reply",), (EGRESS,), _keys([*said.replies(), *heard.recovered()])),
-        Rule("subscribes", ("declare_subscriber",), (INGRESS,), _keys(heard.subscriptions())),
-        Rule("hears", ("put",), (EGRESS,), _keys(heard.puts())),
-        Rule("answers", ("declare_queryable", "reply"), (INGRESS,), _keys([*heard.queryables(), *said.kept()])),
-        Rule("is asked", ("query",), (EGRESS,), _keys([*heard.queryables(), *said.kept_asked()])),
+        Rule("is answered", ("reply",), (EGRESS,), distinct([*said.replies(), *heard.recovered()])),
+        Rule("subscribes", ("declare_subscriber",), (INGRESS,), distinct(heard.subscriptions())),
+        Rule("hears", ("put",), (EGRESS,), distinct(heard.puts())),
+        Rule("answers", ("declare_queryable", "reply"), (INGRESS,), distinct([*heard.queryables(), *said.kept()])),
+        Rule("is asked", ("query",), (EGRESS,), distinct([*heard.queryables(), *said.kept_asked()])),
         Rule(
             "watches presence",
             ("declare_liveliness_subscriber", "liveliness_query"),
             (INGRESS,),
-            _keys(_watched(client)),
+            distinct(_watched(client)),
         ),
-        Rule("sees who is there", ("liveliness_token",), (EGRESS,), _keys(seen)),
+        Rule("sees who is there", ("liveliness_token",), (EGRESS,), distinct(seen)),
     ]
     return [_in(plan.namespace, rule) for rule in found if rule.keys]
 
 
 def link_rules(plan: Plan) -> list[Rule]:
     """Everything that one router may send another: what is forbidden to a client is stopped at the client's router."""
-    roots = dict.fromkeys(key.template.partition("/")[0] + "/**" for key in KEYS.values())
-    keys = _keys([*_with_recovery(roots), *ADMIN])
+    keys = distinct([*with_recovery([EVERYTHING]), *ADMIN])
     return [_in(plan.namespace, Rule("carries everything", MESSAGES, (INGRESS, EGRESS), keys))]
 
 
@@ -296,13 +297,13 @@ class _Said:
 
     def kept_asked(self) -> Iterator[str]:
         """Keys of questions for what was missed: who missed it asks everybody who sends such messages."""
-        return (key for key in self._kept(by=None) if key.endswith(RECOVERY))
+        return (key for key in self._kept(by=None) if is_recovery(key))
 
     def _kept(self, by: str | None) -> Iterator[str]:
         if isinstance(self._client, Robot):
-            yield from _with_recovery([STREAM.every(type=ROS, id=self._client.id)])
+            yield from with_recovery([STREAM.every(type=ROS, id=self._client.id)])
         if self._friends:
-            yield from _with_recovery([NAMED_ALL.every(from_name=by) if by is not None else NAMED_ALL.every()])
+            yield from with_recovery([NAMED_ALL.every(from_name=by) if by is not None else NAMED_ALL.every()])
 
     def answerers(self) -> Iterator[str]:
         yield from _every(CALL, self._callees())
@@ -350,12 +351,12 @@ class _Heard:
         if self._group is not None:
             yield GROUP.every(**self._group)
         yield BROADCAST.every()  # what agents subscribe to; of what goes there, they get what is allowed below
-        yield from _with_recovery(_every(STREAM, self._streams))
+        yield from with_recovery(_every(STREAM, self._streams))
         if isinstance(self._client, Operator):
             yield PING.every()
         if self._name is not None:
             yield NAMED.every(name=self._name)
-            yield from _with_recovery([NAMED_ALL.every()])
+            yield from with_recovery([NAMED_ALL.every()])
 
     def puts(self) -> Iterator[str]:
         yield from _every(UNICAST, inboxes(self._client))
@@ -375,13 +376,13 @@ class _Heard:
 
     def recovered(self) -> Iterator[str]:
         """What it hears and, where the source keeps it, may ask for again."""
-        yield from _with_recovery(_every(STREAM, self._streams))
-        yield from _with_recovery(NAMED_ALL.every(from_name=name) for name in self._friends)
+        yield from with_recovery(_every(STREAM, self._streams))
+        yield from with_recovery(NAMED_ALL.every(from_name=name) for name in self._friends)
 
     def recoveries_asked(self) -> Iterator[str]:
         """Keys of its questions for what it missed."""
         found = [*_every(STREAM, self._streams), *([NAMED_ALL.every()] if self._friends else [])]
-        return (key for key in _with_recovery(found) if key.endswith(RECOVERY))
+        return (key for key in with_recovery(found) if is_recovery(key))
 
     def queryables(self) -> Iterator[str]:
         if not isinstance(self._client, Gateway):
@@ -440,22 +441,6 @@ def _every(key: Key, targets: Iterable[Fields], sender: Fields | None = None) ->
     return (key.every(**target, **(sender or {})) for target in targets)
 
 
-def _with_recovery(keys: Iterable[str]) -> Iterator[str]:
-    for key in keys:
-        yield key
-        yield f"{key}/{RECOVERY}"
-
-
-def _keys(keys: Iterable[str]) -> tuple[str, ...]:
-    """The keys, each once, without those that another one covers."""
-    once = dict.fromkeys(keys)
-    trees = {key.removesuffix("**") for key in once if key.endswith("/**")}
-    covered = {key for key in once for tree in trees if key.startswith(tree) and key != f"{tree}**" and "@" not in key}
-    return tuple(key for key in once if key not in covered)
-
-
 def _in(namespace: str | None, rule: Rule) -> Rule:
-    """A rule as the router sees its keys: the namespace is before each. Not before those of the routers themselves."""
-    if namespace is None:
-        return rule
-    return rule._replace(keys=tuple(key if key.startswith("@") else f"{namespace}/{key}" for key in rule.keys))
+    """A rule as the router sees its keys: the namespace is before each."""
+    return rule._replace(keys=tuple(inside(namespace, key) for key in rule.keys))

@@ -32,7 +32,7 @@ from bridge.security.plan import Client, Gateway, Operator, Plan, Robot
 from macs_zenoh.config import MeshSettings, changed
 from macs_zenoh.errors import ConfigError, Refused, Unreachable
 from macs_zenoh.mesh import Mesh, Sample, Subscription
-from macs_zenoh.protocol.addresses import of_endpoint
+from macs_zenoh.protocol import endpoints, keyexpr
 from macs_zenoh.protocol.keyexpr import (
     BROADCAST,
     CALL,
@@ -121,7 +121,7 @@ class Question(NamedTuple):
 async def check(
     plan: Plan,
     directory: Path,
-    endpoints: Sequence[str] | None = None,
+    routers: Sequence[str] | None = None,
     *,
     timeout_s: float = 5.0,
     progress: Progress = lambda done, of: None,
@@ -130,7 +130,7 @@ async def check(
 
     Args:
         directory: what `generate` wrote, with everybody's key.
-        endpoints: routers to try, one by one; None: those of the plan, and their links.
+        routers: endpoints to try, one by one; None: those of the plan, and their links.
 
     Raises Unreachable: a router does not answer. ConfigError: a certificate is not there.
     """
@@ -138,8 +138,8 @@ async def check(
         for name in (certificates.CERTIFICATE, certificates.KEY, certificates.AUTHORITY):
             if not (directory / client.name / name).exists():
                 raise ConfigError(str(directory / client.name / name), "is not there; run `macs security generate`")
-    ways = [(endpoint, endpoint, endpoint) for endpoint in endpoints or ()]
-    if not endpoints:
+    ways = [(endpoint, endpoint, endpoint) for endpoint in routers or ()]
+    if not routers:
         ways = [(router.name, router.dialled[0], router.dialled[0]) for router in plan.routers]
         ways += [
             (f"{one.name} to {other.name}", one.dialled[0], other.dialled[0])
@@ -171,8 +171,8 @@ async def _reach(label: str, endpoint: str, timeout_s: float) -> None:
 
     Raises Unreachable.
     """
-    place = of_endpoint(endpoint)
-    if place is None or endpoint.partition("/")[0] not in ("tcp", "tls"):
+    place = endpoints.address_of(endpoint)
+    if place is None or endpoints.protocol_of(endpoint) not in ("tcp", "tls"):
         return
 
     async def connect() -> None:
@@ -278,7 +278,7 @@ class _Way:
 
     def _listened(self) -> list[str]:
         """What everybody tries to hear: each inbox, group, stream and name, and everything at once."""
-        keys = {BROADCAST.every(), NAMED_ALL.every(), PING.of(zid=MARK), "macs/**"}
+        keys = {BROADCAST.every(), NAMED_ALL.every(), PING.of(zid=MARK), keyexpr.EVERYTHING}
         for client in self._plan.clients:
             keys.add(UNICAST.every(**inbox_of(client)))
             if isinstance(client, Robot):
@@ -472,7 +472,7 @@ class _Way:
                 yield Question(client.name, f"{client.name} pings {other.name}", key, isinstance(client, Operator))
             # the admin space is outside every namespace, and so out of reach of who is inside one
             admitted = isinstance(client, Operator) and self._plan.namespace is None
-            yield Question(client.name, f"{client.name} asks who the routers are", access.ADMIN[0], admitted)
+            yield Question(client.name, f"{client.name} asks who the routers are", keyexpr.ROUTERS, admitted)
 
     def _calls(self, client: Client, name: Client) -> Iterator[Question]:
         really = self._expected.speaks_as(client, name)
@@ -560,7 +560,7 @@ async def _refusals(plan: Plan, directory: Path, label: str, endpoint: str, time
         attempts = {
             f"{name} with a certificate of another authority is let in": settings_of(plan, foreign, endpoint),
             "somebody without a certificate is let in": changed(plan.mesh, connect=[endpoint], overrides=[root]),
-            "somebody without TLS is let in": changed(plan.mesh, connect=[f"tcp/{endpoint.partition('/')[2]}"]),
+            "somebody without TLS is let in": changed(plan.mesh, connect=[endpoints.by_protocol("tcp", endpoint)]),
         }
         seen = await asyncio.gather(*(_let_in(settings, timeout_s) for settings in attempts.values()))
     return [Result(label, what, False, inside) for what, inside in zip(attempts, seen, strict=True)]

@@ -12,8 +12,10 @@ from bridge.security import access
 from bridge.security.access import Rule
 from bridge.security.plan import Client, Gateway, Operator, Plan, Robot, Router
 from macs_zenoh.config import MeshSettings, TrafficRule, changed
+from macs_zenoh.protocol import keyexpr
+from macs_zenoh.protocol.endpoints import protocol_of
 from macs_zenoh.protocol.keyexpr import STREAM, type_name
-from macs_zenoh.protocol.messages import UNITY
+from macs_zenoh.protocol.messages import ROS, UNITY
 
 WIDTH = 119
 
@@ -98,9 +100,7 @@ def router_json5(plan: Plan, router: Router, directory: str) -> str:
     }
     for name, value in tls.items():
         _put(tree, f"transport/link/tls/{name}", value)
-    protocols = sorted(
-        {endpoint.partition("/")[0] for one in plan.routers for endpoint in (*one.listen, *one.dialled)}
-    )
+    protocols = sorted({protocol_of(endpoint) for one in plan.routers for endpoint in (*one.listen, *one.dialled)})
     _put(tree, "transport/link/protocols", protocols)
     tree["adminspace"] = {"enabled": True, "permissions": {"read": True, "write": False}}
     tree["metadata"] = {"name": router.name}
@@ -264,12 +264,7 @@ def _downsampling(plan: Plan) -> Iterator[str]:
 
 def _exact(plan: Plan, rule: TrafficRule) -> list[str]:
     """The keys of a rule, where they are those of one topic: of one robot, or of each of the plan's."""
-    if "*" not in rule.match:
-        return [rule.match]
-    begin, any_robot, topic = rule.match.partition("/ros/*/")
-    if not any_robot or "*" in begin + topic:
-        return []
-    return [f"{begin}/ros/{robot.id}/{topic}" for robot in plan.robots]
+    return keyexpr.of_each(rule.match, ROS, [robot.id for robot in plan.robots])
 
 
 def _low_pass(plan: Plan) -> Iterator[str]:
@@ -290,7 +285,7 @@ def _low_pass(plan: Plan) -> Iterator[str]:
         yield "  ],"
 
 
-STREAMS = STREAM.template.split("/")[:2]
+STREAMS = keyexpr.begins(STREAM.template)
 """How the keys of robots' topics begin, and no others."""
 
 
@@ -299,10 +294,10 @@ def _priorities(plan: Plan) -> Iterator[str]:
     entries: list[str] = []
     given = [(number, rule) for number, rule in enumerate(plan.traffic) if rule.priority is not None]
     for number, rule in given:
-        begin = rule.match.split("/")[:2]
+        begin = keyexpr.begins(rule.match)
         if begin == STREAMS:
             yield f"  // priority of {rule.match} is left to the programs: a robot may have another for the topic"
-        elif len(begin) == 2 and "*" not in "".join(begin):
+        elif begin is not None:
             entries.append(
                 f'    {{ id: "priority {number}", messages: ["put", "query"], flows: ["ingress"],'
                 f" key_exprs: {json.dumps([_inside(plan, rule.match)])},"
@@ -319,7 +314,7 @@ def _priorities(plan: Plan) -> Iterator[str]:
 
 
 def _inside(plan: Plan, key: str) -> str:
-    return f"{plan.namespace}/{key}" if plan.namespace is not None else key
+    return keyexpr.inside(plan.namespace, key)
 
 
 # -- a client ----------------------------------------------------------------------------------------------------

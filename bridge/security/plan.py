@@ -31,7 +31,7 @@ from msgspec import Meta
 
 from macs_zenoh.config import AgentId, AgentName, GatewaySettings, GroupId, MeshSettings, TrafficRule
 from macs_zenoh.errors import ConfigError, MissingExtra
-from macs_zenoh.protocol.addresses import joined
+from macs_zenoh.protocol import endpoints
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=63)]
 """Also the name in the certificate and of a directory, so: letters, digits, dot, dash and underscore."""
@@ -74,8 +74,9 @@ class Router(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """Its endpoints for others."""
         if self.endpoints:
             return self.endpoints
-        protocol, _, address = re.split("[?#]", self.listen[0])[0].partition("/")
-        return [f"{protocol}/{joined(self.addresses[0], address.rpartition(':')[2])}"]
+        listening = endpoints.address_of(self.listen[0])
+        protocol, port = endpoints.protocol_of(self.listen[0]), listening.port if listening else PORT
+        return [endpoints.written(protocol, self.addresses[0], port)]
 
 
 class _Client(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -339,7 +340,8 @@ def _check_router(router: Router, plan: Plan) -> None:
     where = f"routers: {router.name}"
     for field in ("listen", "endpoints"):
         for endpoint in getattr(router, field):
-            if not re.fullmatch(r"(tls|quic)/\S+:\d+([?#]\S*)?", endpoint):
+            wrong = endpoints.problem(endpoint, lowest_port=0 if field == "listen" else 1)
+            if wrong or endpoints.protocol_of(endpoint) not in ("tls", "quic"):
                 raise ConfigError(f"{where}.{field}", f"{endpoint!r} is no TLS endpoint, as in tls/10.0.0.5:7447")
     for address in router.addresses:
         if "/" in address or not (_is_ip(address) or re.fullmatch(r"[A-Za-z0-9.-]+", address)):

@@ -84,8 +84,5 @@ class Subscription:
         self._declared, other._declared = other._declared, ()
 
 
-SOURCES = "@adv/pub/**"
-"""Behind a key: its reliable sources, as Zenoh's advanced publishers name them (``@adv/pub/{zid}/{entity}/_``)."""
-
 Token = Subscription
 """A liveliness token: it lives until `close`, or until its process is gone."""

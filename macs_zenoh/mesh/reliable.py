@@ -11,10 +11,11 @@ from functools import partial
 
 import zenoh
 
+from macs_zenoh.protocol import keyexpr
 from macs_zenoh.protocol.recovery import Ask, Recovery
 
 from .arrivals import Arrivals
-from .declared import SOURCES, AtOnce, Numbered, OnBatch, OnMiss, OnNumbered, Sample, Subscription
+from .declared import AtOnce, Numbered, OnBatch, OnMiss, OnNumbered, Sample, Subscription
 
 log = logging.getLogger("macs.mesh")
 
@@ -64,7 +65,7 @@ class Recovered:
         declared = Subscription(
             self,
             session.declare_subscriber(self._key, samples),
-            session.declare_subscriber(f"{self._key}/{SOURCES}", heartbeats),
+            session.declare_subscriber(keyexpr.sources(self._key), heartbeats),
         )
         self._look_for_sources()
         return declared
@@ -101,7 +102,7 @@ class Recovered:
             elif linked and self._linked:  # else once there is a router
                 self._recovery.settled = True
 
-        self._get(f"{self._key}/{SOURCES}?_max=1", known, ended, dropped)
+        self._get(f"{keyexpr.sources(self._key)}?_max=1", known, ended, dropped)
 
     def _numbered(self, batch: Iterator[Numbered]) -> None:
         now = time.monotonic()
@@ -114,7 +115,7 @@ class Recovered:
         now = time.monotonic()
         freed: list[Sample] = []
         for key, payload in batch:
-            data_key, _, source = key.removesuffix("/_").rpartition(f"/{SOURCES.removesuffix('**')}")
+            data_key, source = keyexpr.source_of(key)
             if data_key and len(payload) == 4:
                 freed += self._recovery.heartbeat(source, data_key, int.from_bytes(payload, "little"), now)
         self._go_on(freed)
@@ -154,8 +155,7 @@ class Recovered:
                 self._recovery.reply_dropped(ask)
             self._go_on(self._recovery.ended(ask, time.monotonic()))
 
-        source = f"{SOURCES.removesuffix('**')}{ask.source}/**"
-        self._get(f"{ask.key}/{source}?_sn={ask.numbers}", replied, ended, dropped)
+        self._get(f"{keyexpr.sources(ask.key, ask.source)}?_sn={ask.numbers}", replied, ended, dropped)
 
     def _get(self, selector: str, on_replies: OnNumbered, on_end: OnBatch, dropped: list[bool]) -> None:
         """``dropped`` gets an entry for each reply that there was no room for, before those that came after it."""

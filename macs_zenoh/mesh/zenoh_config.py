@@ -12,6 +12,7 @@ import zenoh
 
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError
+from macs_zenoh.protocol import endpoints
 
 
 def configuration(settings: MeshSettings) -> dict[str, Any]:
@@ -48,7 +49,6 @@ def zenoh_config(settings: MeshSettings) -> zenoh.Config:
 
 
 _CERTIFICATE, _KEY = b"CERTIFICATE-----", b"PRIVATE KEY-----"
-TLS_PROTOCOLS = ("tls", "quic", "quic_datagram")
 TLS_FILES = {
     "root_ca_certificate": _CERTIFICATE,
     "connect_certificate": _CERTIFICATE,
@@ -66,28 +66,18 @@ def check_files(config: zenoh.Config) -> None:
     Raises ConfigError.
     """
     whole = msgspec.json.decode(str(config))
-    common = (((whole.get("transport") or {}).get("link") or {}).get("tls")) or {}
+    common = endpoints.value_at(whole, "transport/link/tls") or {}
     for role in ("connect", "listen"):
-        for endpoint in _endpoints(whole, role):
-            if endpoint.partition("/")[0] not in TLS_PROTOCOLS:
+        for endpoint in endpoints.configured(whole, role):
+            if endpoints.protocol_of(endpoint) not in endpoints.TLS_PROTOCOLS:
                 continue
-            own = dict(part.partition("=")[::2] for part in endpoint.partition("#")[2].split(";") if part)
-            used = {**common, **own}
+            own, used = endpoints.own_settings(endpoint), endpoints.tls_settings(endpoint, common)
             mutual = used.get("enable_mtls") in (True, "true")
             for name, begins in TLS_FILES.items():
                 needed = name.startswith(role) and (mutual or role == "listen")
                 if (needed or name == "root_ca_certificate") and used.get(name):
                     where = endpoint if name in own else f"transport/link/tls/{name}"
                     _check_pem(f"zenoh configuration {where}", str(used[name]), begins)
-
-
-def _endpoints(whole: dict[str, Any], role: str) -> Iterable[str]:
-    """Zenoh allows one list, or one per mode; and a list in a list."""
-    found = (whole.get(role) or {}).get("endpoints") or []
-    if isinstance(found, dict):
-        found = found.get(whole.get("mode") or "client") or []
-    for endpoint in found:
-        yield from endpoint if isinstance(endpoint, list) else [endpoint]
 
 
 def _check_pem(setting: str, path: str, begins: bytes) -> None:

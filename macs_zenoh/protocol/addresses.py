@@ -63,15 +63,6 @@ def parse(text: str, default_port: int) -> Address:
     return Address(bare(host), int(port))
 
 
-def of_endpoint(endpoint: str) -> Address | None:
-    """Where an endpoint like ``tls/[::1]:7447#iface=eth0`` is; None for those without host and port."""
-    address = re.split("[?#]", endpoint.partition("/")[2])[0]
-    host, _, port = address.rpartition(":")
-    if not host or not port.isascii() or not port.isdigit():
-        return None
-    return Address(host.removeprefix("[").removesuffix("]"), int(port))
-
-
 def of_peer(host: str) -> str:
     """The address of somebody who has connected: one of IPv4 as such, also on a socket of both families."""
     mapped = host.lower().removeprefix("::ffff:")

@@ -18,6 +18,7 @@ from typing import NamedTuple, Protocol
 
 from ..errors import WireError
 from .credit import Credit
+from .keyexpr import GROUP, UNICAST, sender_of
 from .messages import ROS, NodeType
 from .reading import Message, Reader
 from .wire import Layout
@@ -346,19 +347,12 @@ class Guard:
         self._bad = True  # the loop finds it too, and counts it
 
 
-INBOX_KEYS = "macs/to/"
-GROUP_KEYS = "macs/group/"
+INBOX_KEYS, GROUP_KEYS = UNICAST.prefix, GROUP.prefix
 
 
 def presses(data: bytes) -> bool:
     """Whether data for the emergency stop stops: not more than is needed to know, the stop itself looks closer."""
     return len(data) > 4 and data[4] != 0
-
-
-def sender_of(key: str) -> str:
-    """Type and id at the end of a key."""
-    at = key.rfind("/", 0, max(0, key.rfind("/")))
-    return key[at + 1 :]
 
 
 def _is_command(message: Message) -> bool:

@@ -7,6 +7,7 @@ together. Agent types are names in keys (``ros``, ``unity``, otherwise the numbe
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from urllib.parse import quote, unquote
@@ -73,6 +74,11 @@ class Key:
         pattern = re.sub(r"\{(\w+)\}", r"(?P<\1>[^/*$?#]+)", self.template)
         object.__setattr__(self, "_pattern", re.compile(pattern))
 
+    @property
+    def prefix(self) -> str:
+        """How each of its keys begins: ``macs/to/``."""
+        return self.template.partition("{")[0]
+
     def of(self, **values: FieldValue) -> str:
         """The concrete key for these fields. Raises UsageError when one is missing, unknown or cannot be written."""
         missing = set(self.fields) - values.keys()
@@ -115,6 +121,103 @@ class Key:
         if len(key) > KEY_BYTES:
             raise UsageError(f"a key {self.template} of {len(key)} bytes, at most {KEY_BYTES} are allowed")
         return key
+
+
+# -- keys beside the table: of Zenoh itself, of namespaces, of programs that look ------------------------------------
+
+EVERYTHING = "macs/**"
+"""Every key of the mesh."""
+ROUTERS = "@/*/router"
+"""The admin space of each router that shows it: version, sessions, addresses."""
+ADMIN = (ROUTERS, ROUTERS + "/**")
+"""The admin space of routers, read only: versions, sessions, links."""
+_RECOVERY, _SOURCES = "@adv/**", "@adv/pub/"
+
+
+def router(zid: str) -> str:
+    """The admin space of one router."""
+    return f"@/{zid}/router"
+
+
+def router_links(zid: str) -> str:
+    """Where a router tells which routers it is linked with."""
+    return router(zid) + "/linkstate/north"
+
+
+def with_recovery(keys: Iterable[str]) -> Iterator[str]:
+    """Each key, and what the source of reliable messages and their receivers say behind it about lost ones."""
+    for key in keys:
+        yield key
+        yield f"{key}/{_RECOVERY}"
+
+
+def is_recovery(key: str) -> bool:
+    """Whether a key is one of those about lost messages."""
+    return key.endswith(_RECOVERY)
+
+
+def sources(key: str, source: str = "") -> str:
+    """Behind a key: its reliable sources, or one, as Zenoh's advanced publishers name them
+    (``@adv/pub/{zid}/{entity}/_``)."""
+    return f"{key}/{_SOURCES}{source}/**" if source else f"{key}/{_SOURCES}**"
+
+
+def source_of(key: str) -> tuple[str, str]:
+    """The data's key and the source that a heartbeat's key names; both are empty for other keys."""
+    data_key, _, source = key.removesuffix("/_").rpartition(f"/{_SOURCES}")
+    return (data_key, source) if data_key else ("", "")
+
+
+def inside(namespace: str | None, key: str) -> str:
+    """A key as others see it who are in no namespace. The admin space of routers is in none."""
+    return key if namespace is None or key.startswith("@") else f"{namespace}/{key}"
+
+
+def everywhere(space: Key) -> str:
+    """All keys of a space in every namespace, and without one."""
+    return "**/" + space.every()
+
+
+def namespace_of(space: Key, key: str) -> str | None:
+    """The namespace before a key of a space, empty for none; None for a key of no such space."""
+    namespace, found, _ = key.rpartition(space.prefix)
+    return namespace.rstrip("/") if found else None
+
+
+def marked(key: str, mark: str) -> str:
+    """The same key with a mark before its last chunk, so that programs do not take it for one of their own."""
+    begin, _, last = key.rpartition("/")
+    return f"{begin}/{mark}{last}"
+
+
+def sender_of(key: str) -> str:
+    """Type and id at the end of a key."""
+    at = key.rfind("/", 0, max(0, key.rfind("/")))
+    return key[at + 1 :]
+
+
+def distinct(keys: Iterable[str]) -> tuple[str, ...]:
+    """The expressions, each once, without those that another one covers."""
+    once = dict.fromkeys(keys)
+    trees = {key.removesuffix("**") for key in once if key.endswith("/**")}
+    covered = {key for key in once for tree in trees if key.startswith(tree) and key != f"{tree}**" and "@" not in key}
+    return tuple(key for key in once if key not in covered)
+
+
+def begins(expression: str) -> str | None:
+    """The first two chunks of an expression, as ``macs/from``; None where there are not two without wildcards."""
+    chunks = expression.split("/")[:2]
+    return "/".join(chunks) if len(chunks) == 2 and "*" not in "".join(chunks) else None
+
+
+def of_each(expression: str, agent_type: int, ids: Iterable[int]) -> list[str]:
+    """An expression whose only wildcard is an id behind a type, once for each id; itself without any; else nothing."""
+    if "*" not in expression:
+        return [expression]
+    begin, found, end = expression.partition(f"/{type_name(agent_type)}/*/")
+    if not found or "*" in begin + end:
+        return []
+    return [f"{begin}/{type_name(agent_type)}/{number}/{end}" for number in ids]
 
 
 def expression_problem(text: str) -> str | None:

@@ -84,15 +84,15 @@ async def test_a_healthy_mesh_has_nothing_wrong() -> None:
     facts = report.document["facts"]
     [endpoint] = facts["endpoints"]
     assert endpoint["router"]
-    assert [echo["size_bytes"] for echo in endpoint["way"]["echoes"]][:2] == [4 << 10, 64 << 10]
-    assert abs(endpoint["way"]["clock"]["offset_s"]) < 1
+    assert [echo["size_bytes"] for echo in endpoint["path"]["echoes"]][:2] == [4 << 10, 64 << 10]
+    assert abs(endpoint["path"]["clock"]["offset_s"]) < 1
     assert endpoint["rights"] == dict.fromkeys(("seen", "sees", "watches", "leases", "hears", "pings"), True)
     programs = {tuple(program["agents"]): program for program in facts["programs"]}
     assert programs[("ros/7",)]["called"]
     assert programs[()]["blocks"] == [1]
     for program in programs.values():
         assert program["pong"]["zenoh"]
-        assert len(program["way"]["round_trips_ms"]) == 5
+        assert len(program["path"]["round_trips_ms"]) == 5
     assert facts["probe_bytes"] > 0
 
 
@@ -102,8 +102,8 @@ async def test_quick_sends_nothing_large() -> None:
         report = await doctor("-e", router.endpoint, "--quick")
     assert report.code == 0
     assert report.document["facts"]["probe_bytes"] == 0
-    assert report.document["facts"]["endpoints"][0]["way"]["round_trips_ms"]
-    assert not report.document["facts"]["endpoints"][0]["way"]["echoes"]
+    assert report.document["facts"]["endpoints"][0]["path"]["round_trips_ms"]
+    assert not report.document["facts"]["endpoints"][0]["path"]["echoes"]
 
 
 async def test_an_examination_leaves_no_trace() -> None:
@@ -298,7 +298,7 @@ async def test_what_access_rules_allow_and_forbid(guarded: Router) -> None:
 
         thief = await doctor("-e", endpoint, "--as", "ros/8", "--quick", cfg=credentials("robot-7"))
         assert thief.wrong == {"presence_denied": "error", "inbox_denied": "error"}
-        assert "macs/live/ros/8/**" in thief.find("presence_denied")["todo"]
+        assert "macs/live/ros/8/**" in thief.find("presence_denied")["remedy"]
         assert thief.code == 1
 
         observer = await doctor("-e", endpoint, "--as", "observer", "--quick", cfg=credentials("observer"))

@@ -6,8 +6,8 @@ import itertools
 
 import pytest
 
-from macs_zenoh.protocol.guard import Ages, Allowances, Fresh, Guard, Limits, sender_of
-from macs_zenoh.protocol.keyexpr import GROUP
+from macs_zenoh.protocol.guard import Ages, Allowances, Fresh, Guard, Limits
+from macs_zenoh.protocol.keyexpr import GROUP, sender_of
 from macs_zenoh.protocol.messages import Metadata, NodeType
 from macs_zenoh.protocol.reading import Message, Reader
 from macs_zenoh.protocol.routing import unicast_key

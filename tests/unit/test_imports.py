@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -140,6 +141,27 @@ def test_the_protocol_stands_alone(path: Path) -> None:
     ours = {name for name, _ in imported(path) if name.startswith("macs_zenoh.")}
     allowed = tuple(f"macs_zenoh.{name}" for name in ("protocol", "errors", "plain", "config", "versions"))
     assert not {name for name in ours if not name.startswith(allowed)}
+
+
+KEY = re.compile(r"/?(macs/|@/|@adv\b)|\*\*/$")
+ENDPOINT = re.compile(r"(tcp|tls|quic|ws)/$")
+
+
+@pytest.mark.parametrize("path", [*CORE, *BRIDGE], ids=lambda path: str(path.relative_to(ROOT)))
+def test_one_module_spells_keys_and_one_endpoints(path: Path) -> None:
+    """No other text in the code begins as a key of the mesh or of Zenoh, or puts an endpoint together."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    documents = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    texts = [
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documents
+    ]
+    if path.name != "keyexpr.py":
+        assert [text for text in texts if KEY.match(text) and " " not in text] == []
+    if path.name != "endpoints.py":
+        made = [part for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values[:1]]
+        assert [p.value for p in made if isinstance(p, ast.Constant) and ENDPOINT.fullmatch(str(p.value))] == []
 
 
 def test_the_public_names_are_there() -> None:

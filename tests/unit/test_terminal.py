@@ -9,7 +9,7 @@ import pytest
 
 from bridge.cli import terminal
 from bridge.cli.terminal import BAD, Block, Columns
-from tests.unit.test_doctor_findings import Terminal
+from tests.unit.test_doctor_analyze import Terminal
 
 NAME = "[bold]x[/bold] :smile: \x1b[31mred\x1b[0m [link=http://x]y[/link]"
 LONG = "word " * 60 + "a" * 300

@@ -14,13 +14,14 @@ import pytest
 
 from bridge.cli import terminal
 from bridge.cli.doctor import shown
-from bridge.doctor import below, report
+from bridge.doctor import report, transport
+from bridge.doctor.analyze import analyze, found, worst
+from bridge.doctor.checks import CHECKS, ERROR, GROUPS, NOTE, OK, WARNING, Severity
 from bridge.doctor.facts import Certificate, Clock, Echo, Endpoint, Facts, Rights, RouterInfo, Session, Tls
-from bridge.doctor.findings import found, judge, worst
-from bridge.doctor.kinds import ERROR, GROUPS, KINDS, NOTE, OK, WARNING, Severity
 from bridge.principal import Principal
 from macs_zenoh.config import GatewaySettings, OperatorSettings, RobotSettings, Settings
 from macs_zenoh.errors import UsageError
+from macs_zenoh.protocol import endpoints
 from macs_zenoh.protocol.keyexpr import LEASE, NAME, PRESENCE
 from macs_zenoh.protocol.ping import Pong
 
@@ -35,12 +36,12 @@ def healthy() -> Facts:
 
 def wrong(facts: Facts) -> dict[str, Severity]:
     """Everything above ok, by id."""
-    return {finding.id: finding.severity for finding in judge(facts) if finding.severity > OK}
+    return {finding.id: finding.severity for finding in analyze(facts) if finding.severity > OK}
 
 
 def test_a_healthy_mesh_has_nothing_wrong() -> None:
     """The recorded facts make findings that are all ok, in the order of the groups."""
-    findings = judge(healthy())
+    findings = analyze(healthy())
     assert {finding.severity for finding in findings} == {OK}
     assert [finding.group for finding in findings] == sorted((finding.group for finding in findings), key=GROUPS.index)
     assert {finding.group for finding in findings} == set(GROUPS) - {"tls"}
@@ -152,17 +153,17 @@ def _(facts: Facts) -> None:
 
 @makes("slow", NOTE)
 def _(facts: Facts) -> None:
-    facts.endpoints[0].way.round_trips_ms = [210.0, 205.0, 300.0]
+    facts.endpoints[0].path.round_trips_ms = [210.0, 205.0, 300.0]
 
 
 @makes("large_dropped", NOTE)
 def _(facts: Facts) -> None:  # 4 x 252 KiB in 0.4 s
-    facts.endpoints[0].way.echoes = [Echo(size_bytes=4096, took_s=0.1), Echo(size_bytes=262144, took_s=0.5)]
+    facts.endpoints[0].path.echoes = [Echo(size_bytes=4096, took_s=0.1), Echo(size_bytes=262144, took_s=0.5)]
 
 
 @makes("large_lost", WARNING)
 def _(facts: Facts) -> None:
-    facts.programs[0].way.lost_bytes = 65536
+    facts.programs[0].path.lost_bytes = 65536
 
 
 @makes("peer", NOTE)
@@ -185,7 +186,7 @@ def _(facts: Facts) -> None:
         router.sessions[2].shared_memory = True
 
 
-@pytest.mark.parametrize("problem", [name.removeprefix("tls_") for name in KINDS if name.startswith("tls_")])
+@pytest.mark.parametrize("problem", [name.removeprefix("tls_") for name in CHECKS if name.startswith("tls_")])
 def test_each_tls_problem_is_a_finding(problem: str) -> None:
     """Every way in which a handshake fails has words of its own; when Zenoh is content, none is said."""
     facts = healthy()
@@ -300,12 +301,12 @@ def _(facts: Facts) -> None:
 
 @makes("clock_off", WARNING)
 def _(facts: Facts) -> None:
-    facts.programs[0].way.clock = Clock(offset_s=-2.5, within_s=0.01)
+    facts.programs[0].path.clock = Clock(offset_s=-2.5, within_s=0.01)
 
 
 @makes("clock_off", WARNING)
 def _(facts: Facts) -> None:
-    facts.endpoints[0].way.clock = Clock(offset_s=0.2, within_s=0.01)
+    facts.endpoints[0].path.clock = Clock(offset_s=0.2, within_s=0.01)
 
 
 def _said(facts: Facts, **changes: object) -> None:
@@ -424,20 +425,20 @@ def test_routers_without_an_admin_space_are_judged_by_what_passes() -> None:
 def test_an_uncertain_clock_is_not_accused() -> None:
     """An offset that the way there may explain is no finding."""
     facts = healthy()
-    facts.programs[0].way.clock = Clock(offset_s=0.4, within_s=0.35)
+    facts.programs[0].path.clock = Clock(offset_s=0.4, within_s=0.35)
     assert not wrong(facts)
 
 
 def test_every_kind_of_finding_is_tried() -> None:
     """Each finding of the table is made by some change above, and has all that its words need."""
-    made = {name for name, _, _ in CHANGES} | {"no_endpoint"} | {name for name in KINDS if name.startswith("tls_")}
-    made |= {finding.id for finding in judge(healthy())}
-    assert made == set(KINDS)
-    for name, kind in KINDS.items():
-        fields = [field for _, field, _, _ in string.Formatter().parse(kind.text + kind.todo) if field]
+    made = {name for name, _, _ in CHANGES} | {"no_endpoint"} | {name for name in CHECKS if name.startswith("tls_")}
+    made |= {finding.id for finding in analyze(healthy())}
+    assert made == set(CHECKS)
+    for name, kind in CHECKS.items():
+        fields = [field for _, field, _, _ in string.Formatter().parse(kind.text + kind.remedy) if field]
         finding = found(name, **dict.fromkeys(fields, "something"))
         assert kind.group in GROUPS
-        assert finding.todo or kind.severity == OK or name in ("nobody", "programs_left_out")
+        assert finding.remedy or kind.severity == OK or name in ("nobody", "programs_left_out")
 
 
 def test_the_page_explains_every_finding() -> None:
@@ -445,7 +446,7 @@ def test_the_page_explains_every_finding() -> None:
     page = (ROOT / "docs" / "doctor.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)` \| (\w+) \|", page, re.MULTILINE)
     assert len(rows) == len(dict(rows))
-    assert dict(rows) == {name: kind.severity.name.lower() for name, kind in KINDS.items()}
+    assert dict(rows) == {name: kind.severity.name.lower() for name, kind in CHECKS.items()}
 
 
 class Terminal(io.StringIO):
@@ -470,7 +471,7 @@ def test_the_json_has_findings_and_facts() -> None:
     """The JSON report has the worst severity, each finding in full, and facts from which the same follows."""
     facts = healthy()
     _down(facts, reach="refused")
-    document = json.loads(report.as_json(judge(facts), facts))
+    document = json.loads(report.as_json(analyze(facts), facts))
     assert document["severity"] == "warning"
     [refused] = [finding for finding in document["findings"] if finding["severity"] == "warning"]
     assert refused == {
@@ -478,10 +479,10 @@ def test_the_json_has_findings_and_facts() -> None:
         "group": "routers",
         "severity": "warning",
         "where": facts.endpoints[1].endpoint,
-        "what": KINDS["refused"].text,
-        "todo": KINDS["refused"].todo,
+        "what": CHECKS["refused"].text,
+        "remedy": CHECKS["refused"].remedy,
     }
-    assert judge(msgspec.convert(document["facts"], Facts)) == judge(facts)
+    assert analyze(msgspec.convert(document["facts"], Facts)) == analyze(facts)
 
 
 def test_the_text_is_grouped_and_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -492,7 +493,7 @@ def test_the_text_is_grouped_and_says_what_to_do(monkeypatch: pytest.MonkeyPatch
         monkeypatch.delenv(name, raising=False)
     facts = healthy()
     _down(facts, reach="refused")
-    blocks = list(shown(judge(facts), facts))
+    blocks = list(shown(analyze(facts), facts))
     text = terminal.drawn(blocks, io.StringIO())
     assert text.splitlines()[0] == "Routers"
     assert f"  warning  {facts.endpoints[1].endpoint}: nobody listens there" in text.splitlines()
@@ -528,16 +529,16 @@ def test_the_worst_finding_counts() -> None:
 )
 def test_an_endpoint_says_where_it_is(endpoint: str, where: tuple[str, int] | None) -> None:
     """Host and port come out of endpoints that have them."""
-    assert below.host_and_port(endpoint) == where
+    assert endpoints.address_of(endpoint) == where
 
 
 def test_an_endpoint_may_bring_its_own_tls_settings() -> None:
     """What an endpoint says after # comes before the configuration; null there is nothing."""
     zenoh = {"root_ca_certificate": "a.pem", "connect_certificate": None}
-    settings = below.tls_settings("tls/h:1#root_ca_certificate=b.pem;enable_mtls=true", zenoh)
+    settings = endpoints.tls_settings("tls/h:1#root_ca_certificate=b.pem;enable_mtls=true", zenoh)
     assert settings == {"root_ca_certificate": "b.pem", "enable_mtls": "true"}
-    assert not below.presents_certificate(settings)
-    assert below.presents_certificate({**settings, "connect_certificate": "c.pem"})
+    assert not transport.presents_certificate(settings)
+    assert transport.presents_certificate({**settings, "connect_certificate": "c.pem"})
 
 
 def test_whose_rights_are_tried() -> None:

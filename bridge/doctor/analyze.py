@@ -1,6 +1,6 @@
 """What the facts mean: each finding has an id, a severity, where it is, what was seen and what to do. Pure.
 
-The table of all of them is in `kinds`.
+The table of all of them is in `checks`.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
+from bridge.principal import Principal
 from macs_zenoh.protocol.directory import AgentInfo, published
-from macs_zenoh.protocol.keyexpr import LEASE, NAME, block_of, type_name
+from macs_zenoh.protocol.keyexpr import LEASE, NAME, PRESENCE, UNICAST, block_of, namespace_of, type_name
 from macs_zenoh.protocol.messages import UNITY
 
-from .facts import Certificate, Clock, Endpoint, Facts, Program, RouterInfo, Way
-from .kinds import ERROR, GROUPS, KINDS, NOTE, OK, WARNING, Severity
+from .checks import CHECKS, ERROR, GROUPS, NOTE, OK, WARNING, Severity
+from .facts import Certificate, Clock, Endpoint, Facts, NetworkPath, Program, RouterInfo
 
 CLOCK_S = 0.1
 """A clock that is further off makes sensor times and latencies misleading."""
@@ -40,27 +41,27 @@ class Finding(NamedTuple):
     severity: Severity
     where: str
     text: str
-    todo: str
+    remedy: str
 
     @property
     def group(self) -> str:
         """The part of the report that it belongs to."""
-        return KINDS[self.id].group
+        return CHECKS[self.id].group
 
 
 def found(finding: str, where: str = "", *, severity: Severity | None = None, **values: object) -> Finding:
     """A finding of a kind, filled in."""
-    kind = KINDS[finding]
+    kind = CHECKS[finding]
     return Finding(
         finding,
         kind.severity if severity is None else severity,
         where,
         kind.text.format(**values),
-        kind.todo.format(**values),
+        kind.remedy.format(**values),
     )
 
 
-def judge(facts: Facts) -> list[Finding]:
+def analyze(facts: Facts) -> list[Finding]:
     """Everything that the facts show, worst first within each group."""
     everything = [
         *_routers(facts),
@@ -101,14 +102,14 @@ def _routers(facts: Facts) -> Iterator[Finding]:
                 "router_ok",
                 where,
                 version=_version_of(endpoint),
-                round_trip=_round_trip(endpoint.way),
-                throughput=_throughput_words(endpoint.way, crossings=4),
+                round_trip=_round_trip(endpoint.path),
+                throughput=_throughput_words(endpoint.path, crossings=4),
             )
             if not endpoint.routers:
                 yield found("admin_hidden", where)
-            if _median_ms(endpoint.way) > SLOW_MS:
-                yield found("slow", where, round_trip=_round_trip(endpoint.way))
-            yield from _way(endpoint.way, where)
+            if _median_ms(endpoint.path) > SLOW_MS:
+                yield found("slow", where, round_trip=_round_trip(endpoint.path))
+            yield from _way(endpoint.path, where)
         elif endpoint.reach not in ("ok", "untried"):
             # programs use the others meanwhile
             severity = WARNING if some_answer else ERROR
@@ -254,19 +255,17 @@ def _access(facts: Facts) -> Iterator[Finding]:
 
 def _denied(facts: Facts, endpoint: Endpoint, who: str) -> Iterator[Finding]:
     rights, where = endpoint.rights, endpoint.endpoint
-    kind, _, number = facts.own.who.partition("/")
-    inbox = f"macs/to/unity/{number}/**" if kind == "gateway" else f"macs/to/{kind}/{_block(number)}/{number}/**"
-    presence = "macs/live/unity/**" if kind == "gateway" else f"macs/live/{kind}/{number}/**"
+    principal = Principal.parse(facts.own.who) if facts.own.who else Principal()
     if rights.sees is None and rights.seen is False:
         yield found("presence_unread", where)
-    if rights.seen is False and kind not in ("", "operator"):
-        yield found("presence_denied", where, who=who, key=presence)
+    if rights.seen is False and principal.kind not in ("", "operator"):
+        yield found("presence_denied", where, who=who, key=_presence(principal))
     if rights.watches is False:
         yield found("presence_unwatched", where)
     if rights.leases is False:
-        yield found("lease_denied", where, who=who, key=f"macs/block/{number}/*")
+        yield found("lease_denied", where, who=who, key=LEASE.every(block=principal.number))
     if rights.hears is False:
-        yield found("inbox_denied", where, who=who, key=inbox)
+        yield found("inbox_denied", where, who=who, key=_inbox(principal))
     if rights.pings is False:
         yield found("ping_denied", where)
     if endpoint is next(one for one in facts.endpoints if one.router):  # through which calls were made
@@ -275,8 +274,16 @@ def _denied(facts: Facts, endpoint: Endpoint, who: str) -> Iterator[Finding]:
                 yield found("call_denied", where, agent=program.agents[0], who=who)
 
 
-def _block(number: str) -> int:
-    return block_of(int(number)) if number else 0
+def _presence(principal: Principal) -> str:
+    kind, number = principal.agent
+    return PRESENCE.every(type=kind) if principal.kind == "gateway" else PRESENCE.every(type=kind, id=number)
+
+
+def _inbox(principal: Principal) -> str:
+    kind, number = principal.agent
+    if principal.kind == "gateway":
+        return UNICAST.every(type=kind, block=principal.number)
+    return UNICAST.every(type=kind, block=block_of(number), id=number)
 
 
 def _tried(endpoint: Endpoint, called: bool) -> str:
@@ -359,8 +366,7 @@ def _ids_and_blocks(facts: Facts) -> Iterator[Finding]:
 def _namespaces(facts: Facts, somebody: bool) -> Iterator[Finding]:
     counts: dict[str, set[str]] = defaultdict(set)
     for key in _keys(facts, "elsewhere"):
-        namespace, _, rest = key.rpartition("macs/live/")
-        counts[namespace.rstrip("/")].add(rest)
+        counts[namespace_of(PRESENCE, key) or ""].add(key)
     for namespace, keys in sorted(counts.items()):
         own = f"“{facts.own.namespace}”" if facts.own.namespace else "none"
         yield found(
@@ -380,8 +386,8 @@ def _keys(facts: Facts, field: str) -> list[str]:
 
 def _programs(facts: Facts) -> Iterator[Finding]:
     for endpoint in facts.endpoints:
-        if endpoint.way.clock is not None:
-            yield from _clock_off(endpoint.way.clock, endpoint.endpoint)
+        if endpoint.path.clock is not None:
+            yield from _clock_off(endpoint.path.clock, endpoint.endpoint)
     pingable = any(endpoint.rights.pings for endpoint in facts.endpoints)
     pinged = facts.programs[: len(facts.programs) - facts.unpinged]
     for program in pinged:
@@ -405,18 +411,18 @@ def _programs(facts: Facts) -> Iterator[Finding]:
 
 def _one_program(facts: Facts, program: Program, where: str) -> Iterator[Finding]:
     assert program.pong is not None
-    pong, clock = program.pong, program.way.clock
+    pong, clock = program.pong, program.path.clock
     yield found(
         "program_ok",
         where,
         macs=pong.macs or "(unknown)",
-        round_trip=_round_trip(program.way),
-        throughput=_throughput_words(program.way, crossings=2),
+        round_trip=_round_trip(program.path),
+        throughput=_throughput_words(program.path, crossings=2),
         clock=f"{clock.offset_s * 1000:+.1f} ms (±{clock.within_s * 1000:.1f})" if clock else "unknown",
     )
     if clock is not None:
         yield from _clock_off(clock, where)
-    yield from _way(program.way, where)
+    yield from _way(program.path, where)
     ours, theirs = (facts.own.id_slots, facts.own.group_slots), (pong.id_slots, pong.group_slots)
     if any(theirs) and ours != theirs:
         yield found("slots_differ", where, ours="{} and {}".format(*ours), theirs="{} and {}".format(*theirs))
@@ -444,9 +450,9 @@ def _clock_off(clock: Clock, where: str) -> Iterator[Finding]:
         yield found("clock_off", where, offset=_seconds(abs(clock.offset_s)), direction=direction)
 
 
-def _way(way: Way, where: str) -> Iterator[Finding]:
-    if way.lost_bytes:
-        yield found("large_lost", where, size=_bytes(way.lost_bytes))
+def _way(path: NetworkPath, where: str) -> Iterator[Finding]:
+    if path.lost_bytes:
+        yield found("large_lost", where, size=_bytes(path.lost_bytes))
 
 
 # -- our settings ------------------------------------------------------------------------------------------------
@@ -494,7 +500,7 @@ def _dropped(facts: Facts) -> Iterator[Finding]:
     queue = _number(sizes.get("data")) * BATCH_BYTES
     wait_s = _number(_congestion(facts, "drop", "max_wait_before_drop_fragments")) / 1e6
     for endpoint in facts.endpoints:
-        rate = _bytes_per_s(endpoint.way, crossings=4)
+        rate = _bytes_per_s(endpoint.path, crossings=4)
         if rate and queue and (limit := queue + rate * wait_s) < 5e6:
             yield found("large_dropped", endpoint.endpoint, throughput=_rate(rate), size=_bytes(limit))
 
@@ -521,26 +527,26 @@ def _name(program: Program) -> str:
     return ", ".join(program.agents) or program.zid[:8]
 
 
-def _median_ms(way: Way) -> float:
-    return statistics.median(way.round_trips_ms) if way.round_trips_ms else 0.0
+def _median_ms(path: NetworkPath) -> float:
+    return statistics.median(path.round_trips_ms) if path.round_trips_ms else 0.0
 
 
-def _round_trip(way: Way) -> str:
-    return f"{_median_ms(way):.1f} ms" if way.round_trips_ms else "an unknown time"
+def _round_trip(path: NetworkPath) -> str:
+    return f"{_median_ms(path):.1f} ms" if path.round_trips_ms else "an unknown time"
 
 
-def _bytes_per_s(way: Way, *, crossings: int) -> float:
+def _bytes_per_s(path: NetworkPath, *, crossings: int) -> float:
     """Throughput out of the largest echo: how much longer it took than the smallest. ``crossings``: how often the
     bytes went over a link, one after the other. 0: unknown."""
-    if len(way.echoes) < 2:
+    if len(path.echoes) < 2:
         return 0.0
-    small, large = way.echoes[0], way.echoes[-1]
+    small, large = path.echoes[0], path.echoes[-1]
     took_s = large.took_s - small.took_s
     return crossings * (large.size_bytes - small.size_bytes) / took_s if took_s > 0 else 0.0
 
 
-def _throughput_words(way: Way, *, crossings: int) -> str:
-    rate = _bytes_per_s(way, crossings=crossings)
+def _throughput_words(path: NetworkPath, *, crossings: int) -> str:
+    rate = _bytes_per_s(path, crossings=crossings)
     return f", about {_rate(rate)}" if rate else ""
 
 

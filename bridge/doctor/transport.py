@@ -1,5 +1,5 @@
 """Below Zenoh: whether an endpoint's host answers, and what is wrong with TLS. Zenoh itself only says that it timed
-out. Blocking; `look` calls it in threads."""
+out. Blocking; `gather` calls it in threads."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from macs_zenoh.protocol import greetings
-from macs_zenoh.protocol.addresses import joined, of_endpoint
+from macs_zenoh.protocol.endpoints import written
 
 from .facts import Certificate, Reach, Speaker, Tls, TlsProblem
 
@@ -30,15 +30,6 @@ _VERIFY_CODES: dict[int, TlsProblem] = {
     64: "wrong_name",
 }
 """OpenSSL's X509_V_ERR_* numbers."""
-
-
-host_and_port = of_endpoint
-
-
-def tls_settings(endpoint: str, zenoh: Mapping[str, Any]) -> dict[str, Any]:
-    """The TLS settings of an endpoint: Zenoh's ``transport/link/tls``, and what the endpoint itself says after #."""
-    own = dict(part.partition("=")[::2] for part in endpoint.partition("#")[2].split(";") if part)
-    return {**{name: value for name, value in zenoh.items() if value is not None}, **own}
 
 
 def reach(host: str, port: int, timeout_s: float) -> tuple[Reach, str]:
@@ -89,7 +80,7 @@ def answers(host: str, port: int, timeout_s: float) -> Speaker:
 
 def router_beside(host: str, timeout_s: float) -> str:
     """The endpoint of a router on this host at the usual port; empty without one."""
-    return f"tcp/{joined(host, 7447)}" if answers(host, 7447, timeout_s) == "zenoh" else ""
+    return written("tcp", host, 7447) if answers(host, 7447, timeout_s) == "zenoh" else ""
 
 
 def tls(host: str, port: int, settings: Mapping[str, Any], timeout_s: float) -> Tls:
