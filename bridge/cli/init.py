@@ -6,7 +6,7 @@ examples:
   macs init robot --id 7 -e tcp/192.168.1.10:7447      robot.toml, macs-robot.service, robot.launch.py
   macs init gateway --into /etc/macs                   gateway.toml, macs-gateway.service
   macs init router                                     router.json5, macs-router.service, macs-zenohd.service
-  macs init site --into hall-1                         two routers, a gateway, a robot, and a plan for certificates
+  macs init site --into hall-1                         two routers, a gateway, a robot, and a policy for certificates
 
 what it prints:
   ./robot.toml
@@ -72,13 +72,13 @@ KINDS: dict[str, Kind] = {
             "gateway.toml": ("site", "gateway.toml"),
             "robot.toml": ("site", "robot.toml"),
             "macs.toml": ("macs.toml",),
-            "plan.yaml": ("security", "site.yaml"),
+            "policy.yaml": ("security", "site.yaml"),
             **{
                 f"macs-{name}.service": ("systemd", f"macs-{name}.service")
                 for name in ("router", "zenohd", "gateway", "robot")
             },
         },
-        "Put your hosts into the files, and your robots into plan.yaml; then: macs security generate DIR/plan.yaml",
+        "Put your hosts into the files, your robots into policy.yaml; then: macs security generate DIR/policy.yaml",
     ),
 }
 

@@ -205,7 +205,7 @@ class Operator:
             await self.ask(robot, "status", timeout_s=timeout_s)
         except MacsError:
             return ""
-        right = f"a plan gives it by `may: call` with `verbs: [{verb}]`, or `may: command`"
+        right = f"a policy gives it by `may: call` with `verbs: [{verb}]`, or `may: command`"
         return f"access rules do not let {self._caller} call its verb {verb}; {right} (docs/security.md)"
 
     async def ask(self, robot: int, verb: str, data: bytes = b"", *, timeout_s: float, urgent: bool = False) -> bytes:

@@ -1,11 +1,11 @@
-"""Make a mesh secure from a plan, and see that it is.
+"""Make a mesh secure from a policy, and see that it is.
 
-`generate` reads a plan (YAML: who exists, who may command, see, call or message whom) and writes a directory for each
-node: its certificate and key, a router's whole configuration, a client's settings. Run again, it keeps what is good,
-renews certificates with less than a third of their life left, and names what is in the plan no more.
+`generate` reads a policy (YAML: who exists, who may command, see, call or message whom) and writes a directory for
+each node: its certificate and key, a router's whole configuration, a client's settings. Run again, it keeps what is
+good, renews certificates with less than a third of their life left, and names what is in the policy no more.
 
-`check` proves by trying, against running routers, that each may do what the plan says and nothing else.
-docs/security.md has the plan's fields and what to do when something is stolen.
+`check` proves by trying, against running routers, that each may do what the policy says and nothing else.
+docs/security.md has the policy's fields and what to do when something is stolen.
 
 examples:
   macs security generate site.yaml --into pki
@@ -18,7 +18,7 @@ what it prints:
   robot-7: certificate made, new, until 2027-02-26                                   of generate
   ../pki: 5 certificates made, 0 kept, 18 files written; the first certificate ends on 2027-02-26
   WRONG tls/10.0.0.5:7447: robot-9 commands robot-7: forbidden, permitted seen       of check
-  212 attempts, 211 as planned, 1 not"""
+  212 attempts, 211 as expected, 1 not"""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from bridge.cli import output, running, terminal
 from bridge.cli.terminal import BAD, Block
 
 if TYPE_CHECKING:
-    from bridge.security.check import Result
+    from bridge.security.attempts import Result
     from bridge.security.generate import Report
 
-SUMMARY = "certificates and access rules from a plan"
+SUMMARY = "certificates and access rules from a policy"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     generate = verbs.add_parser(
         "generate", help="write certificates, rules and settings", description=_generate.__doc__
     )
-    generate.add_argument("plan", metavar="PLAN", help="the plan (YAML), as config/security/site.yaml")
+    generate.add_argument("policy", metavar="POLICY", help="the policy (YAML), as config/security/site.yaml")
     generate.add_argument("--into", required=True, metavar="DIR", help="directory for everything, with the authority")
     generate.add_argument(
         "--at", metavar="PATH", help="where nodes' directories will be on their machines, as /etc/macs"
@@ -54,13 +54,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     generate.add_argument("--new-ca", action="store_true", help="a new authority: all certificates so far end")
     generate.add_argument("--json", action="store_true", help="for programs")
     check = verbs.add_parser("check", help="try everything on running routers", description=_check.__doc__)
-    check.add_argument("plan", metavar="PLAN", help="the plan (YAML)")
+    check.add_argument("policy", metavar="POLICY", help="the policy (YAML)")
     check.add_argument("--dir", required=True, metavar="DIR", help="what `generate` wrote")
     check.add_argument(
-        "-e", "--connect", metavar="ENDPOINT", action="append", help="routers to try; default: those of the plan"
+        "-e", "--connect", metavar="ENDPOINT", action="append", help="routers to try; default: those of the policy"
     )
     check.add_argument("--json", action="store_true", help="for programs: every attempt, expected and seen")
-    check.add_argument("--all", action="store_true", help="show what is as planned as well")
+    check.add_argument("--all", action="store_true", help="show what is as expected as well")
     check.add_argument(
         "--timeout", type=float, default=5.0, metavar="S", help="how long to wait for a router (default: 5)"
     )
@@ -71,14 +71,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _generate(args: argparse.Namespace) -> int:
-    """Write what follows from a plan. Exit code 2: the plan or the directory cannot be used."""
+    """Write what follows from a policy. Exit code 2: the policy or the directory cannot be used."""
     import datetime as dt
 
-    from bridge.security import plan
+    from bridge.security import policy
     from bridge.security.generate import generate
 
     report = generate(
-        plan.load(args.plan),
+        policy.load(args.policy),
         Path(args.into),
         dt.datetime.now(dt.timezone.utc),
         at=args.at,
@@ -97,9 +97,9 @@ def _as_text(report: Report) -> str:
     if report.authority.why:
         lines.append(f"authority: {report.authority.why}, until {report.authority.until:%Y-%m-%d}")
     lines += [f"{one.name}: certificate made, {one.why}, until {one.until:%Y-%m-%d}" for one in made]
-    for name, until in report.left_over:
+    for name, until in report.orphaned:
         lines.append(
-            f"{name}: not in the plan any more. Its certificate lasts until {until:%Y-%m-%d} and is good for nothing"
+            f"{name}: not in the policy any more. Its certificate lasts until {until:%Y-%m-%d} and is good for nothing"
             " as soon as the routers run with these files"
         )
     if report.routers_changed:
@@ -121,7 +121,7 @@ def _as_json(report: Report) -> str:
             ],
             "written": [str(path) for path in report.written],
             "restart": report.routers_changed,
-            "left_over": [{"name": name, "until": until.isoformat()} for name, until in report.left_over],
+            "orphaned": [{"name": name, "until": until.isoformat()} for name, until in report.orphaned],
         }
     )
 
@@ -129,13 +129,13 @@ def _as_json(report: Report) -> str:
 def _check(args: argparse.Namespace) -> int:
     """Try what each node may and may not, with its own certificate, on routers that run.
 
-    Exit code 0: everything is as planned; 1: something is not, or a router does not answer; 2: the plan or the
+    Exit code 0: everything is as expected; 1: something is not, or a router does not answer; 2: the policy or the
     directory cannot be used; 130 after Ctrl-C.
     """
-    from bridge.security import plan
+    from bridge.security import policy
     from bridge.security.check import check
 
-    read = plan.load(args.plan)
+    read = policy.load(args.policy)
     if not args.verbose:
         logging.getLogger("macs.mesh").setLevel(logging.WARNING)  # of each of many sessions
 
@@ -148,21 +148,21 @@ def _check(args: argparse.Namespace) -> int:
                 timeout_s=args.timeout,
                 progress=lambda done, of: tell("attempts", done, of),
             )
-        wrong = [result for result in results if not result.as_planned]
+        wrong = [result for result in results if not result.as_expected]
         if args.json:
             output.say(json.dumps([result.as_dict() for result in results]))
         else:
             terminal.show(*(_line(result) for result in (results if args.all else wrong)))
-            output.say(f"{len(results)} attempts, {len(results) - len(wrong)} as planned, {len(wrong)} not")
+            output.say(f"{len(results)} attempts, {len(results) - len(wrong)} as expected, {len(wrong)} not")
         return 1 if wrong or not results else 0
 
     return running.until_stopped(work, interrupted=running.INTERRUPTED)
 
 
 def _line(result: Result) -> Block:
-    verdict = "ok   " if result.as_planned else "WRONG"
+    verdict = "ok   " if result.as_expected else "WRONG"
     expected = "permitted" if result.permitted else "forbidden"
     seen = "permitted" if result.seen else "forbidden"
     key = f" ({result.key})" if result.key else ""
     line = f"{verdict} {result.router}: {result.what}: {expected}, {seen} seen{key}"
-    return line if result.as_planned else (line, BAD)
+    return line if result.as_expected else (line, BAD)

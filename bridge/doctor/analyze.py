@@ -489,7 +489,7 @@ def _setting_problems(facts: Facts) -> Iterator[Finding]:
         if _number(size) > QUEUE_BATCHES:
             yield found("queue_long", name=name, size=size)
     wait_us = _number(_congestion(facts, "block", "wait_before_close"))
-    if wait_us > max(CLOSE_US, lease_ms * 1000):  # with a longer lease it is for slow links: config/wan/plan.yaml
+    if wait_us > max(CLOSE_US, lease_ms * 1000):  # with a longer lease it is for slow links: config/wan/policy.yaml
         yield found("close_long", wait=_seconds(wait_us / 1e6))
 
 

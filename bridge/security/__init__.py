@@ -1,1 +1,1 @@
-"""Security by generation: a plan of who exists and who may what, and everything that follows from it."""
+"""Security by generation: a policy of who exists and who may what, and everything that follows from it."""

@@ -1,4 +1,4 @@
-"""What each node of a plan may put, declare, ask and answer: the rules of a router's access control. Pure.
+"""What each node of a policy may put, declare, ask and answer: the rules of a router's access control. Pure.
 
 Zenoh allows a message when its key is included in the key expression of a rule, for each session that it passes:
 ``ingress`` on its way into the router, ``egress`` on its way out. So each node gets
@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from bridge.security.plan import Client, Gateway, Operator, Plan, Robot, Router, kind_of
+from bridge.security.policy import Client, Gateway, Operator, Policy, Robot, Router, kind_of
 from macs_zenoh.protocol.keyexpr import (
     ADMIN,
     BLOCK_SIZE,
@@ -75,27 +75,29 @@ class Rule(NamedTuple):
     keys: tuple[str, ...]
 
 
-def rules(plan: Plan, client: Client) -> list[Rule]:
+def rules(policy: Policy, client: Client) -> list[Rule]:
     """Everything that a client may."""
-    said = _Said(plan, client)
-    heard = _Heard(plan, client)
-    seen = list(_tokens_seen(plan, client))
+    outbound = _Outbound(policy, client)
+    inbound = _Inbound(policy, client)
+    seen = list(_tokens_seen(policy, client))
     found = [
-        Rule("is present", ("liveliness_token",), (INGRESS,), distinct(_own_tokens(plan, client))),
-        Rule("speaks", ("put",), (INGRESS,), distinct(said.puts())),
-        Rule("asks", ("query",), (INGRESS,), distinct([*said.queries(), *heard.recoveries_asked()])),
-        Rule("learns who listens to it", ("declare_subscriber",), (EGRESS,), distinct(said.listeners())),
+        Rule("is present", ("liveliness_token",), (INGRESS,), distinct(_own_tokens(policy, client))),
+        Rule("speaks", ("put",), (INGRESS,), distinct(outbound.puts())),
+        Rule("asks", ("query",), (INGRESS,), distinct([*outbound.queries(), *inbound.recoveries_asked()])),
+        Rule("learns who listens to it", ("declare_subscriber",), (EGRESS,), distinct(outbound.listeners())),
         Rule(
             "learns who answers it",
             ("declare_queryable",),
             (EGRESS,),
-            distinct([*said.answerers(), *heard.recovered()]),
+            distinct([*outbound.answerers(), *inbound.recovered()]),
         ),
-        Rule("is answered", ("reply",), (EGRESS,), distinct([*said.replies(), *heard.recovered()])),
-        Rule("subscribes", ("declare_subscriber",), (INGRESS,), distinct(heard.subscriptions())),
-        Rule("hears", ("put",), (EGRESS,), distinct(heard.puts())),
-        Rule("answers", ("declare_queryable", "reply"), (INGRESS,), distinct([*heard.queryables(), *said.kept()])),
-        Rule("is asked", ("query",), (EGRESS,), distinct([*heard.queryables(), *said.kept_asked()])),
+        Rule("is answered", ("reply",), (EGRESS,), distinct([*outbound.replies(), *inbound.recovered()])),
+        Rule("subscribes", ("declare_subscriber",), (INGRESS,), distinct(inbound.subscriptions())),
+        Rule("hears", ("put",), (EGRESS,), distinct(inbound.puts())),
+        Rule(
+            "answers", ("declare_queryable", "reply"), (INGRESS,), distinct([*inbound.queryables(), *outbound.kept()])
+        ),
+        Rule("is asked", ("query",), (EGRESS,), distinct([*inbound.queryables(), *outbound.kept_asked()])),
         Rule(
             "watches presence",
             ("declare_liveliness_subscriber", "liveliness_query"),
@@ -104,20 +106,20 @@ def rules(plan: Plan, client: Client) -> list[Rule]:
         ),
         Rule("sees who is there", ("liveliness_token",), (EGRESS,), distinct(seen)),
     ]
-    return [_in(plan.namespace, rule) for rule in found if rule.keys]
+    return [_in(policy.namespace, rule) for rule in found if rule.keys]
 
 
-def link_rules(plan: Plan) -> list[Rule]:
+def link_rules(policy: Policy) -> list[Rule]:
     """Everything that one router may send another: what is forbidden to a client is stopped at the client's router."""
     keys = distinct([*with_recovery([EVERYTHING]), *ADMIN])
-    return [_in(plan.namespace, Rule("carries everything", MESSAGES, (INGRESS, EGRESS), keys))]
+    return [_in(policy.namespace, Rule("carries everything", MESSAGES, (INGRESS, EGRESS), keys))]
 
 
-def linked(plan: Plan, router: Router) -> list[Router]:
+def linked(policy: Policy, router: Router) -> list[Router]:
     """The routers that this one has a link with, whoever dials."""
     return [
         other
-        for other in plan.routers
+        for other in policy.routers
         if other is not router and (other.name in router.links or router.name in other.links)
     ]
 
@@ -156,42 +158,44 @@ def inboxes(client: Client) -> list[Fields]:
 # -- who may what ------------------------------------------------------------------------------------------------
 
 
-def reaches(plan: Plan, sender: Client, receiver: Client) -> bool:
+def reaches(policy: Policy, sender: Client, receiver: Client) -> bool:
     """Whether one may send to the other by id, by group and with everybody.
 
     To a robot that is commanding it. Others also hear those whom they may command, see or call, since these answer.
     """
     if not inboxes(receiver):
         return False
-    if plan.may(sender, "command", receiver) or isinstance(receiver, Robot):
-        return plan.may(sender, "command", receiver)
-    return plan.may(sender, "message", receiver) or any(
-        plan.may(receiver, right, sender) for right in ("command", "see", "call")
+    if policy.may(sender, "command", receiver) or isinstance(receiver, Robot):
+        return policy.may(sender, "command", receiver)
+    return policy.may(sender, "message", receiver) or any(
+        policy.may(receiver, right, sender) for right in ("command", "see", "call")
     )
 
 
-def converse(plan: Plan, one: Client, other: Client) -> bool:
+def converse(policy: Policy, one: Client, other: Client) -> bool:
     """Whether one of two named robots may send to the other by name, so that both need to know of each other."""
-    return plan.may(one, "message", other) or plan.may(other, "message", one)
+    return policy.may(one, "message", other) or policy.may(other, "message", one)
 
 
-def called(client: Client) -> str | None:
+def awareness_name(client: Client) -> str | None:
     """A client's name in collective awareness."""
-    return client.called if isinstance(client, Robot) else None
+    return client.awareness_name if isinstance(client, Robot) else None
 
 
-def _names(plan: Plan, client: Client, holds: Callable[[Client, Client], bool]) -> list[str]:
+def _names(policy: Policy, client: Client, holds: Callable[[Client, Client], bool]) -> list[str]:
     """The names of the named robots for which something holds with a named client; none for one without a name."""
-    others = [robot for robot in plan.robots if robot is not client and called(client) is not None]
-    return [robot.called for robot in others if robot.called is not None and holds(client, robot)]
+    others = [robot for robot in policy.robots if robot is not client and awareness_name(client) is not None]
+    return [robot.awareness_name for robot in others if robot.awareness_name is not None and holds(client, robot)]
 
 
-def _by_kind(plan: Plan, client: Client, holds: Callable[[Client], bool]) -> Iterator[tuple[str, list[Client], bool]]:
+def _by_kind(
+    policy: Policy, client: Client, holds: Callable[[Client], bool]
+) -> Iterator[tuple[str, list[Client], bool]]:
     """The others for whom something holds, by kind, with whether they are all of that kind."""
     lists: dict[str, Sequence[Client]] = {
-        "robots": plan.robots,
-        "gateways": plan.gateways,
-        "operators": plan.operators,
+        "robots": policy.robots,
+        "gateways": policy.gateways,
+        "operators": policy.operators,
     }
     for kind, everyone in lists.items():
         others = [other for other in everyone if other is not client]
@@ -201,11 +205,11 @@ def _by_kind(plan: Plan, client: Client, holds: Callable[[Client], bool]) -> Ite
 
 
 def _collapsed(
-    plan: Plan, client: Client, holds: Callable[[Client], bool], fields: Callable[[Client], list[Fields]]
+    policy: Policy, client: Client, holds: Callable[[Client], bool], fields: Callable[[Client], list[Fields]]
 ) -> list[Fields]:
     """Fields for the others for whom something holds: only the type where it holds for all of a kind."""
     found: list[Fields] = []
-    for kind, chosen, complete in _by_kind(plan, client, holds):
+    for kind, chosen, complete in _by_kind(policy, client, holds):
         each = [fields_of_one for other in chosen for fields_of_one in fields(other)]
         if each and complete:
             each = [{"from_type" if fields is senders else "type": TYPES[kind]}]
@@ -216,23 +220,23 @@ def _collapsed(
 # -- saying ------------------------------------------------------------------------------------------------------
 
 
-class _Said:
+class _Outbound:
     """What a client may say, and what it must know to say it: a publisher here is quiet until it knows who listens."""
 
-    def __init__(self, plan: Plan, client: Client) -> None:
-        self._plan = plan
+    def __init__(self, policy: Policy, client: Client) -> None:
+        self._policy = policy
         self._client = client
         self._as = senders(client)
-        self._name = called(client)
-        reached = _collapsed(plan, client, lambda other: reaches(plan, client, other), inboxes)
+        self._name = awareness_name(client)
+        reached = _collapsed(policy, client, lambda other: reaches(policy, client, other), inboxes)
         self._inboxes = [*([] if {"type": TYPES[kind_of(client)]} in reached else inboxes(client)), *reached]
         self._groups = list(self._group_targets())
         self._broadcasts = bool(reached) or isinstance(client, Gateway)
-        self._friends = _names(plan, client, lambda me, robot: plan.may(me, "message", robot))
+        self._friends = _names(policy, client, lambda me, robot: policy.may(me, "message", robot))
 
     def _group_targets(self) -> Iterator[Fields]:
-        plan, client = self._plan, self._client
-        for kind, chosen, complete in _by_kind(plan, client, lambda other: reaches(plan, client, other)):
+        policy, client = self._policy, self._client
+        for kind, chosen, complete in _by_kind(policy, client, lambda other: reaches(policy, client, other)):
             if kind == "gateways":
                 yield {"type": UNITY}  # headsets choose their groups themselves
             elif kind == "robots" and complete:
@@ -267,16 +271,16 @@ class _Said:
             yield from ADMIN
 
     def _callees(self) -> list[Fields]:
-        plan, client = self._plan, self._client
+        policy, client = self._policy, self._client
         by_verbs: dict[tuple[str, ...] | None, list[Client]] = {}
-        others: list[Client] = [*plan.robots, *plan.operators]
+        others: list[Client] = [*policy.robots, *policy.operators]
         for other in others:
-            verbs = plan.verbs(client, other)
+            verbs = policy.verbs(client, other)
             if other is not client and verbs != []:
                 by_verbs.setdefault(tuple(verbs) if verbs is not None else None, []).append(other)
         found: list[Fields] = []
         for some, chosen in by_verbs.items():
-            callees = _collapsed(plan, client, chosen.__contains__, agents)
+            callees = _collapsed(policy, client, chosen.__contains__, agents)
             found += [{**callee, "verb": verb} for callee in callees for verb in some] if some else callees
         return found
 
@@ -328,23 +332,23 @@ class _Said:
 # -- hearing -----------------------------------------------------------------------------------------------------
 
 
-class _Heard:
+class _Inbound:
     """What a client may hear, and what it declares for it."""
 
-    def __init__(self, plan: Plan, client: Client) -> None:
-        self._plan = plan
+    def __init__(self, policy: Policy, client: Client) -> None:
+        self._policy = policy
         self._client = client
-        self._name = called(client)
-        self._senders = _collapsed(plan, client, lambda other: reaches(plan, other, client), senders)
+        self._name = awareness_name(client)
+        self._senders = _collapsed(policy, client, lambda other: reaches(policy, other, client), senders)
         self._streams = _collapsed(
-            plan, client, lambda other: isinstance(other, Robot) and plan.may(client, "see", other), agents
+            policy, client, lambda other: isinstance(other, Robot) and policy.may(client, "see", other), agents
         )
         self._group: Fields | None = None
         if isinstance(client, Robot):
             self._group = {"group": client.group, "type": ROS} if client.group else None
         elif isinstance(client, Gateway):
             self._group = {"type": UNITY}
-        self._friends = _names(plan, client, lambda me, robot: plan.may(robot, "message", me))
+        self._friends = _names(policy, client, lambda me, robot: policy.may(robot, "message", me))
 
     def subscriptions(self) -> Iterator[str]:
         yield from _every(UNICAST, inboxes(self._client))
@@ -396,7 +400,7 @@ class _Heard:
 # -- presence ----------------------------------------------------------------------------------------------------
 
 
-def _own_tokens(plan: Plan, client: Client) -> Iterator[str]:
+def _own_tokens(policy: Policy, client: Client) -> Iterator[str]:
     for agent in agents(client):
         yield PRESENCE.every(**agent, **({"group": client.group} if isinstance(client, Robot) else {}))
     if isinstance(client, Operator):
@@ -405,9 +409,9 @@ def _own_tokens(plan: Plan, client: Client) -> Iterator[str]:
         yield from (LEASE.every(block=block) for block in client.blocks)
         if not client.blocks:
             yield LEASE.every()
-    if isinstance(client, Robot) and client.called is not None:
-        yield NAME.every(name=client.called, type=ROS, id=client.id)
-        yield WANTED.every(name=client.called)
+    if isinstance(client, Robot) and client.awareness_name is not None:
+        yield NAME.every(name=client.awareness_name, type=ROS, id=client.id)
+        yield WANTED.every(name=client.awareness_name)
 
 
 def _watched(client: Client) -> Iterator[str]:
@@ -415,21 +419,21 @@ def _watched(client: Client) -> Iterator[str]:
     yield PRESENCE.every()
     if not isinstance(client, Robot):
         yield LEASE.every()
-    if isinstance(client, Operator) or called(client) is not None:
+    if isinstance(client, Operator) or awareness_name(client) is not None:
         yield NAME.every()
         yield WANTED.every()
 
 
-def _tokens_seen(plan: Plan, client: Client) -> Iterator[str]:
+def _tokens_seen(policy: Policy, client: Client) -> Iterator[str]:
     if isinstance(client, Operator):
         yield from (key.every() for key in (PRESENCE, LEASE, NAME, WANTED))
         return
     yield from _every(PRESENCE, agents(client))
-    yield from _every(PRESENCE, _collapsed(plan, client, lambda other: plan.related(client, other), agents))
+    yield from _every(PRESENCE, _collapsed(policy, client, lambda other: policy.related(client, other), agents))
     if isinstance(client, Gateway):
         yield LEASE.every()
-    if (name := called(client)) is not None:
-        for one in [name, *_names(plan, client, lambda me, robot: converse(plan, me, robot))]:
+    if (name := awareness_name(client)) is not None:
+        for one in [name, *_names(policy, client, lambda me, robot: converse(policy, me, robot))]:
             yield NAME.every(name=one)
             yield WANTED.every(name=one)
 

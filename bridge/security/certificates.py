@@ -1,4 +1,4 @@
-"""A certificate authority in a directory: its own certificate, and one for each node of a plan.
+"""A certificate authority in a directory: its own certificate, and one for each node of a policy.
 
 Keys are made with `cryptography`: EC P-256, which Zenoh's TLS takes. Who somebody is stands in the common name, which
 is what a router's access control reads. Only routers have certificates for servers, so that no robot can pass for one.
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.security.plan import Plan, Router
+from bridge.security.policy import Policy, Router
 from macs_zenoh.errors import ConfigError, MissingExtra, UsageError
 
 try:
@@ -49,7 +49,7 @@ class Issued:
     why: str = ""
 
 
-def authority(into: Path, plan: Plan, now: dt.datetime, *, renew: bool = False) -> tuple[Authority, Issued]:
+def authority(into: Path, policy: Policy, now: dt.datetime, *, renew: bool = False) -> tuple[Authority, Issued]:
     """The certificate authority of a directory, made where there is none, or with ``renew``.
 
     Raises ConfigError when its files cannot be used.
@@ -60,7 +60,7 @@ def authority(into: Path, plan: Plan, now: dt.datetime, *, renew: bool = False) 
     if not certificate.exists() and not key.exists():
         why = "new"
     if why:
-        return _new_authority(directory, plan, now, why)
+        return _new_authority(directory, policy, now, why)
     if not (certificate.exists() and key.exists()):
         missing = key if certificate.exists() else certificate
         raise ConfigError(str(missing), "is missing; restore it, or make a new authority with --new-ca")
@@ -80,7 +80,7 @@ class Authority:
     key: ec.EllipticCurvePrivateKey
     pem: bytes
 
-    def issue(self, directory: Path, node: Router | None, plan: Plan, now: dt.datetime, *, renew: bool) -> Issued:
+    def issue(self, directory: Path, node: Router | None, policy: Policy, now: dt.datetime, *, renew: bool) -> Issued:
         """The certificate in a node's directory, kept while it is good, else made anew with a new key.
 
         ``node`` is the router that it is for, None for a client; the directory's name is the node's.
@@ -88,7 +88,7 @@ class Authority:
         addresses = node.addresses if node is not None else []
         why = "asked" if renew else self._problem(directory, addresses, now)
         if why:
-            self._make(directory, addresses, plan, now)
+            self._make(directory, addresses, policy, now)
         elif (directory / AUTHORITY).read_bytes() != self.pem:
             write(directory / AUTHORITY, self.pem, PUBLIC_FILE)
         return Issued(directory.name, _until(_read_certificate(directory / CERTIFICATE)), why)
@@ -115,8 +115,8 @@ class Authority:
         left = _until(certificate) - now
         return f"{max(0, left.days)} days left" if left < life * RENEW_BELOW else ""
 
-    def _make(self, directory: Path, addresses: Sequence[str], plan: Plan, now: dt.datetime) -> None:
-        until = now + dt.timedelta(days=plan.certificates.days)
+    def _make(self, directory: Path, addresses: Sequence[str], policy: Policy, now: dt.datetime) -> None:
+        until = now + dt.timedelta(days=policy.certificates.days)
         if until > _until(self.certificate):
             raise ConfigError(
                 "the certificate authority",
@@ -140,10 +140,10 @@ class Authority:
         write(directory / AUTHORITY, self.pem, PUBLIC_FILE)
 
 
-def _new_authority(directory: Path, plan: Plan, now: dt.datetime, why: str) -> tuple[Authority, Issued]:
+def _new_authority(directory: Path, policy: Policy, now: dt.datetime, why: str) -> tuple[Authority, Issued]:
     key = ec.generate_private_key(ec.SECP256R1())
-    subject = _named(f"macs {plan.namespace or 'mesh'} authority")
-    until = now + dt.timedelta(days=plan.certificates.ca_days)
+    subject = _named(f"macs {policy.namespace or 'mesh'} authority")
+    until = now + dt.timedelta(days=policy.certificates.ca_days)
     certificate = (
         _builder(subject, subject, key, now, until)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)

@@ -1,17 +1,17 @@
-"""What the check expects of a plan: who speaks as whom, who is reached, seen and known; and an agent of each. Pure."""
+"""What the check expects of a policy: who speaks as whom, who is reached, seen and known; an agent of each. Pure."""
 
 from __future__ import annotations
 
 from bridge.security import access
-from bridge.security.plan import Client, Gateway, Operator, Plan, Robot
+from bridge.security.policy import Client, Gateway, Operator, Policy, Robot
 from macs_zenoh.protocol.keyexpr import FieldValue, block_of
 
 
 class Expected:
-    """The plan's answers. What two gateways without blocks may do is one thing: their headsets are one crowd."""
+    """The policy's answers. What two gateways without blocks may do is one thing: their headsets are one crowd."""
 
-    def __init__(self, plan: Plan) -> None:
-        self.plan = plan
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
 
     def speaks_as(self, one: Client, other: Client) -> bool:
         """Whether a node may send in the name of another's sample agent."""
@@ -27,14 +27,14 @@ class Expected:
 
     def reaches(self, one: Client, other: Client) -> bool:
         """Whether a node's agents may send to another's: those who have an inbox."""
-        return bool(access.inboxes(other)) and (one is other or access.reaches(self.plan, one, other))
+        return bool(access.inboxes(other)) and (one is other or access.reaches(self.policy, one, other))
 
     def sees(self, one: Client, other: Client) -> bool:
         """Whether a node may know that another's sample agent is online."""
         return (
             isinstance(one, Operator)
             or one is other
-            or self.plan.related(one, other)
+            or self.policy.related(one, other)
             or (isinstance(one, Gateway) and self.has_inbox(one, other))
         )
 
@@ -42,20 +42,20 @@ class Expected:
         """Whether a node may know of another's name and what is taken under it."""
         if isinstance(one, Operator) or one is other:
             return True
-        both = access.called(one) is not None and access.called(other) is not None
-        return both and access.converse(self.plan, one, other)
+        both = access.awareness_name(one) is not None and access.awareness_name(other) is not None
+        return both and access.converse(self.policy, one, other)
 
     def writes_to(self, one: Client, other: Client) -> bool:
         """Whether a named node may send to another by name."""
-        both = access.called(one) is not None and access.called(other) is not None
-        return both and one is not other and self.plan.may(one, "message", other)
+        both = access.awareness_name(one) is not None and access.awareness_name(other) is not None
+        return both and one is not other and self.policy.may(one, "message", other)
 
     def limited_verbs(self) -> list[str]:
         """Verbs that some may call of somebody who may not call all: real ones, which robots serve as well."""
         found: dict[str, None] = {}
-        for one in self.plan.clients:
-            for other in self.plan.clients:
-                found.update(dict.fromkeys(self.plan.verbs(one, other) or ()))
+        for one in self.policy.clients:
+            for other in self.policy.clients:
+                found.update(dict.fromkeys(self.policy.verbs(one, other) or ()))
         return list(found)
 
     @staticmethod

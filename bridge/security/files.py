@@ -1,4 +1,4 @@
-"""The files of a plan's nodes: a router's configuration (JSON5) and a client's settings (TOML). Pure."""
+"""The files of a policy's nodes: a router's configuration (JSON5) and a client's settings (TOML). Pure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import msgspec
 
 from bridge.security import access
 from bridge.security.access import Rule
-from bridge.security.plan import Client, Gateway, Operator, Plan, Robot, Router
+from bridge.security.policy import Client, Gateway, Operator, Policy, Robot, Router
 from macs_zenoh.config import MeshSettings, TrafficRule, changed
 from macs_zenoh.protocol import keyexpr
 from macs_zenoh.protocol.endpoints import protocol_of
@@ -75,14 +75,14 @@ def client_overrides(directory: str) -> list[str]:
 # -- a router ----------------------------------------------------------------------------------------------------
 
 
-def router_json5(plan: Plan, router: Router, directory: str) -> str:
+def router_json5(policy: Policy, router: Router, directory: str) -> str:
     """The whole configuration of a router, for ``zenohd -c`` and ``macs router -c``.
 
     ``directory`` is where its certificate will be on its machine.
     """
-    others = {other.name: other for other in plan.routers}
+    others = {other.name: other for other in policy.routers}
     mesh = changed(
-        plan.mesh,
+        policy.mesh,
         mode="router",
         listen=router.listen,
         connect=[endpoint for name in router.links for endpoint in others[name].dialled],
@@ -100,14 +100,14 @@ def router_json5(plan: Plan, router: Router, directory: str) -> str:
     }
     for name, value in tls.items():
         _put(tree, f"transport/link/tls/{name}", value)
-    protocols = sorted({protocol_of(endpoint) for one in plan.routers for endpoint in (*one.listen, *one.dialled)})
+    protocols = sorted({protocol_of(endpoint) for one in policy.routers for endpoint in (*one.listen, *one.dialled)})
     _put(tree, "transport/link/protocols", protocols)
     tree["adminspace"] = {"enabled": True, "permissions": {"read": True, "write": False}}
     tree["metadata"] = {"name": router.name}
-    body = [*_members(tree, "", 1), "", *_access(plan, router), *_traffic(plan)]
+    body = [*_members(tree, "", 1), "", *_access(policy, router), *_traffic(policy)]
     return "\n".join(
         [
-            f"// Router {router.name}, made by `macs security generate` from a plan. Change the plan, not this file.",
+            f"// Router {router.name}, made by `macs security generate` from a policy: change that, not this.",
             f"//   zenohd -c router.json5   or   macs router -c router.json5; its certificate is in {directory}",
             "{",
             *body,
@@ -152,9 +152,9 @@ def _inline(value: Any) -> str:
 # -- access control ----------------------------------------------------------------------------------------------
 
 
-def _access(plan: Plan, router: Router) -> Iterator[str]:
-    by_node = [(client.name, access.rules(plan, client)) for client in plan.clients]
-    by_node += [(other.name, access.link_rules(plan)) for other in access.linked(plan, router)]
+def _access(policy: Policy, router: Router) -> Iterator[str]:
+    by_node = [(client.name, access.rules(policy, client)) for client in policy.clients]
+    by_node += [(other.name, access.link_rules(policy)) for other in access.linked(policy, router)]
     yield "  // Who may what. A certificate's common name says who somebody is; what no rule allows is dropped."
     yield "  // `ingress` is on the way into this router, `egress` on the way out of it."
     yield "  access_control: {"
@@ -162,7 +162,7 @@ def _access(plan: Plan, router: Router) -> Iterator[str]:
     yield '    default_permission: "deny",'
     yield "    rules: ["
     for name, rules in by_node:
-        yield f"      // {_summary(plan, name)}"
+        yield f"      // {_summary(policy, name)}"
         for rule in rules:
             yield from _rule(name, rule)
     yield "    ],"
@@ -193,13 +193,15 @@ def _rule(name: str, rule: Rule) -> Iterator[str]:
     yield "      },"
 
 
-def _summary(plan: Plan, name: str) -> str:
-    node = plan.node(name)
+def _summary(policy: Policy, name: str) -> str:
+    node = policy.node(name)
     if isinstance(node, Router):
         return f"{name}: a router, which has held its own clients to these rules"
     if isinstance(node, Robot):
         group = f", group {node.group}" if node.group else ""
-        return f"{name}: robot {node.id}{group}" + (f", called {node.called}" if node.called is not None else "")
+        return f"{name}: robot {node.id}{group}" + (
+            f", called {node.awareness_name}" if node.awareness_name is not None else ""
+        )
     if isinstance(node, Gateway):
         of = f"block {', '.join(map(str, node.blocks))}" if node.blocks else "any block"
         return f"{name}: a gateway, which speaks for the headsets of {of}"
@@ -232,24 +234,24 @@ GUARD = 2.0
 message that was a little late there must not be lost here."""
 
 
-def _traffic(plan: Plan) -> Iterator[str]:
-    """The plan's traffic rules as Zenoh has them, against programs that do not keep them."""
-    if not plan.traffic:
+def _traffic(policy: Policy) -> Iterator[str]:
+    """The policy's traffic rules as Zenoh has them, against programs that do not keep them."""
+    if not policy.traffic:
         return
     yield ""
-    yield "  // Traffic rules of the plan. Programs apply them where messages enter the mesh; the router stops what"
+    yield "  // Traffic rules of the policy. Programs apply them where messages enter the mesh; the router stops what"
     yield "  // comes from a program that does not."
-    yield from _downsampling(plan)
-    yield from _low_pass(plan)
-    yield from _priorities(plan)
+    yield from _downsampling(policy)
+    yield from _low_pass(policy)
+    yield from _priorities(policy)
 
 
-def _downsampling(plan: Plan) -> Iterator[str]:
+def _downsampling(policy: Policy) -> Iterator[str]:
     rates: dict[str, float] = {}
-    for rule in plan.traffic:
+    for rule in policy.traffic:
         if rule.max_hz is None:
             continue
-        keys = [] if rule.reliable is not None else _exact(plan, rule)
+        keys = [] if rule.reliable is not None else _exact(policy, rule)
         if not keys:
             yield f"  // max_hz of {rule.match} is left to the programs: Zenoh counts all keys of a rule as one"
         for key in keys:
@@ -258,23 +260,23 @@ def _downsampling(plan: Plan) -> Iterator[str]:
         yield f"  // {GUARD:g} times max_hz: what was a little late at its source is not lost here"
         yield '  downsampling: [{ id: "max_hz", messages: ["put"], flows: ["ingress"], rules: ['
         for key, rate in rates.items():
-            yield f"    {{ key_expr: {json.dumps(_inside(plan, key))}, freq: {GUARD * rate:g} }},"
+            yield f"    {{ key_expr: {json.dumps(_inside(policy, key))}, freq: {GUARD * rate:g} }},"
         yield "  ] }],"
 
 
-def _exact(plan: Plan, rule: TrafficRule) -> list[str]:
-    """The keys of a rule, where they are those of one topic: of one robot, or of each of the plan's."""
-    return keyexpr.of_each(rule.match, ROS, [robot.id for robot in plan.robots])
+def _exact(policy: Policy, rule: TrafficRule) -> list[str]:
+    """The keys of a rule, where they are those of one topic: of one robot, or of each of the policy's."""
+    return keyexpr.of_each(rule.match, ROS, [robot.id for robot in policy.robots])
 
 
-def _low_pass(plan: Plan) -> Iterator[str]:
+def _low_pass(policy: Policy) -> Iterator[str]:
     largest = 0
     entries = []
-    for number, rule in enumerate(plan.traffic):
+    for number, rule in enumerate(policy.traffic):
         if rule.max_bytes is not None:
             # of several rules that fit, Zenoh takes the smallest limit and programs the first: so none is smaller
             largest = max(largest, rule.max_bytes)
-            keys = json.dumps([_inside(plan, rule.match)])
+            keys = json.dumps([_inside(policy, rule.match)])
             entries.append(
                 f'    {{ id: "max_bytes {number}", messages: ["put", "query"], flows: ["ingress"], key_exprs: {keys},'
                 f" size_limit: {largest} }},"
@@ -289,10 +291,10 @@ STREAMS = keyexpr.begins(STREAM.template)
 """How the keys of robots' topics begin, and no others."""
 
 
-def _priorities(plan: Plan) -> Iterator[str]:
+def _priorities(policy: Policy) -> Iterator[str]:
     """Not of robots' topics: a robot's own rule for a topic wins over one for its key; a router would undo that."""
     entries: list[str] = []
-    given = [(number, rule) for number, rule in enumerate(plan.traffic) if rule.priority is not None]
+    given = [(number, rule) for number, rule in enumerate(policy.traffic) if rule.priority is not None]
     for number, rule in given:
         begin = keyexpr.begins(rule.match)
         if begin == STREAMS:
@@ -300,43 +302,43 @@ def _priorities(plan: Plan) -> Iterator[str]:
         elif begin is not None:
             entries.append(
                 f'    {{ id: "priority {number}", messages: ["put", "query"], flows: ["ingress"],'
-                f" key_exprs: {json.dumps([_inside(plan, rule.match)])},"
+                f" key_exprs: {json.dumps([_inside(policy, rule.match)])},"
                 f" overwrite: {{ priority: {json.dumps(rule.priority)} }} }},"
             )
         else:
             yield f"  // priorities from {rule.match} on are left to the programs: robots' topics are among its keys"
             break
     if entries:
-        yield "  // the last one that fits wins here, the first one in the plan"
+        yield "  // the last one that fits wins here, the first one in the policy"
         yield "  qos: { network: ["
         yield from reversed(entries)
         yield "  ] },"
 
 
-def _inside(plan: Plan, key: str) -> str:
-    return keyexpr.inside(plan.namespace, key)
+def _inside(policy: Policy, key: str) -> str:
+    return keyexpr.inside(policy.namespace, key)
 
 
 # -- a client ----------------------------------------------------------------------------------------------------
 
 
-def settings_toml(plan: Plan, client: Client, directory: str) -> str:
+def settings_toml(policy: Policy, client: Client, directory: str) -> str:
     """The settings of a client's programs. ``directory`` is where its certificate will be on its machine."""
     lines = [
-        f"# Settings of {client.name}, made by `macs security generate` from a plan. Change the plan, not this file.",
+        f"# Settings of {client.name}, made by `macs security generate` from a policy: change that, not this.",
         f"#   {_command(client, directory)}",
         "",
         "[mesh]",
-        f"connect = {json.dumps(plan.endpoints(client))}",
-        *([f"namespace = {json.dumps(plan.namespace)}"] if plan.namespace is not None else []),
-        *_links(plan.mesh),
+        f"connect = {json.dumps(policy.endpoints(client))}",
+        *([f"namespace = {json.dumps(policy.namespace)}"] if policy.namespace is not None else []),
+        *_links(policy.mesh),
         "# Who this is: the certificate. Whom it trusts: routers with a certificate of the same authority.",
         "overrides = [",
         *(f"  {_toml(override)}," for override in client_overrides(directory)),
         "]",
     ]
-    lines += _sections(plan, client)
-    for rule in plan.traffic:
+    lines += _sections(policy, client)
+    for rule in policy.traffic:
         lines += ["", "[[traffic]]"]
         given = msgspec.structs.asdict(rule)
         lines += [f"{name} = {json.dumps(value)}" for name, value in given.items() if value is not None]
@@ -356,7 +358,7 @@ def _command(client: Client, directory: str) -> str:
     return f"macs {verb} --settings {directory}/macs.toml"
 
 
-def _sections(plan: Plan, client: Client) -> list[str]:
+def _sections(policy: Policy, client: Client) -> list[str]:
     if isinstance(client, Gateway):
         return _gateway_section(client)
     if isinstance(client, Operator) and client.id is not None:
@@ -369,12 +371,14 @@ def _sections(plan: Plan, client: Client) -> list[str]:
     if not isinstance(client, Robot):
         return []
     lines = ["", "[robot]", f"id = {client.id}", f"group = {client.group}"]
-    commanders = [pattern for other in plan.clients if plan.may(other, "command", client) for pattern in _who(other)]
+    commanders = [
+        pattern for other in policy.clients if policy.may(other, "command", client) for pattern in _who(other)
+    ]
     lines += ["# who may command it; who may only see it registers for its topics and for nothing else"]
     lines += [f"register_allow = {json.dumps(list(dict.fromkeys(commanders)))}"]
-    lines += _believed(plan, client)
-    if client.called is not None:
-        name = json.dumps(client.called, ensure_ascii=False)
+    lines += _believed(policy, client)
+    if client.awareness_name is not None:
+        name = json.dumps(client.awareness_name, ensure_ascii=False)
         lines += ["", "[awareness]", f"name = {name}", f"id = {client.id}", "beside = true"]
     return lines
 
@@ -388,15 +392,15 @@ def _gateway_section(gateway: Gateway) -> list[str]:
     return ["", "[gateway]", *lines] if lines else []
 
 
-def _believed(plan: Plan, robot: Robot) -> list[str]:
+def _believed(policy: Policy, robot: Robot) -> list[str]:
     """Who is in which group, where a robot is told rights of a group: robots by their certificates, headsets as their
     gateways answer for it."""
     groups: dict[str, list[str]] = {}
-    for other in plan.robots:
-        if other.group and plan.related(robot, other):
+    for other in policy.robots:
+        if other.group and policy.related(robot, other):
             groups.setdefault(str(other.group), []).extend(_who(other))
-    for gateway in plan.gateways:
-        if plan.related(robot, gateway):
+    for gateway in policy.gateways:
+        if policy.related(robot, gateway):
             for group in gateway.groups:
                 groups.setdefault(group, []).extend(_who(gateway))
     if not groups:

@@ -1,4 +1,4 @@
-"""From a plan to a directory: certificates, routers' configurations, clients' settings. Run again, it changes what
+"""From a policy to a directory: certificates, routers' configurations, clients' settings. Run again, it changes what
 has to change and keeps the rest."""
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bridge.security.certificates import (
     PRIVATE_FILE,
     Issued,
 )
-from bridge.security.plan import ALL, Plan, Router
+from bridge.security.policy import ALL, Policy, Router
 from macs_zenoh.errors import UsageError
 
 ROUTER_FILE, SETTINGS_FILE = "router.json5", "macs.toml"
@@ -35,8 +35,8 @@ class Report:
     issued: list[Issued]
     written: list[Path] = field(default_factory=list)
     """Configurations and settings that are new or have changed."""
-    left_over: list[tuple[str, dt.datetime]] = field(default_factory=list)
-    """Names that are in no plan any more, and when their certificates end."""
+    orphaned: list[tuple[str, dt.datetime]] = field(default_factory=list)
+    """Names that are in no policy any more, and when their certificates end."""
 
     @property
     def routers_changed(self) -> list[str]:
@@ -47,7 +47,7 @@ class Report:
 
 
 def generate(
-    plan: Plan,
+    policy: Policy,
     into: Path,
     now: dt.datetime,
     *,
@@ -55,7 +55,7 @@ def generate(
     renew: Collection[str] = (),
     new_authority: bool = False,
 ) -> Report:
-    """Write everything that follows from a plan.
+    """Write everything that follows from a policy.
 
     Args:
         into: the directory; made if it is not there. What is in it only its owner can look into.
@@ -65,13 +65,13 @@ def generate(
         renew: names whose certificates are made anew in any case; ``all``.
         new_authority: everybody gets a certificate of a new authority; those of the old one are good for nothing.
 
-    Raises ConfigError: files there cannot be used. UsageError: a name to renew is not in the plan, or a file cannot
+    Raises ConfigError: files there cannot be used. UsageError: a name to renew is not in the policy, or a file cannot
     be written.
     """
-    names = [node.name for node in plan.nodes]
+    names = [node.name for node in policy.nodes]
     for name in renew:
         if name not in (*names, ALL):
-            raise UsageError(f"there is no {name!r} in the plan to renew")
+            raise UsageError(f"there is no {name!r} in the policy to renew")
     try:
         into.mkdir(mode=PRIVATE_DIRECTORY, parents=True, exist_ok=True)
     except OSError as error:
@@ -79,19 +79,19 @@ def generate(
     certificates.check_own(into)
     for directory in [into / CA_DIRECTORY, *(into / name for name in names)]:
         certificates.check_own(directory, *(directory / name for name in FILES))
-    authority, about_authority = certificates.authority(into, plan, now, renew=new_authority)
+    authority, about_authority = certificates.authority(into, policy, now, renew=new_authority)
     report = Report(into, about_authority, [])
-    for node in plan.nodes:
+    for node in policy.nodes:
         directory = into / node.name
         anew = node.name in renew or ALL in renew
         router = node if isinstance(node, Router) else None
-        report.issued.append(authority.issue(directory, router, plan, now, renew=anew))
+        report.issued.append(authority.issue(directory, router, policy, now, renew=anew))
         there = f"{at.rstrip('/')}/{node.name}" if at is not None else str(directory.resolve())
         if isinstance(node, Router):
-            _write(directory / ROUTER_FILE, files.router_json5(plan, node, there), report)
+            _write(directory / ROUTER_FILE, files.router_json5(policy, node, there), report)
         else:
-            _write(directory / SETTINGS_FILE, files.settings_toml(plan, node, there), report)
-    report.left_over.extend(_left_over(into, names))
+            _write(directory / SETTINGS_FILE, files.settings_toml(policy, node, there), report)
+    report.orphaned.extend(_orphaned(into, names))
     return report
 
 
@@ -106,7 +106,7 @@ def _write(path: Path, text: str, report: Report) -> None:
     report.written.append(path)
 
 
-def _left_over(into: Path, names: Collection[str]) -> list[tuple[str, dt.datetime]]:
+def _orphaned(into: Path, names: Collection[str]) -> list[tuple[str, dt.datetime]]:
     found = []
     for directory in sorted(path for path in into.iterdir() if path.is_dir()):
         if directory.name not in (*names, CA_DIRECTORY):

@@ -26,7 +26,7 @@ import zenoh
 import macs_zenoh
 from bridge.cli import build_parser
 from bridge.headset.client import Headset
-from bridge.security import plan
+from bridge.security import policy
 from bridge.security.generate import generate
 from macs_zenoh import config
 from macs_zenoh.config import MeshSettings, Settings, changed
@@ -122,8 +122,8 @@ def agree(router: zenoh.Config, program: MeshSettings) -> None:
 
 @pytest.mark.parametrize("path", PLANS, ids=ids)
 def test_both_ends_of_generated_links_agree(path: Path, tmp_path: Path) -> None:
-    """What is generated for the routers of a plan has the values of what is generated for its programs."""
-    read = plan.load(path)
+    """What is generated for the routers of a policy has the values of what is generated for its programs."""
+    read = policy.load(path)
     generate(read, tmp_path, dt.datetime.now(dt.timezone.utc))
     for router in read.routers:
         written = zenoh.Config.from_file(str(tmp_path / router.name / "router.json5"))
@@ -170,7 +170,7 @@ async def meet(headset: Headset, robot: macs_zenoh.Agent) -> None:
         await asyncio.wait([arrives], timeout=0.05)
 
 
-# -- settings and plans ------------------------------------------------------------------------------------------
+# -- settings and policies ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", SETTINGS, ids=ids)
@@ -182,7 +182,7 @@ def test_programs_accept_it(path: Path) -> None:
 @pytest.mark.parametrize("path", PLANS, ids=ids)
 def test_a_plan_is_one(path: Path) -> None:
     """`macs security generate` takes it."""
-    assert plan.load(path).routers
+    assert policy.load(path).routers
 
 
 # -- systemd -----------------------------------------------------------------------------------------------------

@@ -127,7 +127,7 @@ class Reader:
     def _copy(self, words: list[str]) -> str:
         *sources, target = words
         into = self._folder / target.rpartition(":")[2]
-        if into == self._folder / "plan.yaml":
+        if into == self._folder / "policy.yaml":
             shutil.copy(self._folder / sources[0], into)
             return ""
         into.mkdir(parents=True, exist_ok=True)

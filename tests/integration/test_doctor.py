@@ -20,7 +20,7 @@ from tests.integration.test_access_rules import RULES, USERS, credentials
 from tests.programs import ROOT, Program, free_port
 from tests.routers import Router
 
-PLAN = """\
+POLICY = """\
 routers: [{name: site, addresses: [127.0.0.1]}]
 robots: [{name: robot-7, id: 7}, {name: robot-8, id: 8}]
 gateways: [{name: hall, blocks: [1]}]
@@ -336,10 +336,11 @@ async def test_a_wrong_password(guarded: Router) -> None:
 async def test_what_a_plan_gives(tmp_path: Path) -> None:
     """With the files of `macs security generate` robot, gateway and operator may do their work, by mutual TLS; with a
     robot's file another robot is refused, and the operator measures everything."""
-    plan = tmp_path / "plan.yaml"
-    plan.write_text(PLAN)
+    policy = tmp_path / "policy.yaml"
+    policy.write_text(POLICY)
     made = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "bridge", "security", "generate", str(plan), "--into", str(tmp_path / "pki")), cwd=ROOT
+        *(sys.executable, "-m", "bridge", "security", "generate", str(policy), "--into", str(tmp_path / "pki")),
+        cwd=ROOT,
     )
     assert await made.wait() == 0
     endpoint = f"tls/127.0.0.1:{free_port()}"

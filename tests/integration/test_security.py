@@ -1,4 +1,4 @@
-"""A plan on real routers with mutual TLS: who gets in, who may what, and whether `macs security check` notices."""
+"""A policy on real routers with mutual TLS: who gets in, who may what, and whether `macs security check` notices."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ import pytest
 import macs_zenoh
 from bridge.gateway import Gateway
 from bridge.headset.client import Headset
-from bridge.security import certificates, plan
-from bridge.security.check import Result, check
+from bridge.security import certificates, policy
+from bridge.security.attempts import Result
+from bridge.security.check import check
 from bridge.security.files import client_overrides
 from bridge.security.generate import generate
-from bridge.security.plan import Plan
+from bridge.security.policy import Policy
 from macs_zenoh import awareness, config
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import NotServed, Refused, Unreachable
@@ -41,9 +42,9 @@ NOW = dt.datetime.now(dt.timezone.utc)
 
 CLIENTS = """
 robots:
-  - {name: robot-7, id: 7, group: 3, called: drone7}
-  - {name: robot-8, id: 8, group: 3, called: drone8}
-  - {name: robot-9, id: 9, called: drone9}
+  - {name: robot-7, id: 7, group: 3, awareness_name: drone7}
+  - {name: robot-8, id: 8, group: 3, awareness_name: drone8}
+  - {name: robot-9, id: 9, awareness_name: drone9}
 gateways:
   - {name: hall-1, blocks: [1]}
   - {name: hall-2, blocks: [2]}
@@ -61,9 +62,9 @@ permissions:
 
 @dataclass
 class Site:
-    """A plan, its files, and where its first router is."""
+    """A policy, its files, and where its first router is."""
 
-    plan: Plan
+    policy: Policy
     directory: Path
 
     def settings(self, name: str) -> MeshSettings:
@@ -83,11 +84,11 @@ class Site:
             yield mesh
 
     def router(self, name: str) -> list[str]:
-        return next(router for router in self.plan.routers if router.name == name).dialled
+        return next(router for router in self.policy.routers if router.name == name).dialled
 
     async def wrong(self, endpoints: list[str] | None = None) -> list[Result]:
         """What the check finds."""
-        return [one for one in await check(self.plan, self.directory, endpoints) if not one.as_planned]
+        return [one for one in await check(self.policy, self.directory, endpoints) if not one.as_expected]
 
 
 def made(directory: Path, clients: str = CLIENTS, routers: int = 1) -> Site:
@@ -96,7 +97,7 @@ def made(directory: Path, clients: str = CLIENTS, routers: int = 1) -> Site:
     if routers == 2:
         listen = f"tls/127.0.0.1:{free_port()}"
         lines.append(f"  - {{name: cloud, addresses: [127.0.0.1], listen: ['{listen}'], links: [site]}}")
-    read = plan.parse("\n".join(["routers:", *lines]) + clients)
+    read = policy.parse("\n".join(["routers:", *lines]) + clients)
     generate(read, directory, NOW)
     return Site(read, directory)
 
@@ -153,7 +154,7 @@ PUTS = [
 
 async def test_puts_and_subscriptions_by_role(site: Site) -> None:
     """Between each pair of roles what is permitted arrives; what is put or subscribed to without a right does not."""
-    names = [client.name for client in site.plan.clients]
+    names = [client.name for client in site.policy.clients]
     async with AsyncExitStack() as stack:
         hears = {name: await stack.enter_async_context(site.session(name)) for name in names}
         says = {name: await stack.enter_async_context(site.session(name)) for name in names}
@@ -211,7 +212,7 @@ async def test_queries_by_role(site: Site) -> None:
     """Between each pair of roles what may be asked is answered by whom it concerns, and nothing else is."""
     async with AsyncExitStack() as stack:
         meshes = {
-            client.name: await stack.enter_async_context(site.session(client.name)) for client in site.plan.clients
+            client.name: await stack.enter_async_context(site.session(client.name)) for client in site.policy.clients
         }
 
         async def answer(key: str, payload: bytes) -> bytes:
@@ -285,7 +286,7 @@ TOKENS = [
 
 async def test_presence_by_role(site: Site) -> None:
     """Each is online as itself only, and seen by those who have to do with it, and by operators."""
-    names = [client.name for client in site.plan.clients]
+    names = [client.name for client in site.policy.clients]
     async with AsyncExitStack() as stack:
         watches = {name: await stack.enter_async_context(site.session(name)) for name in names}
         declares = {name: await stack.enter_async_context(site.session(name)) for name in names}
@@ -310,7 +311,7 @@ async def test_presence_by_role(site: Site) -> None:
 async def test_wildcards_get_round_nothing(site: Site) -> None:
     """Putting to several keys at once, or subscribing to more than is one's own, reaches nobody and hears nothing."""
     async with AsyncExitStack() as stack:
-        names = [client.name for client in site.plan.clients]
+        names = [client.name for client in site.policy.clients]
         hears = {name: await stack.enter_async_context(site.session(name)) for name in names}
         says = {name: await stack.enter_async_context(site.session(name)) for name in names}
         robot = listening(hears["robot-9"], "macs/to/ros/0/9/**")
@@ -379,9 +380,9 @@ def online(agent: macs_zenoh.Agent) -> set[tuple[str, int]]:
 async def test_who_is_not_of_this_mesh_is_not_let_in(site: Site, tmp_path: Path) -> None:
     """A certificate that has expired, that another authority made, or none at all, gets no session; nor does TCP."""
     past = NOW - dt.timedelta(days=200)
-    authority, _ = certificates.authority(site.directory, site.plan, NOW)
-    authority.issue(tmp_path / "expired" / "robot-7", None, site.plan, past, renew=False)
-    generate(site.plan, tmp_path / "foreign", NOW)
+    authority, _ = certificates.authority(site.directory, site.policy, NOW)
+    authority.issue(tmp_path / "expired" / "robot-7", None, site.policy, past, renew=False)
+    generate(site.policy, tmp_path / "foreign", NOW)
     ours = site.directory / "robot-7" / "ca.pem"
     (tmp_path / "foreign" / "robot-7" / "ca.pem").write_bytes(ours.read_bytes())
     endpoint = site.router("site")[0]
@@ -449,30 +450,30 @@ async def test_a_client_that_says_it_is_a_router_may_no_more(site: Site) -> None
 
 async def test_a_link_ends_with_its_certificate(site: Site) -> None:
     """A session whose certificate expires is cut off, and is back with a renewed one without being started again."""
-    short = plan.parse(
+    short = policy.parse(
         "routers: [{name: site, addresses: [127.0.0.1]}]\nrobots: [{name: robot-7, id: 7}]\ncertificates: {days: 1}\n"
     )
-    authority, _ = certificates.authority(site.directory, site.plan, NOW)
+    authority, _ = certificates.authority(site.directory, site.policy, NOW)
     ends_in = dt.timedelta(seconds=4)
     soon = dt.datetime.now(dt.timezone.utc) - dt.timedelta(days=1) + ends_in
     authority.issue(site.directory / "robot-7", None, short, soon, renew=True)
     async with site.session("robot-7") as mesh:
         await until(lambda: not mesh.linked, 20)
-        authority.issue(site.directory / "robot-7", None, site.plan, NOW, renew=True)
+        authority.issue(site.directory / "robot-7", None, site.policy, NOW, renew=True)
         await until(lambda: mesh.linked, 10)
 
 
 async def test_who_left_the_plan_may_nothing(tmp_path: Path) -> None:
-    """After the plan lost a robot and the router has its new file, the old certificate is good for nothing; another
+    """After the policy lost a robot and the router has its new file, the old certificate is good for nothing; another
     robot has its id."""
     found = made(tmp_path / "pki")
     text = CLIENTS.replace("robot-7, id", "robot-7b, id").replace("whom: robot-7}", "whom: robot-7b}")
     listen = f"routers: [{{name: site, addresses: [127.0.0.1], listen: ['{found.router('site')[0]}']}}]"
-    without = plan.parse(
+    without = policy.parse(
         listen + text.replace("[robot-7, robot-8]", "[robot-7b, robot-8]").replace("who: robot-7,", "who: robot-7b,")
     )
     report = generate(without, found.directory, NOW)
-    assert [name for name, _ in report.left_over] == ["robot-7"]
+    assert [name for name, _ in report.orphaned] == ["robot-7"]
     after = Site(without, found.directory)
     async with Router(after.file()), after.session("robot-7") as thief, after.session("anna") as anna:
         heard = [listening(thief, key) for key in ("macs/to/ros/0/7/**", "macs/all/**")]
@@ -498,9 +499,9 @@ async def test_who_left_the_plan_may_nothing(tmp_path: Path) -> None:
 
 
 async def test_a_generated_router_holds_everybody_to_the_plan(site: Site) -> None:
-    """Tried with every certificate on the real router: everything is as planned, permitted and forbidden alike."""
-    results = await check(site.plan, site.directory)
-    assert [result for result in results if not result.as_planned] == []
+    """Tried with every certificate on the real router: everything is as expected, permitted and forbidden alike."""
+    results = await check(site.policy, site.directory)
+    assert [result for result in results if not result.as_expected] == []
     for word in ("heard by", "is online", "calls", "delivers to"):
         assert {result.permitted for result in results if word in result.what} == {True, False}, word
 
@@ -517,9 +518,9 @@ async def test_across_two_routers(tmp_path: Path) -> None:
     found = made(tmp_path / "pki", routers=2)
     async with Router(found.file("site")), Router(found.file("cloud")):
         await linked(found)
-        results = await check(found.plan, found.directory)
+        results = await check(found.policy, found.directory)
     assert {result.router for result in results} == {"site", "cloud", "site to cloud", "cloud to site"}
-    assert [result for result in results if not result.as_planned] == []
+    assert [result for result in results if not result.as_expected] == []
 
 
 async def linked(found: Site) -> None:
@@ -532,10 +533,10 @@ async def linked(found: Site) -> None:
 
 
 async def test_gateways_without_blocks_and_a_namespace(tmp_path: Path) -> None:
-    """The shortest plan, within a namespace, is held to as well."""
+    """The shortest policy, within a namespace, is held to as well."""
     found = made(
         tmp_path / "pki",
-        "\nrobots: [{name: r, id: 7, called: drone7}, {name: s, id: 300, called: drone8}]\n"
+        "\nrobots: [{name: r, id: 7, awareness_name: drone7}, {name: s, id: 300, awareness_name: drone8}]\n"
         "gateways: [{name: hall}, {name: lab}]\noperators: [{name: anna}, {name: berta, id: 5}]\n"
         "permissions: [{who: all, may: all, whom: all}]\nnamespace: site1\n",
     )
@@ -846,12 +847,12 @@ async def test_an_operator_who_may_not_stop_hears_which_right_is_missing(tmp_pat
             1,
             "robot 7 is NOT stopped: access rules do not let operator/0 call its verb stop",
         )
-        assert "a plan gives it by `may: call` with `verbs: [stop]`" in out
+        assert "a policy gives it by `may: call` with `verbs: [stop]`" in out
 
 
 def test_the_shipped_wan_plan_has_an_operator_who_may_stop() -> None:
     """Somebody who looks at robots from wherever can stop them, and can do no more to them."""
-    wan = plan.load(ROOT / "config" / "wan" / "plan.yaml")
+    wan = policy.load(ROOT / "config" / "wan" / "policy.yaml")
     (anna,) = wan.operators
     for robot in wan.robots:
         verbs = wan.verbs(anna, robot)
@@ -920,13 +921,13 @@ async def test_a_check_that_was_stopped_is_none_that_went_well(how: signal.Signa
     """Ctrl-C or SIGTERM in the middle of a check ends it with 130."""
     found = made(tmp_path / "pki")
     listen = found.router("site")[0]
-    (tmp_path / "plan.yaml").write_text(
+    (tmp_path / "policy.yaml").write_text(
         f"routers: [{{name: site, addresses: [127.0.0.1], listen: ['{listen}']}}]" + CLIENTS
     )
     with socket.create_server(("127.0.0.1", int(listen.rpartition(":")[2]))) as says_nothing:
         says_nothing.setblocking(False)
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "bridge", "security", "check", str(tmp_path / "plan.yaml")),
+            *(sys.executable, "-m", "bridge", "security", "check", str(tmp_path / "policy.yaml")),
             *("--dir", str(found.directory)),
             cwd=ROOT,
             stdout=asyncio.subprocess.DEVNULL,
@@ -942,7 +943,7 @@ async def test_a_check_without_a_router_gives_up(tmp_path: Path) -> None:
     """Where nobody listens, a check ends after its time with one line, however many sessions it would have made."""
     found = made(tmp_path / "pki")
     nowhere = found.router("site")[0]
-    plan_file = tmp_path / "plan.yaml"
+    plan_file = tmp_path / "policy.yaml"
     plan_file.write_text(f"routers: [{{name: site, addresses: [127.0.0.1], listen: ['{nowhere}']}}]" + CLIENTS)
     began = time.monotonic()
     code, out, errors = await run(
@@ -957,25 +958,27 @@ async def test_the_command_generates_and_checks(tmp_path: Path) -> None:
     """`macs security generate` says what it made, `check` whether it holds; the exit code says it to programs."""
     found = made(tmp_path / "unused")
     routers = f"routers: [{{name: site, addresses: [127.0.0.1], listen: ['{found.router('site')[0]}']}}]"
-    (tmp_path / "plan.yaml").write_text(routers + CLIENTS)
+    (tmp_path / "policy.yaml").write_text(routers + CLIENTS)
     pki = str(tmp_path / "pki")
-    code, out, _ = await run("security", "generate", str(tmp_path / "plan.yaml"), "--into", pki)
+    code, out, _ = await run("security", "generate", str(tmp_path / "policy.yaml"), "--into", pki)
     assert code == 0
     assert "7 certificates made, 0 kept, 7 files written" in out
-    told = await macs("security", "generate", str(tmp_path / "plan.yaml"), "--into", pki, "--renew", "anna", "--json")
+    told = await macs(
+        "security", "generate", str(tmp_path / "policy.yaml"), "--into", pki, "--renew", "anna", "--json"
+    )
     assert [one["name"] for one in told["certificates"] if one["made"]] == ["anna"]
     assert (told["written"], told["restart"]) == ([], [])
 
-    code, out, errors = await run("security", "check", str(tmp_path / "plan.yaml"), "--dir", pki)
+    code, out, errors = await run("security", "check", str(tmp_path / "policy.yaml"), "--dir", pki)
     assert (code, out) == (1, "")
     assert "nobody listens there" in errors
     async with Router(tmp_path / "pki" / "site" / "router.json5"):
-        code, out, _ = await run("security", "check", str(tmp_path / "plan.yaml"), "--dir", pki)
+        code, out, _ = await run("security", "check", str(tmp_path / "policy.yaml"), "--dir", pki)
         assert code == 0, out
         assert out.endswith(" 0 not\n")
-        results = await macs("security", "check", str(tmp_path / "plan.yaml"), "--dir", pki, "--json")
-        assert all(result["as_planned"] for result in results)
-    (tmp_path / "plan.yaml").write_text(routers + CLIENTS.replace("robot-7, id", "robot-7, idd"))
-    code, _, errors = await run("security", "generate", str(tmp_path / "plan.yaml"), "--into", pki)
+        results = await macs("security", "check", str(tmp_path / "policy.yaml"), "--dir", pki, "--json")
+        assert all(result["as_expected"] for result in results)
+    (tmp_path / "policy.yaml").write_text(routers + CLIENTS.replace("robot-7, id", "robot-7, idd"))
+    code, _, errors = await run("security", "generate", str(tmp_path / "policy.yaml"), "--into", pki)
     assert code == 2
     assert "did you mean `id`?" in errors

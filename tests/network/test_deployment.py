@@ -1,4 +1,4 @@
-"""config/wan as shipped, behind two NATs: what `macs security generate` makes of its plan, on hosts of its own."""
+"""config/wan as shipped, behind two NATs: what `macs security generate` makes of its policy, on hosts of its own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bridge.security import plan
+from bridge.security import policy
 from bridge.security.generate import generate
 from tests.network.hosts import Network
 from tests.network.inside import Inside
@@ -40,9 +40,9 @@ async def test_a_robot_behind_nat_is_driven_from_behind_another(network: Network
         nat.default_route(cloud)
     cloud.ip("addr", "add", f"{CLOUD}/32", "dev", "lo")
 
-    text = (WAN / "plan.yaml").read_text(encoding="utf-8")
+    text = (WAN / "policy.yaml").read_text(encoding="utf-8")
     text = text.replace("cloud.example.org", CLOUD).replace("192.168.1.10", site.address_towards(robot))
-    generate(plan.parse(text), tmp_path, dt.datetime.now(dt.timezone.utc))
+    generate(policy.parse(text), tmp_path, dt.datetime.now(dt.timezone.utc))
 
     async with AsyncExitStack() as stack:
         for name in ("cloud", "site"):

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 from msgspec.structs import asdict
 
-from bridge.security.plan import load
+from bridge.security.policy import load
 from macs_zenoh.config import MeshSettings, changed
 from tests.network.hosts import Host, Network
 from tests.network.inside import Inside, lost, median_ms, quantile
@@ -44,7 +44,7 @@ LARGE_BYTES = 5_000_000
 
 WAN = ROOT / "config" / "wan"
 """What is shipped for such networks, with reasons: its values are those that are measured here."""
-MESH = load(WAN / "plan.yaml").mesh
+MESH = load(WAN / "policy.yaml").mesh
 ROUTER = [
     f"{path}:{json5}"
     for path, json5, _ in changed(MESH, mode="router").zenoh()

@@ -480,13 +480,13 @@ sys.exit(2 if len(marks.read_text()) == 3 else 1)
     ("argv", "missing", "extra"),
     [
         (["headset", "127.0.0.1", "sub", "/t", "std_msgs/String"], "rosbags", "headset"),
-        (["security", "generate", "plan.yaml", "--into", "somewhere"], "yaml", "security"),
-        (["security", "generate", "plan.yaml", "--into", "somewhere"], "cryptography", "security"),
+        (["security", "generate", "policy.yaml", "--into", "somewhere"], "yaml", "security"),
+        (["security", "generate", "policy.yaml", "--into", "somewhere"], "cryptography", "security"),
     ],
 )
 def test_a_missing_extra_is_exit_code_1(argv: list[str], missing: str, extra: str, tmp_path: Path) -> None:
     """What is not installed is told once, with what to install, by whichever verb needs it."""
-    (tmp_path / "plan.yaml").write_text("{}")
+    (tmp_path / "policy.yaml").write_text("{}")
     code = (
         "import sys; from importlib.abc import MetaPathFinder\n"
         "class Hidden(MetaPathFinder):\n"

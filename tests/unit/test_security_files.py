@@ -1,4 +1,4 @@
-"""What follows from a plan: rules, routers' configurations, settings, certificates."""
+"""What follows from a policy: rules, routers' configurations, settings, certificates."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import zenoh
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from bridge.security import access, files, plan
-from bridge.security.check import settings_of
+from bridge.security import access, files, policy
 from bridge.security.generate import generate
-from bridge.security.plan import Plan
+from bridge.security.policy import Policy
+from bridge.security.router_path import settings_of
 from macs_zenoh import config
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, UsageError
@@ -32,8 +32,8 @@ routers:
   - {name: site, addresses: [site.example.org, 10.0.0.5]}
   - {name: cloud, addresses: [cloud.example.org], links: [site]}
 robots:
-  - {name: robot-7, id: 7, group: 3, called: "drone 7"}
-  - {name: robot-8, id: 300, group: 3, called: drone8}
+  - {name: robot-7, id: 7, group: 3, awareness_name: "drone 7"}
+  - {name: robot-8, id: 300, group: 3, awareness_name: drone8}
 gateways:
   - {name: hall-1, blocks: [1]}
   - {name: hall-2, blocks: [2]}
@@ -47,11 +47,11 @@ permissions:
 """
 
 
-SITE = plan.parse(TEXT)
+SITE = policy.parse(TEXT)
 
 
 @pytest.fixture
-def site() -> Plan:
+def site() -> Policy:
     return SITE
 
 
@@ -70,7 +70,7 @@ def may(name: str, message: str, flow: str, key: str) -> bool:
 # -- rules ---------------------------------------------------------------------------------------------------------
 
 
-def test_every_key_of_every_rule_is_one_for_zenoh(site: Plan) -> None:
+def test_every_key_of_every_rule_is_one_for_zenoh(site: Policy) -> None:
     """Rules have canonical key expressions, each once."""
     for client in site.clients:
         for rule in access.rules(site, client):
@@ -134,7 +134,7 @@ def test_presence_is_seen_by_who_has_to_do_with_it() -> None:
     assert may("anna", "liveliness_token", "egress", "macs/live/ros/300/3/a1")
 
 
-def test_only_what_a_node_may_hear_is_in_its_rules(site: Plan) -> None:
+def test_only_what_a_node_may_hear_is_in_its_rules(site: Policy) -> None:
     """Nobody may subscribe to what belongs to others, nor to everything."""
     for client in site.clients:
         for key in ("macs/**", "**", "macs/to/**", "macs/from/**", "macs/ca/to/**", "macs/call/**"):
@@ -144,7 +144,7 @@ def test_only_what_a_node_may_hear_is_in_its_rules(site: Plan) -> None:
 
 def test_a_namespace_is_before_every_key_but_the_routers_own() -> None:
     """Rules are for keys as the router sees them."""
-    inside = plan.parse(TEXT + "namespace: site1/hall\n")
+    inside = policy.parse(TEXT + "namespace: site1/hall\n")
     keys = [key for client in inside.clients for rule in access.rules(inside, client) for key in rule.keys]
     keys += [key for rule in access.link_rules(inside) for key in rule.keys]
     assert {key.partition("/macs/")[0] for key in keys if not key.startswith("@")} == {"site1/hall"}
@@ -154,14 +154,14 @@ def test_a_namespace_is_before_every_key_but_the_routers_own() -> None:
 # -- a router's file -------------------------------------------------------------------------------------------------
 
 
-def loaded(found: Plan, name: str, tmp_path: Path) -> Any:
+def loaded(found: Policy, name: str, tmp_path: Path) -> Any:
     path = tmp_path / "router.json5"
     router = next(router for router in found.routers if router.name == name)
     path.write_text(files.router_json5(found, router, "/etc/macs/" + name))
     return zenoh.Config.from_file(str(path))
 
 
-def test_a_router_has_our_values(site: Plan, tmp_path: Path) -> None:
+def test_a_router_has_our_values(site: Policy, tmp_path: Path) -> None:
     """Everything that `macs router` would set is in the file, with the same values."""
     conf = loaded(site, "cloud", tmp_path)
     ours = MeshSettings(mode="router", listen=["tls/[::]:7447"], connect=["tls/site.example.org:7447"])
@@ -188,15 +188,15 @@ def test_a_router_has_our_values(site: Plan, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", sorted((ROOT / "config" / "security").glob("*.yaml")), ids=lambda path: path.name)
 def test_the_shipped_plans_make_files_that_load(path: Path, tmp_path: Path) -> None:
-    """Zenoh takes the routers' files of each shipped plan, and our programs take the settings."""
-    shipped = plan.load(path)
+    """Zenoh takes the routers' files of each shipped policy, and our programs take the settings."""
+    shipped = policy.load(path)
     for router in shipped.routers:
         assert json.loads(loaded(shipped, router.name, tmp_path).get_json("access_control/enabled")) is True
     for client in shipped.clients:
         assert config.parse(files.settings_toml(shipped, client, "/etc/macs")).mesh.connect
 
 
-def test_the_rules_in_the_file_are_the_rules(site: Plan, tmp_path: Path) -> None:
+def test_the_rules_in_the_file_are_the_rules(site: Policy, tmp_path: Path) -> None:
     """Each client's rules are in the file whole, and in its policy, and in nobody else's."""
     control = json.loads(loaded(site, "site", tmp_path).get_json("access_control"))
     rules = {rule["id"]: rule for rule in control["rules"]}
@@ -210,7 +210,7 @@ def test_the_rules_in_the_file_are_the_rules(site: Plan, tmp_path: Path) -> None
     assert list(rules) == ["cloud carries everything"]
 
 
-def test_no_line_is_long(site: Plan) -> None:
+def test_no_line_is_long(site: Policy) -> None:
     """The file can be read: keys are wrapped, and each node has a line that says who it is."""
     text = files.router_json5(site, site.routers[0], "/etc/macs/site")
     assert max(map(len, text.splitlines())) <= 140
@@ -231,7 +231,7 @@ traffic:
 
 def test_traffic_rules_are_a_guard_in_the_router(tmp_path: Path) -> None:
     """What Zenoh can say of the traffic rules is in the file, never stricter than where messages enter the mesh."""
-    conf = loaded(plan.parse(TEXT + TRAFFIC), "site", tmp_path)
+    conf = loaded(policy.parse(TEXT + TRAFFIC), "site", tmp_path)
     (rates,) = json.loads(conf.get_json("downsampling"))
     assert rates["flows"] == ["ingress"]
     assert {rule["key_expr"]: rule["freq"] for rule in rates["rules"]} == {
@@ -254,7 +254,7 @@ def test_a_router_leaves_the_priorities_of_topics_to_robots(tmp_path: Path) -> N
     """A robot's own rule for a topic wins over a traffic rule for its key, so no router may change it again; behind a
     rule that holds for topics and others alike nothing is exported, because there the last one would win."""
     text = TEXT + TRAFFIC.replace("macs/to/ros/**", "macs/**")
-    conf = loaded(plan.parse(text), "site", tmp_path)
+    conf = loaded(policy.parse(text), "site", tmp_path)
     assert not json.loads(conf.get_json("qos/network"))
     written = (tmp_path / "router.json5").read_text()
     assert "priority of macs/from/ros/7/** is left to the programs" in written
@@ -266,7 +266,7 @@ def test_a_router_leaves_the_priorities_of_topics_to_robots(tmp_path: Path) -> N
 
 def test_settings_say_who_somebody_is() -> None:
     """A client's settings have routers in order, its certificate, and what it is on the mesh."""
-    found = plan.parse(TEXT + TRAFFIC + "namespace: site1\n")
+    found = policy.parse(TEXT + TRAFFIC + "namespace: site1\n")
     made = {client.name: config.parse(files.settings_toml(found, client, "/etc/macs")) for client in found.clients}
     robot = made["robot-7"]
     assert robot.mesh.connect == ["tls/site.example.org:7447", "tls/cloud.example.org:7447"]
@@ -279,7 +279,7 @@ def test_settings_say_who_somebody_is() -> None:
     assert made["hall-2"].gateway.blocks == [2]
     assert robot.traffic == found.traffic
     assert made["anna"].operator.id is None
-    numbered = plan.parse((TEXT + TRAFFIC).replace("{name: anna}", "{name: anna, id: 5}"))
+    numbered = policy.parse((TEXT + TRAFFIC).replace("{name: anna}", "{name: anna, id: 5}"))
     anna = next(client for client in numbered.clients if client.name == "anna")
     assert config.parse(files.settings_toml(numbered, anna, "/etc/macs")).operator.id == 5
 
@@ -288,20 +288,20 @@ def test_groups_are_believed_of_those_who_are_answered_for() -> None:
     """Where a gateway says from where a group may be chosen, robots that have to do with it believe its headsets;
     robots are in the group that their certificate is for."""
     text = TEXT.replace("blocks: [1]", "blocks: [1], groups: {'9': [10.0.3.0/24]}")
-    found = plan.parse(text)
+    found = policy.parse(text)
     made = {client.name: config.parse(files.settings_toml(found, client, "/x")) for client in found.clients}
     assert made["hall-1"].gateway.groups == {"9": ["10.0.3.0/24"]}
     assert made["hall-2"].gateway.groups == {}
     assert made["robot-7"].robot.groups["9"] == ["block/1"]
     with pytest.raises(ConfigError, match=r"gateways: hall-1\.groups\.9.*is not a network"):
-        plan.parse(text.replace("10.0.3.0/24", "somewhere"))
+        policy.parse(text.replace("10.0.3.0/24", "somewhere"))
 
 
 def test_a_robot_knows_who_may_command_it() -> None:
     """What somebody registers for is in a payload, where no router sees it, so the robot's settings say who may."""
     text = TEXT.replace("{name: anna}", "{name: anna, id: 5}\n  - {name: berta}").replace(", blocks: [1]", "")
     text = text.replace(", blocks: [2]", "").partition("permissions:")[0]
-    found = plan.parse(text + "permissions: [{who: [gateways, robot-8, operators], may: command, whom: robot-7}]")
+    found = policy.parse(text + "permissions: [{who: [gateways, robot-8, operators], may: command, whom: robot-7}]")
     first, second = (config.parse(files.settings_toml(found, robot, "/x")).robot for robot in found.robots)
     assert sorted(first.register_allow) == ["operator/0", "operator/5", "ros/300", "unity"]
     assert second.register_allow == []
@@ -309,7 +309,7 @@ def test_a_robot_knows_who_may_command_it() -> None:
 
 def test_names_with_quotes_and_spaces_survive() -> None:
     """Whatever a robot is called and wherever its files are, its settings say so."""
-    found = plan.parse(TEXT.replace('"drone 7"', """'d"r\\o''né 7'"""))
+    found = policy.parse(TEXT.replace('"drone 7"', """'d"r\\o''né 7'"""))
     made = config.parse(files.settings_toml(found, found.robots[0], "/etc/it's macs/ß"))
     assert made.awareness.name == "d\"r\\o'né 7"
     assert made.mesh.overrides[0] == 'transport/link/tls/root_ca_certificate:"/etc/it\'s macs/\\u00df/ca.pem"'
@@ -317,7 +317,7 @@ def test_names_with_quotes_and_spaces_survive() -> None:
 
 def test_the_check_has_the_links_of_the_plan(tmp_path: Path) -> None:
     """Sessions of the check wait as long as everybody's on this mesh, so that a slow link is not cut and misread."""
-    slow = plan.parse(TEXT + "namespace: site1\nmesh: {lease_ms: 10000, block_limit_ms: 5000}\n")
+    slow = policy.parse(TEXT + "namespace: site1\nmesh: {lease_ms: 10000, block_limit_ms: 5000}\n")
     made = settings_of(slow, tmp_path, "tls/cloud.example.org:7447")
     assert (made.lease_ms, made.block_limit_ms, made.namespace) == (10000, 5000, "site1")
     assert made.connect == ["tls/cloud.example.org:7447"]
@@ -331,7 +331,7 @@ def certificate(directory: Path) -> x509.Certificate:
     return x509.load_pem_x509_certificate((directory / "cert.pem").read_bytes())
 
 
-def test_a_certificate_says_who_and_for_what(site: Plan, tmp_path: Path) -> None:
+def test_a_certificate_says_who_and_for_what(site: Policy, tmp_path: Path) -> None:
     """The common name is the node's; only routers may be servers, under their addresses."""
     generate(site, tmp_path, NOW)
     for node in site.nodes:
@@ -345,7 +345,7 @@ def test_a_certificate_says_who_and_for_what(site: Plan, tmp_path: Path) -> None
     assert [str(name.value) for name in names] == ["site.example.org", "10.0.0.5"]
 
 
-def test_keys_are_for_their_owner_only(site: Plan, tmp_path: Path) -> None:
+def test_keys_are_for_their_owner_only(site: Policy, tmp_path: Path) -> None:
     """Whatever the umask: directories 0700; keys, routers' files and settings 0600."""
     before = os.umask(0)
     try:
@@ -360,7 +360,7 @@ def test_keys_are_for_their_owner_only(site: Plan, tmp_path: Path) -> None:
             assert mode == (0o644 if path.name in ("cert.pem", "ca.pem") else 0o600), path
 
 
-def test_a_directory_that_is_there_stays_as_it_is(site: Plan, tmp_path: Path) -> None:
+def test_a_directory_that_is_there_stays_as_it_is(site: Policy, tmp_path: Path) -> None:
     """Only what is made is closed to others, not the directory that somebody had already."""
     tmp_path.chmod(0o755)
     generate(site, tmp_path, NOW)
@@ -372,8 +372,8 @@ def contents(directory: Path) -> dict[str, bytes]:
     return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 
 
-def test_a_second_run_changes_nothing(site: Plan, tmp_path: Path) -> None:
-    """While certificates are good and the plan is the same, every file stays as it is."""
+def test_a_second_run_changes_nothing(site: Policy, tmp_path: Path) -> None:
+    """While certificates are good and the policy is the same, every file stays as it is."""
     generate(site, tmp_path, NOW)
     before = contents(tmp_path)
     report = generate(site, tmp_path, NOW + 59 * DAY)
@@ -383,7 +383,7 @@ def test_a_second_run_changes_nothing(site: Plan, tmp_path: Path) -> None:
     assert not report.routers_changed
 
 
-def test_what_is_about_to_end_is_renewed(site: Plan, tmp_path: Path) -> None:
+def test_what_is_about_to_end_is_renewed(site: Policy, tmp_path: Path) -> None:
     """With less than a third of its life left, or when it is asked for, a certificate and its key are made anew."""
     generate(site, tmp_path, NOW)
     before = contents(tmp_path)
@@ -400,13 +400,13 @@ def test_what_is_about_to_end_is_renewed(site: Plan, tmp_path: Path) -> None:
     assert certificate(tmp_path / "hall-1").not_valid_after_utc == NOW + 152 * DAY
 
 
-def test_what_does_not_fit_is_renewed(site: Plan, tmp_path: Path) -> None:
+def test_what_does_not_fit_is_renewed(site: Policy, tmp_path: Path) -> None:
     """A router with other addresses, a lost key and a broken certificate are made anew; nothing else."""
     generate(site, tmp_path, NOW)
     (tmp_path / "robot-7" / "key.pem").write_bytes((tmp_path / "robot-8" / "key.pem").read_bytes())
     (tmp_path / "hall-1" / "key.pem").unlink()
     (tmp_path / "hall-2" / "cert.pem").write_text("broken")
-    moved = plan.parse(TEXT.replace("10.0.0.5", "10.0.0.6"))
+    moved = policy.parse(TEXT.replace("10.0.0.5", "10.0.0.6"))
     report = generate(moved, tmp_path, NOW + DAY)
     assert {one.name: one.why for one in report.issued if one.why} == {
         "site": "other addresses",
@@ -416,16 +416,16 @@ def test_what_does_not_fit_is_renewed(site: Plan, tmp_path: Path) -> None:
     }
 
 
-def test_a_directory_under_another_name_gets_a_certificate_of_its_own(site: Plan, tmp_path: Path) -> None:
+def test_a_directory_under_another_name_gets_a_certificate_of_its_own(site: Policy, tmp_path: Path) -> None:
     """What was moved or copied says who it was, which no rule knows under the new name: it is made anew."""
     generate(site, tmp_path, NOW)
     (tmp_path / "robot-7").rename(tmp_path / "robot-7b")
-    report = generate(plan.parse(TEXT.replace("robot-7", "robot-7b")), tmp_path, NOW + DAY)
+    report = generate(policy.parse(TEXT.replace("robot-7", "robot-7b")), tmp_path, NOW + DAY)
     assert {one.name: one.why for one in report.issued if one.why} == {"robot-7b": "other name"}
     assert [name.value for name in certificate(tmp_path / "robot-7b").subject] == ["robot-7b"]
 
 
-def test_a_new_authority_ends_all_certificates(site: Plan, tmp_path: Path) -> None:
+def test_a_new_authority_ends_all_certificates(site: Policy, tmp_path: Path) -> None:
     """With a new authority everybody gets a new certificate and trusts the new one only."""
     generate(site, tmp_path, NOW)
     before = contents(tmp_path)
@@ -436,29 +436,29 @@ def test_a_new_authority_ends_all_certificates(site: Plan, tmp_path: Path) -> No
     assert {after[name] for name in after if name.endswith("ca.pem")} == {after["ca/ca.pem"]}
 
 
-def test_who_left_the_plan_is_named_and_in_no_rule(site: Plan, tmp_path: Path) -> None:
-    """A name that is no longer in the plan is reported, its files stay, and routers do not know it any more."""
+def test_who_left_the_plan_is_named_and_in_no_rule(site: Policy, tmp_path: Path) -> None:
+    """A name that is no longer in the policy is reported, its files stay, and routers do not know it any more."""
     generate(site, tmp_path, NOW)
-    fewer = plan.parse(
-        TEXT.replace("  - {name: robot-8, id: 300, group: 3, called: drone8}\n", "").replace(
+    fewer = policy.parse(
+        TEXT.replace("  - {name: robot-8, id: 300, group: 3, awareness_name: drone8}\n", "").replace(
             "  - {who: robot-7, may: message, whom: robot-8}\n", ""
         )
     )
     report = generate(fewer, tmp_path, NOW + DAY)
-    assert report.left_over == [("robot-8", NOW + 90 * DAY)]
+    assert report.orphaned == [("robot-8", NOW + 90 * DAY)]
     assert report.routers_changed == ["cloud", "site"]
     assert (tmp_path / "robot-8" / "cert.pem").exists()
     assert "robot-8" not in (tmp_path / "site" / "router.json5").read_text()
 
 
-def test_no_certificate_outlives_its_authority(site: Plan, tmp_path: Path) -> None:
+def test_no_certificate_outlives_its_authority(site: Policy, tmp_path: Path) -> None:
     """An authority that ends sooner than a certificate would says what to do."""
     generate(site, tmp_path, NOW)
     with pytest.raises(ConfigError, match="--new-ca"):
         generate(site, tmp_path, NOW + 3600 * DAY)
 
 
-def test_an_authority_without_its_key_is_not_replaced_silently(site: Plan, tmp_path: Path) -> None:
+def test_an_authority_without_its_key_is_not_replaced_silently(site: Policy, tmp_path: Path) -> None:
     """A lost or foreign key of the authority is an error that says what to do."""
     generate(site, tmp_path, NOW)
     key = tmp_path / "ca" / "key.pem"
@@ -470,14 +470,14 @@ def test_an_authority_without_its_key_is_not_replaced_silently(site: Plan, tmp_p
         generate(site, tmp_path, NOW)
 
 
-def test_only_names_of_the_plan_are_renewed(site: Plan, tmp_path: Path) -> None:
+def test_only_names_of_the_plan_are_renewed(site: Policy, tmp_path: Path) -> None:
     """A misspelled name to renew is refused before anything is written."""
     with pytest.raises(UsageError, match="robot-9"):
         generate(site, tmp_path / "pki", NOW, renew=["robot-9"])
     assert not (tmp_path / "pki").exists()
 
 
-def test_files_know_where_they_will_be(site: Plan, tmp_path: Path) -> None:
+def test_files_know_where_they_will_be(site: Policy, tmp_path: Path) -> None:
     """With a place to be, settings and routers' files name it; without, where they are now."""
     generate(site, tmp_path, NOW, at="/etc/macs/")
     assert '"/etc/macs/robot-7/key.pem"' in (tmp_path / "robot-7" / "macs.toml").read_text()
@@ -492,7 +492,7 @@ def test_files_know_where_they_will_be(site: Plan, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "planted", ["ca", "ca/key.pem", "ca/ca.pem", "robot-7", "robot-7/key.pem", "robot-7/macs.toml"]
 )
-def test_nothing_is_written_or_read_through_a_link(site: Plan, tmp_path: Path, planted: str) -> None:
+def test_nothing_is_written_or_read_through_a_link(site: Policy, tmp_path: Path, planted: str) -> None:
     """Who prepared the directory gets no key of ours, and no authority of his is taken for ours."""
     into, elsewhere = tmp_path / "pki", tmp_path / "elsewhere"
     generate(site, into, NOW)
@@ -505,7 +505,7 @@ def test_nothing_is_written_or_read_through_a_link(site: Plan, tmp_path: Path, p
     assert sorted(path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()) == before
 
 
-def test_a_directory_of_others_is_not_used(site: Plan, tmp_path: Path) -> None:
+def test_a_directory_of_others_is_not_used(site: Policy, tmp_path: Path) -> None:
     """What belongs to somebody else, or can be written by others, is refused with what to do."""
     generate(site, tmp_path / "pki", NOW)
     (tmp_path / "pki" / "ca" / "key.pem").chmod(0o660)
@@ -519,7 +519,7 @@ def test_a_directory_of_others_is_not_used(site: Plan, tmp_path: Path) -> None:
             generate(site, tmp_path / "pki", NOW)
 
 
-def test_a_certificate_that_is_no_authority_signs_nothing(site: Plan, tmp_path: Path) -> None:
+def test_a_certificate_that_is_no_authority_signs_nothing(site: Policy, tmp_path: Path) -> None:
     """A node's certificate and key in the authority's place are found out."""
     generate(site, tmp_path, NOW)
     for name, source in (("ca.pem", "cert.pem"), ("key.pem", "key.pem")):

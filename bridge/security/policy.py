@@ -1,11 +1,11 @@
-"""The plan: who exists on a mesh, and who may command, see, call or message whom. Pure, except `load`.
+"""The policy: who exists on a mesh, and who may command, see, call or message whom. Pure, except `load`.
 
 One YAML file, from which `macs security generate` makes certificates, routers' rules and settings files::
 
     routers:
       - {name: site, addresses: [site.example.org]}
     robots:
-      - {name: robot-7, id: 7, group: 3, called: drone7}
+      - {name: robot-7, id: 7, group: 3, awareness_name: drone7}
     gateways:
       - {name: hall, blocks: [1]}
     operators:
@@ -54,7 +54,7 @@ COMMAND_VERBS = (*SEE_VERBS, "control", "stop")
 
 
 class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One entry of a plan."""
+    """One entry of a policy."""
 
 
 class Router(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -84,7 +84,7 @@ class _Client(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     name: Name
     routers: list[str] = []
-    """Which, in the order in which they are tried. Empty: all, in the order of the plan."""
+    """Which, in the order in which they are tried. Empty: all, in the order of the policy."""
 
 
 class Robot(_Client, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -93,7 +93,7 @@ class Robot(_Client, frozen=True, kw_only=True, forbid_unknown_fields=True):
     id: AgentId
     group: GroupId = 0
     """0: in no group."""
-    called: AgentName | None = None
+    awareness_name: AgentName | None = None
     """Its name in collective awareness; without one it takes no part in it."""
 
 
@@ -139,15 +139,15 @@ class Certificates(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 ELSEWHERE = ("mode", "connect", "listen", "config_file", "overrides", "namespace")
-"""Fields of `MeshSettings` that follow from the rest of a plan, or hold for one program only."""
+"""Fields of `MeshSettings` that follow from the rest of a policy, or hold for one program only."""
 
 
 Node = Router | Robot | Gateway | Operator
 Client = Robot | Gateway | Operator
 
 
-class Plan(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A whole plan. Made by `load` or `parse`, which refuse what contradicts itself."""
+class Policy(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole policy. Made by `load` or `parse`, which refuse what contradicts itself."""
 
     routers: Annotated[list[Router], Meta(min_length=1)]
     robots: list[Robot] = []
@@ -160,7 +160,7 @@ class Plan(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Zenoh's, before every key."""
     mesh: MeshSettings = MeshSettings()
     """What leaves the defaults on every link: a link needs the same at both ends. As in a settings file, without what
-    the plan has words of its own for (`ELSEWHERE`)."""
+    the policy has words of its own for (`ELSEWHERE`)."""
     certificates: Certificates = Certificates()
 
     @property
@@ -178,7 +178,7 @@ class Plan(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
         for node in self.nodes:
             if node.name == name:
                 return node
-        raise ConfigError("plan", _unknown(name, [node.name for node in self.nodes]))
+        raise ConfigError("policy", _unknown(name, [node.name for node in self.nodes]))
 
     def endpoints(self, client: Client) -> list[str]:
         """Where a client dials, the first one first."""
@@ -193,7 +193,7 @@ class Plan(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return any(right in permission.rights for permission in self._between(who, whom))
 
     def verbs(self, who: Client, whom: Client) -> list[str] | None:
-        """The verbs that one may call of another, in the order of the plan; None: every one."""
+        """The verbs that one may call of another, in the order of the policy; None: every one."""
         found: dict[str, None] = {}
         for permission in self._between(who, whom):
             if "call" in permission.rights:
@@ -232,15 +232,15 @@ class Plan(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def kind_of(node: Node) -> str:
-    """``robots``, ``gateways``, ``operators`` or ``routers``: the plan's list that it is in."""
+    """``robots``, ``gateways``, ``operators`` or ``routers``: the policy's list that it is in."""
     return type(node).__name__.lower() + "s"
 
 
 # -- reading -----------------------------------------------------------------------------------------------------
 
 
-def load(path: str | os.PathLike[str]) -> Plan:
-    """Read a plan. Raises `ConfigError`: it cannot be read, is not YAML, or says what cannot be."""
+def load(path: str | os.PathLike[str]) -> Policy:
+    """Read a policy. Raises `ConfigError`: it cannot be read, is not YAML, or says what cannot be."""
     source = str(path)
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -251,27 +251,27 @@ def load(path: str | os.PathLike[str]) -> Plan:
     return parse(text, source)
 
 
-def parse(text: str, source: str = "plan") -> Plan:
-    """Turn the text of a plan into a plan; ``source`` names it in errors."""
+def parse(text: str, source: str = "policy") -> Policy:
+    """Turn the text of a policy into a policy; ``source`` names it in errors."""
     document = _yaml(text, source)
     if not isinstance(document, dict):
-        raise ConfigError(source, "a plan has routers, robots, gateways, operators and permissions")
+        raise ConfigError(source, "a policy has routers, robots, gateways, operators and permissions")
     try:
-        plan = msgspec.convert(document, Plan)
-        _check(plan)
+        policy = msgspec.convert(document, Policy)
+        _check(policy)
     except msgspec.ValidationError as error:
         where, problem = _plain(str(error))
         raise ConfigError(f"{source}: {where}" if where else source, problem + _hint(where, problem)) from None
     except ConfigError as error:
         raise ConfigError(f"{source}: {error.path}", error.problem) from None
-    return plan
+    return policy
 
 
 def _yaml(text: str, source: str) -> Any:
     try:
         import yaml
     except ImportError:
-        raise MissingExtra("reading a plan", "PyYAML", "security") from None
+        raise MissingExtra("reading a policy", "PyYAML", "security") from None
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
         """YAML, in which one name twice in a mapping is a mistake, not a replacement."""
@@ -304,39 +304,46 @@ def _yaml(text: str, source: str) -> Any:
 _T = TypeVar("_T")
 
 
-def _check(plan: Plan) -> None:
-    names = [node.name for node in plan.nodes]
-    _once("name", ((f"{kind_of(node)}: {node.name}", node.name.lower()) for node in plan.nodes))
+def _check(policy: Policy) -> None:
+    names = [node.name for node in policy.nodes]
+    _once("name", ((f"{kind_of(node)}: {node.name}", node.name.lower()) for node in policy.nodes))
     for name in names:
         if name in RESERVED:
-            raise ConfigError(name, "is a word of the plan; choose another name")
-    _once("id", ((f"robots: {robot.name}", robot.id) for robot in plan.robots))
-    _once("id", ((f"operators: {o.name}", o.id) for o in plan.operators if o.id is not None))
-    _once("called", ((f"robots: {robot.name}", robot.called) for robot in plan.robots if robot.called is not None))
-    _once("block", ((f"gateways: {gateway.name}", block) for gateway in plan.gateways for block in gateway.blocks))
-    for router in plan.routers:
-        _check_router(router, plan)
-    for client in plan.clients:
-        _known(f"{client.name}.routers", client.routers, [router.name for router in plan.routers])
-    for gateway in plan.gateways:
+            raise ConfigError(name, "is a word of the policy; choose another name")
+    _once("id", ((f"robots: {robot.name}", robot.id) for robot in policy.robots))
+    _once("id", ((f"operators: {o.name}", o.id) for o in policy.operators if o.id is not None))
+    _once(
+        "awareness_name",
+        (
+            (f"robots: {robot.name}", robot.awareness_name)
+            for robot in policy.robots
+            if robot.awareness_name is not None
+        ),
+    )
+    _once("block", ((f"gateways: {gateway.name}", block) for gateway in policy.gateways for block in gateway.blocks))
+    for router in policy.routers:
+        _check_router(router, policy)
+    for client in policy.clients:
+        _known(f"{client.name}.routers", client.routers, [router.name for router in policy.routers])
+    for gateway in policy.gateways:
         try:
             GatewaySettings(groups=gateway.groups)
         except ConfigError as error:
             field = error.path.rpartition("gateway.")[2]
             raise ConfigError(f"gateways: {gateway.name}.{field}", error.problem) from None
-    for number, permission in enumerate(plan.permissions):
-        _check_permission(f"permissions[{number}]", permission, plan)
+    for number, permission in enumerate(policy.permissions):
+        _check_permission(f"permissions[{number}]", permission, policy)
     for field in ELSEWHERE:
-        if getattr(plan.mesh, field) != getattr(MeshSettings(), field):
-            raise ConfigError(f"mesh.{field}", "is not for every link; a plan says it elsewhere")
-    days, ca_days = plan.certificates.days, plan.certificates.ca_days
+        if getattr(policy.mesh, field) != getattr(MeshSettings(), field):
+            raise ConfigError(f"mesh.{field}", "is not for every link; a policy says it elsewhere")
+    days, ca_days = policy.certificates.days, policy.certificates.ca_days
     if ca_days < days:
         raise ConfigError("certificates.ca_days", f"below days, {days}: the authority would end before what it signs")
-    _check_crowd(plan)
-    MeshSettings(namespace=plan.namespace)  # its rules for a namespace
+    _check_crowd(policy)
+    MeshSettings(namespace=policy.namespace)  # its rules for a namespace
 
 
-def _check_router(router: Router, plan: Plan) -> None:
+def _check_router(router: Router, policy: Policy) -> None:
     where = f"routers: {router.name}"
     for field in ("listen", "endpoints"):
         for endpoint in getattr(router, field):
@@ -346,11 +353,11 @@ def _check_router(router: Router, plan: Plan) -> None:
     for address in router.addresses:
         if "/" in address or not (_is_ip(address) or re.fullmatch(r"[A-Za-z0-9.-]+", address)):
             raise ConfigError(f"{where}.addresses", f"{address!r} is no host name or IP address")
-    _known(f"{where}.links", router.links, [other.name for other in plan.routers if other is not router])
+    _known(f"{where}.links", router.links, [other.name for other in policy.routers if other is not router])
 
 
-def _check_permission(where: str, permission: Permission, plan: Plan) -> None:
-    known = [*KINDS, ALL, *(client.name for client in plan.clients)]
+def _check_permission(where: str, permission: Permission, policy: Policy) -> None:
+    known = [*KINDS, ALL, *(client.name for client in policy.clients)]
     for field in ("who", "whom"):
         names = _listed(getattr(permission, field))
         if not names:
@@ -362,22 +369,24 @@ def _check_permission(where: str, permission: Permission, plan: Plan) -> None:
         raise ConfigError(f"{where}.verbs", "belong to `call`, which this permission does not give")
 
 
-def _check_crowd(plan: Plan) -> None:
+def _check_crowd(policy: Policy) -> None:
     """Headsets behind gateways without blocks cannot be told apart, so what holds for one gateway holds for all."""
-    without = [gateway for gateway in plan.gateways if not gateway.blocks]
+    without = [gateway for gateway in policy.gateways if not gateway.blocks]
     if not without:
         return
     first = without[0]
-    others = [client for client in plan.clients if not isinstance(client, Gateway)]
-    for gateway in plan.gateways:
-        differs = next((client for client in others if not plan.same(first, gateway, client)), None)
+    others = [client for client in policy.clients if not isinstance(client, Gateway)]
+    for gateway in policy.gateways:
+        differs = next((client for client in others if not policy.same(first, gateway, client)), None)
         if differs is not None:
             raise ConfigError(
                 f"gateways: {first.name}.blocks",
                 f"needed, since {first.name} and {gateway.name} have different permissions with {differs.name}:"
                 " headsets are told apart by their block",
             )
-    among = {tuple(plan.may(a, right, b) for right in RIGHTS) for a in plan.gateways for b in plan.gateways if a != b}
+    among = {
+        tuple(policy.may(a, right, b) for right in RIGHTS) for a in policy.gateways for b in policy.gateways if a != b
+    }
     if len(among) > 1:
         raise ConfigError(f"gateways: {first.name}.blocks", "needed, since gateways have different permissions")
 
@@ -435,6 +444,6 @@ def _hint(where: str, problem: str) -> str:
         "certificates": Certificates,
         "mesh": MeshSettings,
     }
-    owner: Any = entries.get(where.partition("[")[0], Plan)
+    owner: Any = entries.get(where.partition("[")[0], Policy)
     near = difflib.get_close_matches(unknown[1], [field.name for field in msgspec.structs.fields(owner)], n=1)
     return f", did you mean `{near[0]}`?" if near else ""

@@ -1,4 +1,4 @@
-"""A security plan: what it may say, and what is refused with which words."""
+"""A security policy: what it may say, and what is refused with which words."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from bridge.security import plan
-from bridge.security.plan import COMMAND_VERBS, SEE_VERBS, Plan
+from bridge.security import policy
+from bridge.security.policy import COMMAND_VERBS, SEE_VERBS, Policy
 from macs_zenoh.errors import ConfigError
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "config" / "security").glob("*.yaml"))
@@ -18,7 +18,7 @@ BASE = """
 routers:
   - {name: site, addresses: [site.example.org, 10.0.0.5]}
 robots:
-  - {name: robot-7, id: 7, group: 3, called: drone7}
+  - {name: robot-7, id: 7, group: 3, awareness_name: drone7}
   - {name: robot-8, id: 8}
 gateways:
   - {name: hall-1, blocks: [1]}
@@ -28,32 +28,32 @@ operators:
 """
 
 
-def made(permissions: str = "", base: str = BASE) -> Plan:
-    return plan.parse(base + (f"permissions:\n{permissions}" if permissions else ""))
+def made(permissions: str = "", base: str = BASE) -> Policy:
+    return policy.parse(base + (f"permissions:\n{permissions}" if permissions else ""))
 
 
-def may(found: Plan, who: str, right: str, whom: str) -> bool:
+def may(found: Policy, who: str, right: str, whom: str) -> bool:
     nodes = {client.name: client for client in found.clients}
     return found.may(nodes[who], right, nodes[whom])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
 def test_the_shipped_plans_can_be_read(path: Path) -> None:
-    """Each plan in config/security is one."""
-    assert plan.load(path).clients
+    """Each policy in config/security is one."""
+    assert policy.load(path).clients
 
 
 def test_a_plan_can_be_short() -> None:
     """A router, a robot, a gateway and an operator who may do everything are less than 15 lines."""
     text = (Path(__file__).parents[2] / "config" / "security" / "small.yaml").read_text()
     assert len(text.splitlines()) <= 15
-    small = plan.parse(text)
+    small = policy.parse(text)
     assert all(
         small.may(one, right, other)
         for one in small.clients
         for other in small.clients
         if one is not other
-        for right in plan.RIGHTS
+        for right in policy.RIGHTS
     )
 
 
@@ -96,7 +96,7 @@ def test_verbs_of_a_call() -> None:
 
 def test_clients_dial_the_routers_in_the_order_of_the_plan_or_in_their_own() -> None:
     """Endpoints are a router's first address at its port, unless it has others; a client may prefer a router."""
-    found = plan.parse(
+    found = policy.parse(
         "routers:\n"
         "  - {name: site, addresses: [site.example.org, 10.0.0.5], listen: ['tls/[::]:7000']}\n"
         "  - {name: v6, addresses: ['fd00::1']}\n"
@@ -121,7 +121,7 @@ WRONG = [
     ("routers: [{name: s, addresses: []}]", "addresses"),
     ("routers: [{name: s, addresses: [x], adresses: [y]}]", "did you mean `addresses`"),
     ("routes: []", "did you mean `routers`"),
-    ("[1, 2]", "a plan has routers"),
+    ("[1, 2]", "a policy has routers"),
     ("routers: [", "line 1: not YAML"),
     ("routers: [{name: s, addresses: [x]}]\nrouters: []", "line 2: not YAML: 'routers' twice"),
     ("? [a, b]\n: 1", "line 1: not YAML: a list as a name"),
@@ -132,11 +132,11 @@ WRONG = [
     ("2020-99-99: 1", "not YAML"),
     (BASE + "  - {name: robot-7}", "name robot-7 is robot-7's already"),
     (BASE + "  - {name: Robot-7}", "name robot-7 is robot-7's already"),
-    (BASE + "  - {name: all}", "is a word of the plan"),
-    (BASE + "  - {name: ca}", "is a word of the plan"),
+    (BASE + "  - {name: all}", "is a word of the policy"),
+    (BASE + "  - {name: ca}", "is a word of the policy"),
     (BASE + "  - {name: ../x}", "operators[1].name"),
     (BASE.replace("id: 8", "id: 7"), "robots: robot-8: id 7 is robot-7's already"),
-    (BASE.replace("id: 8", "id: 8, called: drone7"), "called drone7 is robot-7's already"),
+    (BASE.replace("id: 8", "id: 8, awareness_name: drone7"), "awareness_name drone7 is robot-7's already"),
     (BASE.replace("[2, 3]", "[2, 1]"), "gateways: hall-2: block 1 is hall-1's already"),
     (BASE.replace("[2, 3]", "[2, 256]"), "gateways[1].blocks[1]"),
     (BASE.replace("id: 8", "id: 8, routers: [sit]"), "there is no 'sit' here, did you mean 'site'?"),
@@ -163,7 +163,7 @@ WRONG = [
 def test_a_wrong_plan_is_refused(text: str, words: str) -> None:
     """What cannot be is refused with where it is and what would be right."""
     with pytest.raises(ConfigError, match=r"^site\.yaml") as refused:
-        plan.parse(text, "site.yaml")
+        policy.parse(text, "site.yaml")
     assert words in str(refused.value)
 
 
@@ -183,23 +183,23 @@ def test_gateways_with_different_permissions_need_blocks() -> None:
 
 
 def test_a_plan_that_is_not_there(tmp_path: Path) -> None:
-    """A missing file and one that is no text are told apart from a wrong plan."""
+    """A missing file and one that is no text are told apart from a wrong policy."""
     with pytest.raises(ConfigError, match="No such file"):
-        plan.load(tmp_path / "x.yaml")
+        policy.load(tmp_path / "x.yaml")
     (tmp_path / "x.yaml").write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match="not UTF-8"):
-        plan.load(tmp_path / "x.yaml")
+        policy.load(tmp_path / "x.yaml")
 
 
 def test_the_page_has_every_field() -> None:
-    """docs/security.md explains each field of each entry of a plan."""
+    """docs/security.md explains each field of each entry of a policy."""
     page = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
     rows = [line.split("|") for line in page.splitlines() if line.startswith("| `")]
     explained = {(name, row[2].strip(" `")) for row in rows for name in re.findall(r"`(\w+)`", row[1])}
     words = {word for name, of in explained for word in (name, *re.findall(r"\w+", of))}
-    assert {field.name for field in msgspec.structs.fields(Plan)} <= words
-    for kind in (plan.Router, plan.Robot, plan.Gateway, plan.Operator, plan.Permission, plan.Certificates):
-        where = kind.__name__.lower() + ("" if kind is plan.Certificates else "s")
+    assert {field.name for field in msgspec.structs.fields(Policy)} <= words
+    for kind in (policy.Router, policy.Robot, policy.Gateway, policy.Operator, policy.Permission, policy.Certificates):
+        where = kind.__name__.lower() + ("" if kind is policy.Certificates else "s")
         for field in msgspec.structs.fields(kind):
             of = {of for name, of in explained if name == field.name}
             assert any(where in each or each == "all" for each in of), (kind.__name__, field.name)
