@@ -1,23 +1,15 @@
-"""What ``macs up --demo`` shows: a headset that receives a robot's data and drives it, with numbers for a person.
-
-As a program (``python -m bridge.cli.demo``) it is the demo robot of `bridge.ros.demo`, as a child of ``macs up``.
-"""
+"""What ``macs up --demo`` shows: a headset that receives a robot's data and drives it, with numbers for a person."""
 
 from __future__ import annotations
 
 import asyncio
 import math
-import os
-import signal
 import statistics
-import sys
-import threading
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
-from bridge.cli.running import STOP_WITH_STDIN, say_ready
 from macs_zenoh.errors import MacsError, Unreachable
 
 if TYPE_CHECKING:
@@ -170,22 +162,3 @@ def _kb(sizes: list[int]) -> str:
 
 def _place(point: tuple[float, float]) -> str:
     return f"({point[0]:.2f}, {point[1]:.2f})"
-
-
-def robot() -> int:
-    """Be the demo robot until SIGTERM, or until ``macs up`` is gone."""
-    from bridge.ros import demo
-
-    if os.environ.pop(STOP_WITH_STDIN, None):
-        threading.Thread(target=_stop_at_end_of_stdin, daemon=True).start()
-    return demo.main([], alone=True, on_ready=lambda: say_ready("demo robot"))
-
-
-def _stop_at_end_of_stdin() -> None:
-    while os.read(sys.stdin.fileno(), 4096):
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
-
-
-if __name__ == "__main__":
-    sys.exit(robot())

@@ -23,7 +23,7 @@ from contextlib import contextmanager, suppress
 
 from bridge import memory
 from bridge.cli import options, running
-from bridge.cli.children import Child, stop_in_order
+from bridge.cli.supervisor import Child, stop_in_order
 from bridge.listening import bound
 from macs_zenoh.config import GatewaySettings, Settings, changed
 from macs_zenoh.errors import UsageError

@@ -29,9 +29,9 @@ import os
 from contextlib import suppress
 from dataclasses import dataclass
 
-from bridge.cli import children, options, output, running
+from bridge.cli import options, output, running, supervisor
 from bridge.cli.apart import Apart
-from bridge.cli.children import Child, stop_in_order
+from bridge.cli.supervisor import Child, stop_in_order
 from bridge.listening import bound, for_others
 from bridge.logs import prefix_logs
 from macs_zenoh.config import GatewaySettings, RobotSettings, Settings, changed
@@ -88,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.once and not args.demo:
         raise UsageError("--once belongs to --demo")
-    prefix_logs(children.prefix("up"))
+    prefix_logs(supervisor.prefix("up"))
     plan = make_plan(args, options.settings_file(args))
     try:
         return running.until_stopped(lambda: _up(plan), interrupted=running.INTERRUPTED if plan.once else 0)
@@ -132,7 +132,7 @@ class Plan:
     def robot_children(self) -> list[Child]:
         robot = ["--id", str(self.robot.id), "--group", str(self.robot.group)]
         agent = self._child("agent", [*self._mesh(), *robot])
-        return [Child("demo", ["bridge.cli.demo"], self._environment()), agent] if self.demo else [agent]
+        return [Child("demo", ["bridge.cli.demo_robot"], self._environment()), agent] if self.demo else [agent]
 
     def _mesh(self) -> list[str]:
         namespace = [] if self.apart is None else ["--namespace", self.apart.namespace]

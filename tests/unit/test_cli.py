@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from bridge.cli import VERBS, build_parser, children, ls, main, options, robots, stop, terminal, up
+from bridge.cli import VERBS, build_parser, ls, main, options, robots, stop, supervisor, terminal, up
 from bridge.headset.verbs import script_parser
 from macs_zenoh.config import MeshSettings, OperatorSettings, Settings
 from macs_zenoh.errors import ConfigError
@@ -440,27 +440,27 @@ def test_what_next_names_the_addresses_in_use() -> None:
     here.apart.close()
 
 
-# -- children --------------------------------------------------------------------------------------------------------
+# -- supervisor ------------------------------------------------------------------------------------------------------
 
 
-def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> children.Child:
+def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> supervisor.Child:
     """A child that runs some code instead of a verb."""
     (tmp_path / "child_program.py").write_text(code)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    return children.Child("child", ["child_program"])
+    return supervisor.Child("child", ["child_program"])
 
 
 async def test_a_child_that_cannot_start_is_not_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A program that ends at once, before it was ready, ends `macs up` with it."""
     child = script(tmp_path, monkeypatch, "raise SystemExit(1)")
-    with pytest.raises(children.ChildFailed):
+    with pytest.raises(supervisor.ChildFailed):
         await child.run()
     assert child.starts == 1
 
 
 async def test_a_child_that_dies_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A program that was ready once is kept alive; one that finds its configuration wrong is not."""
-    monkeypatch.setattr(children, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(supervisor, "FIRST_PAUSE_S", 0.01)
     code = f"""
 import pathlib, sys
 marks = pathlib.Path({str(tmp_path)!r}, "starts")
@@ -469,7 +469,7 @@ print("ready: here")
 sys.exit(2 if len(marks.read_text()) == 3 else 1)
 """
     child = script(tmp_path, monkeypatch, code)
-    with pytest.raises(children.ChildFailed) as failed:
+    with pytest.raises(supervisor.ChildFailed) as failed:
         await child.run()
     assert failed.value.code == 2
     assert child.starts == 3
