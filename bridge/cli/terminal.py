@@ -1,15 +1,14 @@
 """What people read: columns, colour and progress, drawn by rich. What goes into a pipe or a file is plain text, each
 row whole and in one line, so that nothing is lost and nothing has to be parsed around.
 
-NO_COLOR, FORCE_COLOR, TERM and COLUMNS hold as everywhere. What others said passes the one filter (`macs_zenoh.plain`)
-and is never read as rich's markup: text gets here as text and leaves as `rich.text.Text`. Importing rich takes a
-moment, so it is imported when something is drawn.
+NO_COLOR, FORCE_COLOR and TERM hold as everywhere, COLUMNS for a terminal. What others said passes the one filter
+(`macs_zenoh.plain`) and is never read as rich's markup: text gets here as text and leaves as `rich.text.Text`.
+Importing rich takes a moment, so it is imported when something is drawn.
 """
 
 from __future__ import annotations
 
 import io
-import os
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -60,7 +59,7 @@ def drawn(blocks: Sequence[Block], stream: Any) -> str:
     from rich.console import Console
 
     page = _Page(terminal=stream.isatty())
-    width = None if stream.isatty() or os.environ.get("COLUMNS", "").isdigit() else WHOLE
+    width = None if stream.isatty() else WHOLE  # whatever COLUMNS says: programs read a pipe
     console = Console(file=page, width=width, markup=False, emoji=False, highlight=False, legacy_windows=False)
     for block in blocks:
         console.print(_table(block) if isinstance(block, Columns) else _text(block))

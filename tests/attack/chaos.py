@@ -32,12 +32,13 @@ from tests.attack.scene import BEGIN_S, MIB, ROBOT, descriptors, status_bytes, t
 from std_msgs.msg import String  # isort: skip
 
 from bridge.cli import robots
-from bridge.cli.robots import Caller, Status
+from bridge.cli.robots import Status
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Subscription
 from bridge.ros.session import RosSession
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
+from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.messages import OPERATOR, ROS
 from tests.links import Link, counted
 from tests.programs import ROOT, Program, free_port
@@ -251,7 +252,7 @@ class Site:
 
     async def _mesh_problem(self, ids: list[int]) -> str:
         mesh = MeshSettings(connect=[self.router.endpoint])
-        async with robots.operator(mesh, Caller(OPERATOR, 7), timeout_s=5) as operator:
+        async with robots.operator(mesh, AgentId(OPERATOR, 7), timeout_s=5) as operator:
             seen = sorted((agent.type, agent.id) for agent in await operator.online())
             if seen != sorted([(ROS, ROBOT), *((2, each) for each in ids)]):
                 return f"on the mesh are {seen}, here are {ids}"

@@ -27,12 +27,13 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Bool
 
 from bridge.cli import robots
-from bridge.cli.robots import Caller, Operator, Status
+from bridge.cli.robots import Operator, Status
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Publisher
 from bridge.ros.session import RosSession
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
+from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.limits import UNFINISHED_IN_ALL_BYTES, WAITING_IN_ALL_BYTES
 from macs_zenoh.protocol.messages import OPERATOR
 from tests.attack.judge import Memory, Report, Window
@@ -284,7 +285,7 @@ class Scene:
         while ROBOT not in (await driver.online()).ros_agent_ids:
             await asyncio.sleep(0.02)
         mesh = MeshSettings(connect=[self.site.endpoint])
-        asking = robots.operator(mesh, Caller(OPERATOR, 7), timeout_s=10)
+        asking = robots.operator(mesh, AgentId(OPERATOR, 7), timeout_s=10)
         self.operator = await stack.enter_async_context(asking)
         self.pair = Pair(left, right)
         stack.callback(self.pair.close)

@@ -12,12 +12,13 @@ from typing import Any
 import pytest
 
 import macs_zenoh
-from bridge.cli.robots import Caller, operator
+from bridge.cli.robots import operator
 from macs_zenoh import awareness
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Unreachable
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol import named
+from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.keyexpr import NAMED, PRESENCE, STREAM
 from macs_zenoh.protocol.messages import OPERATOR
 from macs_zenoh.streams import Streams
@@ -171,8 +172,8 @@ async def test_an_observer_asks_robots_and_stops_none(as_user: Callable[[str], M
 
     async with (
         macs_zenoh.join("ros", id=7, settings=as_user("robot-7")) as robot,
-        operator(as_user("observer"), Caller(OPERATOR, 0), timeout_s=5) as nobody,
-        operator(as_user("observer"), Caller(OPERATOR, 5), timeout_s=5) as somebody,
+        operator(as_user("observer"), AgentId(OPERATOR, 0), timeout_s=5) as nobody,
+        operator(as_user("observer"), AgentId(OPERATOR, 5), timeout_s=5) as somebody,
     ):
         for verb in ("status", "offers", "stop"):
             robot.serve(verb, answer)

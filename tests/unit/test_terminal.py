@@ -34,8 +34,10 @@ def without_colours(text: str) -> str:
     return re.sub(r"\x1b\[[0-9;]*m", "", text)
 
 
-def test_a_pipe_gets_each_row_in_one_plain_line() -> None:
-    """Nothing is cut off, wrapped, drawn around or coloured, and nothing hangs at the end of a line."""
+def test_a_pipe_gets_each_row_in_one_plain_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is cut off, wrapped, drawn around or coloured, and nothing hangs at the end of a line, whatever width a
+    terminal somewhere has."""
+    monkeypatch.setenv("COLUMNS", "40")
     rows = [("ros", "7", LONG, ("stopped", BAD)), ("unity", "256", "x", "")]
     lines = piped(Columns(rows, headings=("TYPE", "ID", "NAME", "STATE"), right={1}), "", (LONG, BAD)).split("\n")
     assert len(lines) == 5
