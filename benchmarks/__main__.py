@@ -18,8 +18,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from macs_zenoh.mesh.cpu_latency import Awake
-
 from . import awareness, cases, differing, robot_speed, scale
 from .figures import Figure, table
 from .plan import Plan
@@ -87,9 +85,9 @@ def _arguments() -> argparse.Namespace:
 def _possible() -> list[str]:
     """Every case, without those for which this Python has no ROS, or this user no right."""
     if importlib.util.find_spec("rclpy") is not None:
-        may_wake = os.access(Awake.DEVICE, os.W_OK)
+        may_wake = os.access(robot_speed.CPU_LATENCY, os.W_OK)
         if not may_wake:
-            print(f"{Awake.DEVICE} may not be written: robot-awake is left out", file=sys.stderr)
+            print(f"{robot_speed.CPU_LATENCY} may not be written: robot-awake is left out", file=sys.stderr)
         return [name for name in CASES if may_wake or name != "robot-awake"]
     print(f"no rclpy: {', '.join(WITH_ROS)} are left out", file=sys.stderr)
     return list(WITHOUT_ROS)

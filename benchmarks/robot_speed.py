@@ -8,14 +8,11 @@ what it took in the same round.
 from __future__ import annotations
 
 import os
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
-
-from macs_zenoh.mesh.cpu_latency import Awake
 
 from .figures import Figure
 from .plan import KIB, Case, Plan, Run, in_turn
@@ -24,6 +21,8 @@ from .robot_ends import stamped
 
 IMAGE = 900_000
 QUIET_S = 2.0
+CPU_LATENCY = "/dev/cpu_dma_latency"
+"""While it is open, cores sleep no more deeply than was written to it: zeros for not at all."""
 WITHOUT_US = ("plain", "to topic, bare")
 """The ways that no program of ours takes part in, but for the router: they say what a machine can do."""
 RATES = (500, 1000, 1500, 2000, 2500, 3000, 3500, 4000, 5000, 6000)
@@ -52,12 +51,9 @@ class Site:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         router = stage.router()
         gateway = stage.gateway(router)
-        with tempfile.NamedTemporaryFile("w", suffix=".toml") as settings:
-            settings.write("mesh.awake_us = 0" if awake else "")
-            settings.flush()
-            arguments = ("-m", "bridge", "agent", "--id", "1", "-e", f"tcp/127.0.0.1:{router}")
-            self.agent = stage._start("agent", *arguments, "--settings", str(UNLIMITED), "--settings", settings.name)
-            self.agent.line()
+        arguments = ("-m", "bridge", "agent", "--id", "1", "-e", f"tcp/127.0.0.1:{router}")
+        self.agent = stage._start("agent", *arguments, "--settings", str(UNLIMITED))
+        self.agent.line()
         self.publisher, _ = stage.worker("robot_ends", "ros")
         self.subscriber, _ = stage.worker("robot_ends", "ros")
         self.headset, _ = stage.worker("robot_ends", "headset", gateway, 1)
@@ -83,7 +79,7 @@ class Site:
         """Send on a path at a rate: how many were sent and arrived, and the latencies there."""
         sender, receiver, topic = self._ends(path)
         count = max(10, int(hz * seconds))
-        with self._awake_without_us(path):
+        with self._cores_awake():
             receiver.tell("collect", count=count, quiet_s=QUIET_S + size / 1e6)
             took = sender.ask("publish", topic=topic, size=size, hz=hz, count=count)
             answer = receiver.answer()
@@ -99,13 +95,13 @@ class Site:
         }[path]
 
     @contextmanager
-    def _awake_without_us(self, path: str) -> Iterator[None]:
-        """Where our robot agent keeps the cores awake for its messages, others' messages have them awake too."""
-        if not self._awake or path not in WITHOUT_US:
+    def _cores_awake(self) -> Iterator[None]:
+        """Linux lets no core sleep while the device is open, on every path."""
+        if not self._awake:
             yield
             return
         try:
-            request = open(Awake.DEVICE, "wb", buffering=0)  # noqa: PTH123, SIM115 - closed below
+            request = open(CPU_LATENCY, "wb", buffering=0)  # noqa: PTH123, SIM115 - closed below
         except OSError as error:
             raise ProgramFailed(f"cores cannot be kept awake: {error}") from error
         with request:
@@ -171,7 +167,7 @@ def robot(stage: Stage, plan: Plan) -> Iterator[Figure]:
 
 
 def robot_awake(stage: Stage, plan: Plan) -> Iterator[Figure]:
-    """The same on cores that are kept awake, by the robot agent and for plain rclpy. Needs the right to do so."""
+    """The same on cores that are kept awake. Needs the right to do so."""
     yield from small(Site(stage, awake=True), plan, "1 KiB, 100 Hz, awake")
 
 

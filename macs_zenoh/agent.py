@@ -545,7 +545,6 @@ async def join(
     if connect:
         settings = changed(settings, connect=list(connect))
     async with await Mesh.open(settings, traffic=traffic, on_waiting=on_waiting) as mesh:
-        mesh.keep_awake()
         agent = Agent(mesh, kind, group, guard)
         try:
             await agent._join(id)

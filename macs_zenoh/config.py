@@ -165,10 +165,6 @@ class MeshSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Implicit shared memory bypasses size limits and can drop silently, so it is off (Zenoh: on)."""
     multicast: bool = False
     """Find routers by multicast scouting. Off: a mesh is what its endpoints say (Zenoh: on)."""
-    awake_us: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
-    """While messages pass, cores of this machine may take at most so long to wake (Linux, docs/robot.md). Unset: they
-    sleep as deeply as they like, which costs 0.05 to 0.12 ms wherever a message goes on to a sleeping core."""
-
     id_slots: Annotated[int, Meta(ge=1, le=255)] = 10
     """Destination id slots in the frame header. The same on the whole mesh; 10 is what existing programs use."""
     group_slots: Annotated[int, Meta(ge=1, le=255)] = 10

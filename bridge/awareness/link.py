@@ -70,7 +70,6 @@ class MeshLink:
                 if wanted.beside and wanted.id is not None:
                     mesh = await Mesh.open(self.settings.mesh, traffic=self.settings.traffic, on_waiting=on_waiting)
                     await stack.enter_async_context(mesh)
-                    mesh.keep_awake()
                     self._agent_id = wanted.id
                     self._mesh.set_result(mesh)
                 else:

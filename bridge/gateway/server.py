@@ -177,7 +177,6 @@ class Gateway:
 
         Raises ConfigError when the block is somebody else's, Unreachable when the port cannot be had.
         """
-        self.mesh.keep_awake()
         self.mesh.tells, self.mesh.away = self._now, self._away
         await self._presence.start()
         self.mesh.on_link(lambda up: self._robots.repeat_all() if up else None)

@@ -94,8 +94,6 @@ class Arrivals:
         self.asked: deque[zenoh.Query] = deque()
         """Queries on their way to the loop: an emergency stop can be among them, so no sample overtakes them."""
         self._own = loopback.own
-        self.stirred = False
-        """Whether a message or a question has come since somebody took this back."""
 
     def receiver(
         self,
@@ -103,16 +101,13 @@ class Arrivals:
         on_numbered: OnNumbered | None = None,
         *,
         at_once: AtOnce | None = None,
-        stirs: bool = True,
     ) -> Callable[[zenoh.Sample], bool]:
         """What Zenoh calls, in whatever thread, for each sample of one subscription; whether there was room for it.
         Samples that their source has numbered go to ``on_numbered``, if it is given; others are offered to
-        ``at_once`` first. Heartbeats do not count as messages: they do not ``stir``."""
+        ``at_once`` first."""
         queue, limit, large, own = self._queue, self.TOPICS_LIMIT, self.LARGE_BYTES, self._own
 
         def receive(sample: zenoh.Sample) -> bool:
-            if stirs:
-                self.stirred = True
             try:
                 payload = own.payload
             except AttributeError:  # the first in this thread
@@ -156,7 +151,6 @@ class Arrivals:
                 yield key, payload, age_s + now - at, now
 
         def receive(sample: zenoh.Sample) -> None:
-            self.stirred = True
             try:
                 payload = own.payload
             except AttributeError:  # the first in this thread

@@ -20,8 +20,6 @@ class Loopback:
     def __init__(self) -> None:
         self.own = threading.local()
         """``payload``: what this thread puts at this moment, None in between. Not set in a thread that never put."""
-        self.stirred = False
-        """Whether a message has gone since somebody took this back."""
 
     def put(self, publisher: Outlet, payload: Payload) -> None:
         """Publish. Zenoh calls our own subscriptions back within this, and they take the payload as it is."""
@@ -32,7 +30,6 @@ class Loopback:
         self._put(publisher, payload, b"")
 
     def _put(self, publisher: Outlet, payload: Payload, zenohs: Payload) -> None:
-        self.stirred = True
         self.own.payload = payload
         try:
             publisher.put(zenohs)

@@ -60,7 +60,7 @@ class Recovered:
         session, arrivals = self._session, self._arrivals
         receive = arrivals.receiver(self._on_batch, self._on_numbered, at_once=self._at_once)
         samples = zenoh.handlers.Callback(receive, indirect=False)
-        beat = arrivals.receiver(self._on_heartbeat, stirs=False)
+        beat = arrivals.receiver(self._on_heartbeat)
         heartbeats = zenoh.handlers.Callback(beat, indirect=False)
         declared = Subscription(
             self,

@@ -36,7 +36,6 @@ from macs_zenoh.protocol.policing import Policer
 from macs_zenoh.versions import installed
 
 from .arrivals import Arrivals, now_s
-from .cpu_latency import Awake
 from .declared import AtOnce, Handler, OnAged, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
 from .loopback import Loopback
 from .outgoing import Outgoing
@@ -90,7 +89,6 @@ class Mesh:
         end_on_panics(self._loop)
         self._loopback = Loopback()
         self._arrivals = Arrivals(self._loop, self._from_thread, self.drops, self._loopback)
-        self._awake: Awake | None = None
         self._missed: set[str] = set()
         self._recovered: set[Recovered] = set()
         self._needs_router = settings.mode == "client"
@@ -200,17 +198,6 @@ class Mesh:
         call(self._pulse.put, b"")
         self._beating = self._loop.call_later(BEAT_S, self._beat)
 
-    def keep_awake(self) -> None:
-        """Keep this machine's cores awake while messages or questions pass, if the settings ask for it: for programs
-        that pass them on, not for those that only look, or route."""
-        if self.settings.awake_us is not None and self._awake is None:
-            self._awake = Awake(self.settings.awake_us, self._stirred, self._loop)
-
-    def _stirred(self) -> bool:
-        stirred = self._arrivals.stirred or self._loopback.stirred
-        self._arrivals.stirred = self._loopback.stirred = False
-        return stirred
-
     async def __aenter__(self) -> Mesh:
         return self
 
@@ -224,8 +211,6 @@ class Mesh:
         self._beating.cancel()
         for task in self._tasks:
             task.cancel()
-        if self._awake is not None:
-            self._awake.close()
         closing = asyncio.ensure_future(asyncio.to_thread(self._close))
         cancelled = False
         while not closing.done():
@@ -392,7 +377,6 @@ class Mesh:
             if not answered:
                 self._from_thread(settle, None, NotServed(key))
 
-        self._arrivals.stirred = True
         priority, congestion, express = self._outgoing.way(key, traffic)
         self._session.get(
             key,
@@ -474,7 +458,6 @@ class Mesh:
             task.add_done_callback(self._tasks.discard)
 
         def on_query(query: zenoh.Query) -> None:
-            self._arrivals.stirred = True
             keep_attached()
             problem = _tried(first, query) if first is not None else None
             if gate is not None:

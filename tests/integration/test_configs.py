@@ -52,7 +52,8 @@ IMAGES = [
     path for path in FILES if re.fullmatch(r"Dockerfile(\.[a-z]+)?", path.name) and path.suffix != ".dockerignore"
 ]
 IGNORES = [path for path in FILES if path.suffix == ".dockerignore"]
-KERNEL = [path for path in FILES if path.suffix == ".conf"]
+KERNEL = [path for path in FILES if path.suffix == ".conf" and path.parent.name == "wan"]
+CORES = [CONFIG / "tmpfiles.d" / "macs-cpu-latency.conf", CONFIG / "tuned" / "macs" / "tuned.conf"]
 LAUNCH = [CONFIG / "robot.launch.py"]
 """In tests/ros/test_parameters.py."""
 
@@ -70,7 +71,7 @@ def ids(path: Path) -> str:
 
 def test_every_file_is_tested() -> None:
     """Each shipped file is of a kind that a test here loads."""
-    known = [*ROUTERS, *SETTINGS, *PLANS, *COMPOSED, *UNITS, *IMAGES, *IGNORES, *KERNEL, *LAUNCH]
+    known = [*ROUTERS, *SETTINGS, *PLANS, *COMPOSED, *UNITS, *IMAGES, *IGNORES, *KERNEL, *CORES, *LAUNCH]
     assert sorted(known) == FILES
 
 
@@ -241,6 +242,17 @@ def test_systemd_accepts_a_unit(path: Path, tmp_path: Path) -> None:
     verify = ["systemd-analyze", "verify", "--man=no", str(copy)]
     done = subprocess.run(verify, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_both_files_for_cores_ask_for_the_same() -> None:
+    """tuned and systemd-tmpfiles are told the same latency, in lines that they know."""
+    tuned = configparser.ConfigParser()
+    tuned.read(CORES[1], encoding="utf-8")
+    text = CORES[0].read_text(encoding="utf-8")
+    [line] = [line.split() for line in text.splitlines() if not line.startswith("#")]
+    assert line[0] == "w"
+    assert line[1].endswith("/power/pm_qos_resume_latency_us")
+    assert line[2:] == ["-", "-", "-", "-", tuned["cpu"]["force_latency"]]
 
 
 @pytest.mark.parametrize("path", KERNEL, ids=ids)
