@@ -99,22 +99,22 @@ class Awareness:
         *,
         agent_type: int,
         agent_id: int = 0,
-        rates_hz: Mapping[str, float] | None = None,
-        reliable: Mapping[str, int] | None = None,
-        max_message_bytes: int = MAX_MESSAGE_BYTES,
+        max_hz: Mapping[str, float] | None = None,
+        cache: Mapping[str, int] | None = None,
+        max_bytes: int = MAX_MESSAGE_BYTES,
     ) -> None:
         check_word("agent name", name)
         self.mesh = mesh
         self.name = name
         self.agent_type = agent_type
         self.agent_id = agent_id
-        self.max_message_bytes = max_message_bytes
+        self.max_bytes = max_bytes
         self.names = Names()
         self.counters: Counter[str] = Counter()
         self._lock = threading.Lock()
         self._keys: dict[tuple[str, str], str] = {}
-        self._rates = RateLimits(rates_hz or {})
-        self._reliable = dict(reliable or {})
+        self._rates = RateLimits(max_hz or {})
+        self._cache = dict(cache or {})
         self._last = LastValues()
         self._arrivals = Arrivals()
         self._number = 0
@@ -172,7 +172,7 @@ class Awareness:
                 if self.mesh.linked:
                     outcome = self._expected(receiver, message_type)
                 else:
-                    outcome = Outcome.KEPT if not receiver and message_type in self._reliable else Outcome.NO_ROUTER
+                    outcome = Outcome.KEPT if not receiver and message_type in self._cache else Outcome.NO_ROUTER
         if outcome not in (Outcome.RATE_LIMITED, Outcome.NO_ROUTER):
             self.mesh.put(self._key(receiver, message_type), payload, Traffic.CALL)
         return self._count(outcome)
@@ -218,9 +218,9 @@ class Awareness:
         if receiver:
             check_word("receiver", receiver)
         check_word("message type", message_type)
-        if size > self.max_message_bytes:
+        if size > self.max_bytes:
             self.counters["too_large"] += 1
-            raise UsageError(f"a message of {size} bytes is above the limit of {self.max_message_bytes}")
+            raise UsageError(f"a message of {size} bytes is above the limit of {self.max_bytes}")
 
     def _key(self, receiver: str, message_type: str) -> str:
         key = self._keys.get((receiver, message_type))
@@ -229,8 +229,8 @@ class Awareness:
                 key = NAMED.of(name=receiver, message_type=message_type, from_name=self.name)
             else:
                 key = NAMED_ALL.of(message_type=message_type, from_name=self.name)
-                if message_type in self._reliable:
-                    self.mesh.keep(key, self._reliable[message_type])
+                if message_type in self._cache:
+                    self.mesh.keep(key, self._cache[message_type])
             if len(self._keys) >= self.KEYS:
                 self._keys.clear()
             self._keys[receiver, message_type] = key
@@ -324,7 +324,7 @@ class Awareness:
             return False
         if last and not self._arrivals.newer(sender, message_type, envelope):
             return True
-        if last and message_type in self._reliable and self._arrivals.knows(sender, message_type, envelope):
+        if last and message_type in self._cache and self._arrivals.knows(sender, message_type, envelope):
             return True  # it comes in its turn, behind others that were missed
         if not self._arrivals.fresh(sender, message_type, envelope):
             self.counters["repeated"] += 1
@@ -469,18 +469,18 @@ async def join(
     agent: Agent,
     name: str,
     *,
-    rates_hz: Mapping[str, float] | None = None,
-    reliable: Mapping[str, int] | None = None,
-    max_message_bytes: int = MAX_MESSAGE_BYTES,
+    max_hz: Mapping[str, float] | None = None,
+    cache: Mapping[str, int] | None = None,
+    max_bytes: int = MAX_MESSAGE_BYTES,
 ) -> AsyncIterator[Awareness]:
     """Give an agent a name that others send to, until the end of the block.
 
     Args:
         agent: made by `macs_zenoh.join`; its type and id are what `macs ls` shows with the name.
         name: any text of 1 to 200 characters that nobody else on the mesh has.
-        rates_hz: per message type, how many messages per second may be sent to each receiver.
-        reliable: per message type, how many messages to all are kept for agents that miss some (docs/reliable.md).
-        max_message_bytes: what is larger is refused by `send` and `deliver`.
+        max_hz: per message type, how many messages per second may be sent to each receiver.
+        cache: per message type, how many messages to all are kept for agents that miss some (docs/reliable.md).
+        max_bytes: what is larger is refused by `send` and `deliver`.
 
     Raises UsageError: the name is taken or cannot be one.
     """
@@ -489,9 +489,9 @@ async def join(
         name,
         agent_type=agent.type_number,
         agent_id=agent.id,
-        rates_hz=rates_hz,
-        reliable=reliable,
-        max_message_bytes=max_message_bytes,
+        max_hz=max_hz,
+        cache=cache,
+        max_bytes=max_bytes,
     )
     following_id = agent.on_id(lambda old, new: awareness.change_id(new))
     try:

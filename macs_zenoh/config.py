@@ -330,7 +330,7 @@ class TopicRule(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Topic data to headsets: at most so many messages per second; of those in between, the latest is sent."""
     priority: Priority | None = None
     """Topic data to headsets: its priority on the mesh instead of ``data``. It wins over a `TrafficRule`."""
-    keep_for_recovery: Annotated[int, Meta(ge=1, le=100_000)] | None = None
+    cache: Annotated[int, Meta(ge=1, le=100_000)] | None = None
     """Topic data to headsets: keep the last so many messages, and send those again that a gateway missed while the
     mesh was interrupted (docs/reliable.md). It has nothing to do with ROS QoS, and wins over a `TrafficRule`."""
     read_only: bool | None = None
@@ -472,15 +472,15 @@ class AwarenessSettings(_Section, frozen=True, kw_only=True, forbid_unknown_fiel
     """This robot's id on the mesh. Unset: lease a free one."""
     beside: bool = False
     """A robot agent with this ``id`` runs on this robot as well: the name becomes its name, and no id is taken."""
-    max_message_bytes: Bytes = 32 * 1024 * 1024
+    max_bytes: Bytes = 32 * 1024 * 1024
     """A larger message is refused where it is sent."""
-    rates_hz: dict[str, Annotated[float, Meta(gt=0)]] = {}
+    max_hz: dict[str, Annotated[float, Meta(gt=0)]] = {}
     """Per message type: what is sent more often is dropped and counted."""
     deadlines_s: dict[str, Seconds] = {}
     """Per message type: how long a message to one robot may wait for it, and is repeated until it is confirmed."""
     last_values: list[str] = []
     """Message types of which every other robot's last message to all is asked for when this one joins."""
-    reliable: dict[str, Annotated[int, Meta(ge=1, le=100_000)]] = {}
+    cache: dict[str, Annotated[int, Meta(ge=1, le=100_000)]] = {}
     """Per message type: keep the last so many messages to all, for robots that miss some while the mesh is interrupted
     (docs/reliable.md)."""
     only_addressed: bool = True
@@ -524,7 +524,7 @@ class TrafficRule(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """So many bytes per second for all keys of this rule together, as far as this program sends them."""
     priority: Priority | None = None
     """Instead of that of its class (commands ``real_time``, calls ``interactive_high``, topic data ``data``)."""
-    reliable: Annotated[int, Meta(ge=1, le=100_000)] | None = None
+    cache: Annotated[int, Meta(ge=1, le=100_000)] | None = None
     """The source keeps so many messages of each key; receivers ask for those that they missed."""
 
     def _check(self) -> None:

@@ -106,9 +106,9 @@ class MeshLink:
             name,
             agent_type=ROS,
             agent_id=self._agent_id,
-            rates_hz=settings.rates_hz,
-            reliable=settings.reliable,
-            max_message_bytes=settings.max_message_bytes,
+            max_hz=settings.max_hz,
+            cache=settings.cache,
+            max_bytes=settings.max_bytes,
         )
         try:
             await awareness.start()

@@ -104,7 +104,7 @@ class SubscriberNode(TopicNode):
         self.registrants_changed()  # before the first message comes
         check_topic_type(self.robot.session.node, self.request.tos_name, self.interface)
         self.robot.prioritise_stream(self.key.node_name, self.rule.priority)
-        if self.robot.keep_stream(self.key.node_name, self.rule.keep_for_recovery):
+        if self.robot.keep_stream(self.key.node_name, self.rule.cache):
             self.linger_s = SILENT_S
         self._subscribe(self._profile_of(self._publishers()))
 

@@ -251,7 +251,7 @@ def _downsampling(policy: Policy) -> Iterator[str]:
     for rule in policy.traffic:
         if rule.max_hz is None:
             continue
-        keys = [] if rule.reliable is not None else _exact(policy, rule)
+        keys = [] if rule.cache is not None else _exact(policy, rule)
         if not keys:
             yield f"  // max_hz of {rule.match} is left to the programs: Zenoh counts all keys of a rule as one"
         for key in keys:

@@ -264,7 +264,7 @@ class Outgoing:
         """How many samples to keep of a key; of those that nobody recovers, none."""
         if STREAM.parse(key) is None and NAMED_ALL.parse(key) is None:
             return 0
-        return self._kept.get(key) or (shape.reliable if shape is not None else None) or 0
+        return self._kept.get(key) or (shape.cache if shape is not None else None) or 0
 
     def _keeping(self, key: str, traffic: Traffic, samples: int) -> Any:
         """A publisher that numbers samples, keeps the last ones and answers questions for them."""

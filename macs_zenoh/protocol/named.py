@@ -192,8 +192,8 @@ class RateLimits:
 
     LIMIT = 4096
 
-    def __init__(self, rates_hz: Mapping[str, float]) -> None:
-        self._pause_s = {message_type: 1.0 / rate for message_type, rate in rates_hz.items()}
+    def __init__(self, max_hz: Mapping[str, float]) -> None:
+        self._pause_s = {message_type: 1.0 / rate for message_type, rate in max_hz.items()}
         self._next: dict[tuple[str, str], float] = {}
 
     def admit(self, message_type: str, receiver: str, now: float) -> bool:

@@ -80,16 +80,16 @@ class Policy:
     Attributes:
         key: without wildcards.
         priority: instead of that of the message's class; None leaves it.
-        reliable: how many messages the source keeps for receivers that missed some; None: none.
+        cache: how many messages the source keeps for receivers that missed some; None: none.
         limited: whether `judge` can refuse anything.
     """
 
     def __init__(
-        self, policer: Policer, key: str, priority: Priority | None, reliable: int | None, limits: Sequence[Limit]
+        self, policer: Policer, key: str, priority: Priority | None, cache: int | None, limits: Sequence[Limit]
     ) -> None:
         self.key = key
         self.priority = priority
-        self.reliable = reliable
+        self.cache = cache
         self.limited = bool(limits)
         self._policer = policer
         self._limits = limits
@@ -196,7 +196,7 @@ class Policer:
                     break
         rules = [rule for _, rule in fitting]
         priority: Priority | None = _first_given(rule.priority for rule in rules)
-        return Policy(self, key, priority, _first_given(rule.reliable for rule in rules), limits)
+        return Policy(self, key, priority, _first_given(rule.cache for rule in rules), limits)
 
 
 def _remember(among: OrderedDict[str, T], key: str, value: T, limit: int) -> None:

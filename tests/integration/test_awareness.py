@@ -133,7 +133,7 @@ async def test_who_joins_late_learns_the_last_values(meet: Meet) -> None:
 
 async def test_a_rate_limit_holds_per_type(meet: Meet) -> None:
     """What is sent more often than allowed is dropped, told and counted; other types pass."""
-    a, b = await meet("a", rates_hz={"t": 0.1}), await meet("b")
+    a, b = await meet("a", max_hz={"t": 0.1}), await meet("b")
     module, other = Module(b, "t"), Module(b, "other")
     await a.wait_for("b", "t", timeout_s=5)
     await a.wait_for("b", "other", timeout_s=5)
@@ -183,7 +183,7 @@ async def test_an_empty_name_is_an_error(meet: Meet) -> None:
 @pytest.mark.parametrize("how", ["send", "deliver"])
 async def test_ten_megabytes_arrive_whole(meet: Meet, how: str) -> None:
     """10 MB to one and to all arrive byte for byte, with small messages in between; above the limit is refused."""
-    a, b = await meet("a"), await meet("b", max_message_bytes=20)
+    a, b = await meet("a"), await meet("b", max_bytes=20)
     module, small = Module(b, "t"), Module(b, "small")
     await a.wait_for("b", "small", timeout_s=5)
     data = bytes(range(256)) * 40_000

@@ -40,7 +40,7 @@ RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
 HZ = 200
 KEPT = "macs/from/ros/7/nd__log"
 PLAIN = "macs/from/ros/7/nd__pose"
-KEEP_ALL = [TrafficRule(match="macs/from/ros/*/nd__log", reliable=5000)]
+KEEP_ALL = [TrafficRule(match="macs/from/ros/*/nd__log", cache=5000)]
 
 
 class Routers:
@@ -160,7 +160,7 @@ async def test_nothing_is_lost_while_both_routers_are_away(routers: Routers) -> 
 
 async def test_what_the_source_has_no_more_is_counted(routers: Routers, caplog: pytest.LogCaptureFixture) -> None:
     """With fewer messages kept than an outage takes, the rest is missed: told with the exact count, logged once."""
-    rules = [TrafficRule(match=KEPT, reliable=50)]
+    rules = [TrafficRule(match=KEPT, cache=50)]
     caplog.set_level(logging.WARNING, "macs.mesh")
     async with robot_and_receiver(routers, rules) as (source, receiver, kept, _), Stream(source, KEPT):
         await until(lambda: kept.heard)
@@ -250,7 +250,7 @@ async def test_who_subscribes_late_gets_what_comes_next(routers: Routers) -> Non
 
 async def test_other_keys_are_not_kept(routers: Routers) -> None:
     """A rule for all keys keeps topic data and messages to all, and no commands: an old command must not come late."""
-    rules = [TrafficRule(match="**", reliable=100)]
+    rules = [TrafficRule(match="**", cache=100)]
     command = "macs/to/ros/0/7/unity/256"
     async with robot_and_receiver(routers, rules) as (source, receiver, kept, _):
         commands = Numbers()
@@ -341,8 +341,8 @@ async def test_a_reliable_type_reaches_everybody_afterwards(routers: Routers) ->
     async with (
         macs_zenoh.join("ros", connect=routers.endpoints) as one,
         macs_zenoh.join("ros", connect=routers.endpoints[::-1]) as two,
-        awareness.join(one, "a", reliable={"planning": 50}) as a,
-        awareness.join(two, "b", reliable={"planning": 50}) as b,
+        awareness.join(one, "a", cache={"planning": 50}) as a,
+        awareness.join(two, "b", cache={"planning": 50}) as b,
     ):
         heard: list[tuple[str, bytes]] = []
         for message_type in ("planning", "other"):
@@ -373,7 +373,7 @@ async def test_zenohs_own_subscriber_recovers_as_well(routers: Routers) -> None:
     zenoh = pytest.importorskip("zenoh")
     ext = pytest.importorskip("zenoh.ext")
     key = NAMED_ALL.of(message_type="t", from_name="a")
-    rules = [TrafficRule(match="macs/ca/all/t/**", reliable=10)]
+    rules = [TrafficRule(match="macs/ca/all/t/**", cache=10)]
     async with await Mesh.open(MeshSettings(connect=routers.endpoints), traffic=rules) as source:
         config = zenoh.Config()
         config.insert_json5("mode", '"client"')
@@ -417,7 +417,7 @@ async def test_the_access_rules_let_missed_messages_be_asked_for(allowed: bool, 
             for user in ("robot-7", "gateway-1")
         }
         async with (
-            await Mesh.open(settings["robot-7"], traffic=[TrafficRule(match="**", reliable=5000)]) as source,
+            await Mesh.open(settings["robot-7"], traffic=[TrafficRule(match="**", cache=5000)]) as source,
             await Mesh.open(settings["gateway-1"]) as receiver,
             Stream(source, KEPT) as stream,
         ):

@@ -753,7 +753,7 @@ async def test_what_was_missed_is_asked_for(tmp_path: Path) -> None:
     """A gateway gets what it missed of a reliable topic, and a robot of a reliable message type, through a restart of
     the router."""
     found = made(tmp_path / "pki")
-    rules = [config.TrafficRule(match="**", reliable=5000)]
+    rules = [config.TrafficRule(match="**", cache=5000)]
     keys = ("macs/from/ros/7/nd__log", "macs/ca/all/planning/by/drone7")
     router = Router(found.file())
     async with (

@@ -163,7 +163,7 @@ async def test_what_a_limit_drops_of_a_reliable_key_is_not_asked_for(router: str
         taker = Taker(receiver, MARKER)
         arrived: list[Sample] = []
         receiver.subscribe(CAMERA, arrived.extend, reliable=True)
-        mesh = await sender(taker, TrafficRule(match=CAMERAS, reliable=100, max_bytes=10))
+        mesh = await sender(taker, TrafficRule(match=CAMERAS, cache=100, max_bytes=10))
         for number in range(50):
             mesh.put(CAMERA, bytes([number]) * (11 if number % 5 == 0 else 1), Traffic.STREAM)
         await until(lambda: len(arrived) >= 40)

@@ -188,7 +188,7 @@ async def test_what_cannot_be_delivered_is_told(
     start: StartGateway, peer: Peer, ground: Ground, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A module hears of each message without receiver, with its reason; the log has one line for each reason."""
-    gateway = await start(max_message_bytes=1000)
+    gateway = await start(max_bytes=1000)
     undelivered = await peer.subscription(LocalGenericMessage, "/gateway_undelivered")
     out = await peer.publisher(LocalGenericMessage, "/gateway_out", matched=1)
     await peer.sees("/gateway_undelivered", publishers=1, subscriptions=1)

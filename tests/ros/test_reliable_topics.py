@@ -30,7 +30,7 @@ HZ = 100
 AWAY_S = 4.0
 """Longer than the lease, so that each side has seen the other leave."""
 
-RULES = [TopicRule(match="/log", keep_for_recovery=2000)]
+RULES = [TopicRule(match="/log", cache=2000)]
 
 
 @pytest.fixture

@@ -514,7 +514,7 @@ async def test_nothing_of_an_agent_is_its_successors(router: str, domain: int, p
 
 async def test_a_session_that_only_lost_its_way_keeps_what_it_had(router: str, domain: int) -> None:
     """The same agent is no other one for having been away: what lingers for it stays."""
-    rule = TopicRule(match="/log", keep_for_recovery=10)
+    rule = TopicRule(match="/log", cache=10)
     settings = Settings(mesh=MeshSettings(connect=[router]), robot=RobotSettings(id=ROBOT, rules=[rule]))
     async with (
         open_robot(settings, domain_id=domain) as robot,

@@ -52,7 +52,7 @@ def test_a_file_sets_its_fields(tmp_path: Path) -> None:
         ("[[robot.rules]]\nmatch = '/a'\ndeadman_s = 1", "f.toml: robot.rules.deadman_s", "needs a deadman_message"),
         ("[[traffic]]\nmatch = 'macs/all/**'\nmax_hz = 0", "f.toml: traffic[0].max_hz", "expected `float` > 0"),
         ("[[traffic]]\nmatch = 'macs/all/**'\npriority = 'high'", "f.toml: traffic[0].priority", "'high'"),
-        ("[[traffic]]\nmatch = 'macs/all/**'\nreliable = 0", "f.toml: traffic[0].reliable", ">= 1"),
+        ("[[traffic]]\nmatch = 'macs/all/**'\ncache = 0", "f.toml: traffic[0].cache", ">= 1"),
         ("[[traffic]]\nmatch = 'macs/all/**'\nmaxhz = 5", "f.toml: traffic[0]", "did you mean `max_hz`?"),
         ("[[traffic]]\nmax_hz = 5", "f.toml: traffic[0]", "missing required field `match`"),
         ("[[traffic]]\nmatch = '/cmd_vel'", "f.toml: traffic.match", "'/cmd_vel' is not a key expression"),
@@ -104,14 +104,14 @@ def test_a_file_has_rules_for_traffic_and_topics() -> None:
     """Rules keep their order, and what a rule does not say is unset."""
     settings = config.parse(
         "[[traffic]]\nmatch = 'macs/from/**'\nmax_hz = 5\npriority = 'data_low'\n"
-        "[[traffic]]\nmatch = '**'\nmax_bytes = 1000\nmax_bytes_per_s = 2000\nreliable = 10\n"
+        "[[traffic]]\nmatch = '**'\nmax_bytes = 1000\nmax_bytes_per_s = 2000\ncache = 10\n"
         "[[robot.rules]]\nmatch = '/a'\npriority = 'data_high'\n"
     )
     assert settings.traffic == [
         TrafficRule(match="macs/from/**", max_hz=5.0, priority="data_low"),
-        TrafficRule(match="**", max_bytes=1000, max_bytes_per_s=2000, reliable=10),
+        TrafficRule(match="**", max_bytes=1000, max_bytes_per_s=2000, cache=10),
     ]
-    assert settings.traffic[0].reliable is None
+    assert settings.traffic[0].cache is None
     assert settings.robot.rules == [TopicRule(match="/a", priority="data_high")]
 
 

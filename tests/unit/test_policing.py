@@ -49,10 +49,10 @@ def test_each_setting_comes_from_the_first_rule_that_gives_it() -> None:
     """A rule in front adds to or replaces single settings of those behind, and leaves the others."""
     shape = shape_of(
         TrafficRule(match=CAMERAS, priority="data_low"),
-        TrafficRule(match="macs/from/**", priority="background", max_bytes=500, reliable=3),
-        TrafficRule(match="**", max_bytes=100, reliable=9),
+        TrafficRule(match="macs/from/**", priority="background", max_bytes=500, cache=3),
+        TrafficRule(match="**", max_bytes=100, cache=9),
     )
-    assert (shape.priority, shape.reliable) == ("data_low", 3)
+    assert (shape.priority, shape.cache) == ("data_low", 3)
     assert shape.judge(500, 0.0) is None
     over = shape.judge(501, 0.0)
     assert over is not None
@@ -61,7 +61,7 @@ def test_each_setting_comes_from_the_first_rule_that_gives_it() -> None:
 
 def test_a_rule_without_limits_refuses_nothing() -> None:
     """Where only priority or reliability is set, the messages need not be counted one by one."""
-    shape = shape_of(TrafficRule(match="**", priority="data_low", reliable=5))
+    shape = shape_of(TrafficRule(match="**", priority="data_low", cache=5))
     assert not shape.limited
     assert passed(shape, [0.0] * 1000, size=1 << 20) == [0.0] * 1000
 
