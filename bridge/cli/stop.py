@@ -129,7 +129,7 @@ async def _settle(operator: Operator, robot: int, args: argparse.Namespace) -> O
         except Refused as refusal:
             return Outcome(robot, False, problem=refusal.reason)
         except CallTimeout:
-            if not unserved:  # the last attempt may be cut short
+            if not unserved and outcome.stopped is None:  # the last attempt may be cut short
                 outcome = Outcome(robot, False, problem=f"no answer within {args.timeout:g} s")
             patience_s *= 2
             continue
