@@ -4,6 +4,7 @@ mesh without duplicate ids."""
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
 import time
@@ -440,6 +441,33 @@ async def test_two_agents_have_leased_the_same_id(sites: Sites, caplog: pytest.L
         await asyncio.sleep(0.05)
     watching.close()
     assert set(streamed) == {"macs/from/ros/2/nd__x"}
+
+
+async def test_an_agent_uses_robots_under_its_new_id(sites: Sites) -> None:
+    """What an agent had asked of a robot holds under the id it has to take, and is taken back for the old one."""
+    await sites.part()
+    one, two = await sites.agent("a", "unity", "aa"), await sites.agent("b", "unity", "bb")
+    assert one.id == two.id
+    robot = await sites.robot("b", 1002)
+    await until(lambda: (1, 1002) in two.directory)
+    chatter = await two.subscribe("/chatter", robot=1002, type="std_msgs/String")
+
+    async def heard(text: bytes) -> None:
+        while True:
+            robot.chatter(text)
+            with contextlib.suppress(asyncio.TimeoutError):
+                while (await asyncio.wait_for(chatter.receive(), 0.2)).data != text:
+                    pass
+                return
+
+    await asyncio.wait_for(heard(b"parted"), 20)
+    assert await two.call_service("/set", b"x", robot=1002, type="std_srvs/SetBool") == b"done: x"
+    await sites.meet()
+    await until(lambda: two.id != one.id, 20)
+    topic, service = (NodeType.SUBSCRIBER, "nd__chatter"), (NodeType.CLIENT, "nd__set")
+    await until(lambda: robot.registrants == {topic: {two.id}, service: {two.id}}, 20)
+    await asyncio.wait_for(heard(b"together"), 20)
+    assert await two.call_service("/set", b"y", robot=1002) == b"done: y"
 
 
 async def test_what_fails_for_one_agent_stops_no_other(
