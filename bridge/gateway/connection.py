@@ -138,7 +138,8 @@ class Connection(asyncio.BufferedProtocol):
         """How many interface nodes the agent has, by type and name."""
         self._last_types: dict[str, int] = {}
         """An existing headset keeps its nodes by name: of two types under one name it has the last."""
-        self._verdicts: dict[Metadata, Verdict] = {}
+        self._verdicts: dict[tuple[object, ...], Verdict] = {}
+        """By metadata without its request id."""
         self.existing = True
         """Whether the agent is an existing program, which gets only what those are known to survive."""
         self.asked = Asked()
@@ -312,7 +313,7 @@ class Connection(asyncio.BufferedProtocol):
         self.send_calls([message])
 
     def send_calls(self, messages: Sequence[Chunk]) -> None:
-        """The same for several, of one size."""
+        """The same for several."""
         if self._paused_at is None:
             self._gather(messages)
             return
@@ -380,7 +381,7 @@ class Connection(asyncio.BufferedProtocol):
 
     def _gather(self, messages: Sequence[Chunk]) -> None:
         """Keep for the flush at the end of the batch, but no more than the transport may hold."""
-        size = len(messages) * len(messages[0])
+        size = sum(map(len, messages))
         if size > WRITE_BUFFER_BYTES and not self._has_room(size):
             return
         if not self._ready:
@@ -419,13 +420,21 @@ class Connection(asyncio.BufferedProtocol):
 
     def verdict(self, metadata: Metadata) -> Verdict:
         """Whether a message with this metadata may be sent, and what its data must be."""
-        verdict = self._verdicts.get(metadata)
+        about = (
+            metadata.sender_agent_id,
+            metadata.node_name,
+            metadata.message_manager,
+            metadata.node_type,
+            metadata.data_exchange_type,
+            metadata.sender_agent_type,
+        )
+        verdict = self._verdicts.get(about)
         if verdict is None:
             verdict = self._judge(metadata)
             if verdict.stays:
                 if len(self._verdicts) >= VERDICTS:
                     self._verdicts.clear()
-                self._verdicts[metadata] = verdict
+                self._verdicts[about] = verdict
         return verdict
 
     def _judge(self, metadata: Metadata) -> Verdict:

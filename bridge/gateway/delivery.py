@@ -15,13 +15,13 @@ from macs_zenoh.errors import WireError
 from macs_zenoh.mesh import Payload, Sample
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import Directory
-from macs_zenoh.protocol.existing import CDR, PASS, Data, Verdict, fitting, least_bytes, refuses, topic_data
+from macs_zenoh.protocol.existing import CDR, PASS, PASS_ONCE, Data, Verdict, fitting, least_bytes, refuses, topic_data
 from macs_zenoh.protocol.judging import Judge
 from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue
 from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, decode_management
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.routing import takes_group_copy
-from macs_zenoh.protocol.wire import Frame, Layout, is_probe, parse_frame, parse_frames
+from macs_zenoh.protocol.wire import Buffer, Frame, Layout, is_probe, parse_frame, parse_frames
 
 from .agents import Agents
 from .backpressure import ROBOT_HOLD_S
@@ -111,8 +111,7 @@ class Delivery:
                     self._late_answer(key, payload)
                 continue
             connection, sender = target
-            for frame, metadata in self._read(key, payload, sender):
-                self._send(connection, frame, metadata, by_id=True)
+            self._send_all(connection, self._read(key, payload, sender))
             if connection.congested:
                 self._hold_sender(sender, [connection])
         self.flush()
@@ -228,9 +227,31 @@ class Delivery:
 
     def _send(self, connection: Connection, frame: Frame, metadata: Metadata, *, by_id: bool = False) -> None:
         verdict = connection.verdict(metadata)
-        if verdict is PASS:
+        if verdict is PASS or verdict is PASS_ONCE:
             connection.send_calls(frame.messages)
-        elif verdict.name:
+        else:
+            self._send_judged(connection, frame, metadata, verdict, by_id=by_id)
+
+    def _send_all(self, connection: Connection, read: Read) -> None:
+        """The frames of one sample that was sent to the agent's id."""
+        messages: list[Buffer] = []
+        for frame, metadata in read:
+            verdict = connection.verdict(metadata)
+            if verdict is PASS or verdict is PASS_ONCE:
+                messages += frame.messages
+                continue
+            if messages:
+                connection.send_calls(messages)
+                messages = []
+            self._send_judged(connection, frame, metadata, verdict, by_id=True)
+        if messages:
+            connection.send_calls(messages)
+
+    def _send_judged(
+        self, connection: Connection, frame: Frame, metadata: Metadata, verdict: Verdict, *, by_id: bool
+    ) -> None:
+        """What does not simply pass."""
+        if verdict.name:
             self._refuse(connection, frame, metadata, verdict, by_id=by_id)
         elif verdict.answers:
             connection.asked.answered(metadata)

@@ -101,12 +101,14 @@ class Verdict(NamedTuple):
     why: str = ""
     data: Data = Data.ANY
     stays: bool = True
-    """Whether the next message with this metadata is judged alike, until the agent registers something."""
+    """Whether the next message with this metadata, of whatever request id, is judged alike, until the agent registers
+    or asks something."""
     answers: bool = False
     """Whether it answers a request: a second one would not."""
 
 
 PASS = Verdict()
+PASS_ONCE = Verdict(stays=False)
 
 
 def _no(name: str, why: str, *, stays: bool = True) -> Verdict:
@@ -188,6 +190,11 @@ class Asked:
         """Whether a plain message would be taken for the answer to what somebody else was asked."""
         return message.request_id in self._plain
 
+    @property
+    def plainly(self) -> bool:
+        """Whether a plain request is open: what a plain message is depends on its number then."""
+        return bool(self._plain)
+
     def answered(self, answer: Metadata) -> None:
         """An answer was passed on: the next one like it answers nothing."""
         self._forget((answer.node_name, answer.request_id, _sender(answer)))
@@ -243,7 +250,7 @@ def to_headset(metadata: Metadata, node_types: Mapping[str, int], asked: Asked, 
         return _answer(wanted)
     if asked.awaits_another(metadata):
         return _no("not_asked", "an answer that it awaits from somebody else", stays=False)
-    return PASS  # until it asks something
+    return PASS_ONCE if asked.plainly else PASS  # until it asks something
 
 
 def _node_to_headset(metadata: Metadata, own: int | None, asked: Asked, registered_there: bool) -> Verdict:
