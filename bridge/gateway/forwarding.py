@@ -21,6 +21,7 @@ from macs_zenoh.protocol.tcp_agent import Sent, Streamed
 from .backpressure import Backpressure
 from .connection import Connection
 from .judged import JudgedFrames, Read
+from .presses import Presses
 from .routes import Route, Routes
 
 PUBLISHER = int(NodeType.PUBLISHER)
@@ -56,6 +57,7 @@ class Forwarding:
         """Whether no two of them can have a receiver in common, so that their order does not matter."""
         self._waited: dict[tuple[bytes, str], tuple[Route, Sent]] = {}
         """Commands that have waited in their connection, the newest of each kind, until all that came is seen."""
+        self._presses = Presses(mesh, directory)
         self._backpressure = Backpressure()
         mesh.on_room(self._backpressure.release)
 
@@ -66,6 +68,10 @@ class Forwarding:
     def leave(self, connection: Connection) -> None:
         """It has ended."""
         self._routes.pop(connection, None)
+
+    def close(self) -> None:
+        """Nothing is forwarded any more."""
+        self._presses.close()
 
     def forget(self, connection: Connection) -> None:
         """It is about to have another id: what it sent goes under the one that it had."""
@@ -167,7 +173,10 @@ class Forwarding:
         """Whether a frame to robots goes on now; a command that has waited may, after all that came with it."""
         now, count, metadata = time.monotonic(), sent.frame.count, sent.metadata
         if traffic is COMMAND:
-            passing = connection.pace.command(count, now, may_stop=metadata.data_exchange_type in STOP_TYPES)
+            may_stop = metadata.data_exchange_type in STOP_TYPES
+            if may_stop:
+                self._presses.look(connection.key, sent.frame, metadata)
+            passing = connection.pace.command(count, now, may_stop=may_stop)
         else:
             passing = connection.pace.request(count, now)
         if passing is Passing.NOW:

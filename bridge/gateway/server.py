@@ -238,6 +238,7 @@ class Gateway:
                 await asyncio.wait_for(self._all_closed.wait(), FLUSH_S)
             for connection in connections:
                 connection.abort()
+        self._forwarding.close()
         self._leases.close()
         self._declarations.close()
         self._presence.close()

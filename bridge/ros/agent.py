@@ -30,7 +30,7 @@ from macs_zenoh.agent import Agent, Call
 from macs_zenoh.config import RobotSettings, Settings
 from macs_zenoh.errors import MacsError, Refused, WireError
 from macs_zenoh.managers import Asker, Managers
-from macs_zenoh.mesh import Mesh
+from macs_zenoh.mesh import Mesh, now_s
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.guard import Guard, Limits
 from macs_zenoh.protocol.keyexpr import type_name, type_number
@@ -245,9 +245,19 @@ class RobotAgent:
 
     def _stop(self, call: Call) -> None:
         """The emergency stop with an answer: data ``true`` or ``false``, as on its topic. In a thread of Zenoh's."""
-        if self.nodes.stop is None:
+        stop, sender, topic = (
+            self.nodes.stop,
+            Registrant(type_number(call.sender_type), call.sender_id),
+            call.metadata.node_name,
+        )
+        if stop is None:
             raise Refused("this robot has no emergency stop")
-        self.nodes.stop.set(Registrant(type_number(call.sender_type), call.sender_id), call.data != b"false")
+        if topic and topic != stop.key.node_name:  # a gateway asks, as what a headset sent may be a stop
+            raise Refused(f"{topic[:80]} is not the emergency stop of this robot, which is {stop.topic}")
+        presses = call.data != b"false"
+        stop.set(sender, presses)
+        if presses and self._guard is not None:
+            self._guard.pressed(sender, now_s())
 
     async def _stopped(self, _call: Call) -> bytes:
         return self._state()

@@ -79,9 +79,10 @@ class DeadMan:
         """Whose command was the last, while it is armed."""
         return self._commander
 
-    def command(self, agent: Hashable, now: float) -> None:
-        """A command was published."""
-        self._commander, self._last = agent, now
+    def command(self, agent: Hashable, sent: float) -> None:
+        """A command was published that was sent then: one that waited on its way says no more than that somebody
+        commanded when it was sent."""
+        self._commander, self._last = agent, max(self._last, sent)
 
     def deadline(self) -> float | None:
         """When it trips unless a command comes; None while it cannot."""

@@ -437,7 +437,7 @@ class PublisherNode(TopicNode):
                 self.robot.tell_refused(message, self.topic, name, why)
                 return
             if self._publish(to_ros(self._cdr, message.data)) and self.deadman is not None:
-                self.deadman.command(Registrant.of(message), time.monotonic())
+                self.deadman.command(Registrant.of(message), time.monotonic() - message.age_s)
                 if self._watch is None:
                     self._watch_silence()
 

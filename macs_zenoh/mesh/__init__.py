@@ -10,6 +10,7 @@ switch less is what a single message feels, and one queue of ours keeps the orde
 the words that all of them use, `zenoh_config` Zenoh's configuration, `threads` how Zenoh and Python share a processor.
 """
 
+from .arrivals import now_s
 from .declared import Aged, AtOnce, Handler, OnBatch, OnMiss, Payload, Sample, Subscription, Token, Traffic
 from .session import Mesh
 from .zenoh_config import configuration
@@ -27,4 +28,5 @@ __all__ = [
     "Token",
     "Traffic",
     "configuration",
+    "now_s",
 ]

@@ -17,6 +17,7 @@ from collections.abc import Callable, Hashable
 from typing import NamedTuple, Protocol
 
 from ..errors import WireError
+from .agent_id import AgentId
 from .credit import Credit
 from .keyexpr import GROUP, UNICAST, sender_of
 from .messages import ROS, NodeType
@@ -26,6 +27,8 @@ from .wire import Layout
 COMMAND = int(NodeType.PUBLISHER)
 Buffer = bytes | bytearray
 
+AGED_S = 0.01
+"""What has waited less has not waited."""
 SINGLE_BYTES = 2048
 RUN_BYTES = 384
 """What is larger than a usual message costs as much as many small ones: a sample may hold several frames."""
@@ -243,6 +246,8 @@ class Guard:
     of the emergency stop, which nothing here holds back. Both are set later: until then nothing is taken here.
     """
 
+    PRESSED = 1024
+
     def __init__(self, limits: Limits, layout: Layout) -> None:
         self.me = (ROS, 0)
         """Type and id of the robot, kept by the agent."""
@@ -254,6 +259,8 @@ class Guard:
         self._rescued = Allowances(limits.commands_per_s)
         self._ages = Ages()
         self._fresh = Fresh(limits.max_command_age_s)
+        self._pressed: OrderedDict[str, float] = OrderedDict()
+        """When somebody asked for a stop last; who did so last is at the end."""
         self._reader = Reader(layout, self._found_bad)
         self._bad = False
         self._lock = threading.Lock()
@@ -300,7 +307,7 @@ class Guard:
             sender = sender_of(key)
             for message in messages:
                 if self._passes(message, sender, age_s, now):
-                    command(message)
+                    command(message._replace(age_s=age_s) if age_s > AGED_S else message)
         return True
 
     def judge(self, message: Message, key: str, age_s: float, now: float) -> bool:
@@ -310,6 +317,15 @@ class Guard:
             return True
         with self._lock:
             return self._passes(message, sender_of(key), age_s, now)
+
+    def pressed(self, sender: tuple[int, int], now: float) -> None:
+        """Somebody has stopped the robot by asking, which overtakes what it puts: a release that it sent before is not
+        what it wants now."""
+        with self._lock:
+            self._pressed[name := str(AgentId(*sender))] = now
+            self._pressed.move_to_end(name)
+            if len(self._pressed) > self.PRESSED:
+                self._pressed.popitem(last=False)
 
     def rescue(self, key: str, payload: Buffer, now: float) -> None:
         """Of a sample that is not admitted: whoever floods may still stop the robot. What names the stop and does not
@@ -328,10 +344,18 @@ class Guard:
     def _passes(self, message: Message, sender: str, age_s: float, now: float) -> bool:
         if self._stops(message):
             return True
+        if self._overtaken(message, sender, age_s, now):
+            self.on_dropped("too_old", sender, "a release was sent before the stop that its sender asked for")
+            return False
         if self._fresh.take(sender, age_s, now):
             return True
         self.on_dropped("too_old", sender, f"a command has waited for {age_s:.2f} s on its way, or behind such a one")
         return False
+
+    def _overtaken(self, message: Message, sender: str, age_s: float, now: float) -> bool:
+        if not self._pressed or not self.stop_name or message.metadata.node_name != self.stop_name:
+            return False
+        return self._pressed.get(sender, -math.inf) > now - age_s
 
     def _stops(self, message: Message) -> bool:
         name = message.metadata.node_name

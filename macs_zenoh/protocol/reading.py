@@ -19,12 +19,13 @@ from .wire import Layout, parse_frame, parse_frames
 
 class Message(NamedTuple):
     """What an agent receives. The sender comes from the key, which a router can hold it to, not from the JSON; in
-    ``metadata`` it is put right."""
+    ``metadata`` it is put right. ``age_s``: how long a command has waited on its way, where that was judged."""
 
     sender_type: str
     sender_id: int
     metadata: Metadata
     data: bytes
+    age_s: float = 0.0
 
 
 class _Sender(NamedTuple):

@@ -67,6 +67,17 @@ def test_control_is_handed_over_and_released() -> None:
     assert held.take("a", 2)
 
 
+def test_a_command_that_waited_counts_from_when_it_was_sent() -> None:
+    """The dead-man acts as long after the driver's last command was sent, however late it came; what was sent before
+    another shortens nothing."""
+    deadman = DeadMan(0.5)
+    deadman.command("a", 10.0)
+    deadman.command("a", 9.7)
+    assert deadman.deadline() == 10.5
+    assert not deadman.tick(10.4)
+    assert deadman.tick(10.5)
+
+
 def test_a_dead_man_trips_once_per_silence() -> None:
     """Armed by a command, it trips when time or the commander is gone, and then not again."""
     deadman = DeadMan(0.5)

@@ -13,7 +13,9 @@ from bridge.ros.agent import open_robot
 from bridge.ros.stop_line import apart
 from macs_zenoh import join
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings
+from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.guard import Guard
+from macs_zenoh.protocol.messages import Metadata
 from tests.routers import Router
 
 ROBOT = 7
@@ -75,6 +77,10 @@ async def test_the_stop_is_served_before_and_after_its_session(domain: int, over
         assert line is not None
         await until(lambda: line.is_open)
         await operator.call("ros", ROBOT, "stop", b"false", timeout_s=20)
+        assert not robot.nodes.robot.stop.stopped
+        about = Metadata(node_name="nd__another")
+        with pytest.raises(Refused, match="is not the emergency stop of this robot, which is /emergency_stop"):
+            await operator.call("ros", ROBOT, "stop", b"true", metadata=about, timeout_s=20)
         assert not robot.nodes.robot.stop.stopped
         await line.close()
         await operator.call("ros", ROBOT, "stop", b"true", timeout_s=20)

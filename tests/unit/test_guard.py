@@ -274,6 +274,29 @@ def test_a_stop_passes_however_old_and_however_many(guard: Guard, taken: list[Me
     assert dropped == ["too_old", "flooded"]
 
 
+def test_a_release_that_a_stop_has_overtaken_releases_nothing(guard: Guard, taken: list[Message]) -> None:
+    """Who asks for a stop is faster than what he puts: his release from before it comes later, and is none any more;
+    one that was sent after it is, and so is another's."""
+    release = frame(STOP, b"\x00\x01\x00\x00\x00")
+    guard.pressed((2, 300), 10.0)
+    assert guard.first(KEY, release, 0.3, 10.2)
+    assert not taken
+    assert guard.first(unicast_key(1, 7, 2, 301), release, 0.3, 10.2)
+    assert guard.first(KEY, frame(), 0.3, 10.2)
+    assert guard.first(KEY, release, 0.001, 10.3)
+    assert len(taken) == 3
+    for number in range(2 * Guard.PRESSED):
+        guard.pressed((2, 1000 + number), 11.0)
+    assert len(guard._pressed) == Guard.PRESSED
+
+
+def test_a_command_tells_how_long_it_has_waited(guard: Guard, taken: list[Message]) -> None:
+    """So that a dead-man counts from when it was sent."""
+    assert guard.first(KEY, frame(), 0.4, 10.0)
+    assert guard.first(KEY, frame(), 0.001, 11.0)
+    assert [message.age_s for message in taken] == [0.4, 0.0]
+
+
 def test_who_names_the_stop_without_end_does_not_take_a_robots_time(guard: Guard, taken: list[Message]) -> None:
     """What is looked at for a stop, of all that is not admitted, is as much as may be admitted; another's is apart."""
     for number in range(1000):
