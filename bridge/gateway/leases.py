@@ -159,9 +159,9 @@ class Leases:
             self._judging = None
         now = time.monotonic()
         self._contests.look({block: self._holders.get(block, set()) - {self._mesh.zid} for block in self.blocks}, now)
-        for block, others, give_way in self._contests.judge(now):
-            by = f"session {' and '.join(others)}"
-            if give_way:
+        for verdict in self._contests.judge(now):
+            block, by = verdict.what, f"session {' and '.join(verdict.others)}"
+            if verdict.give_way:
                 log.warning("block %d is also leased by %s, which keeps it", block, by)
                 self.blocks.remove(block)
                 self._free.remove_block(block)

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
 from .keyexpr import BLOCK_SIZE, block_of
 
@@ -107,7 +107,8 @@ def free_id(taken: Collection[int], leased_blocks: Collection[int] = ()) -> int 
     return next((i for i in range(1, 0x10000) if i not in taken and block_of(i) not in leased_blocks), None)
 
 
-class Verdict(NamedTuple, Generic[T]):
+@dataclass(frozen=True)  # a NamedTuple that is generic needs Python 3.11
+class Verdict(Generic[T]):
     """What to do about something of ours that ``others`` (Zenoh ids) hold as well: give way, or tell a person."""
 
     what: T

@@ -164,6 +164,14 @@ def test_one_module_spells_keys_and_one_endpoints(path: Path) -> None:
         assert [p.value for p in made if isinstance(p, ast.Constant) and ENDPOINT.fullmatch(str(p.value))] == []
 
 
+def test_the_oldest_python_can_load_it() -> None:
+    """No class is a named tuple and something else as well, such as generic: Python 3.10 refuses to load that."""
+    for path in (*CORE, *BRIDGE):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and len(node.bases) > 1:
+                assert "NamedTuple" not in {ast.unparse(base) for base in node.bases}, f"{path.name}: {node.name}"
+
+
 def test_the_public_names_are_there() -> None:
     """Each name that macs_zenoh lists can be had, errors among them, and it knows its version."""
     for name in macs_zenoh.__all__:
