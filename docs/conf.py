@@ -8,6 +8,7 @@ from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from sphinx.application import Sphinx
 
 HERE = Path(__file__).parent
@@ -18,7 +19,7 @@ import reference_pages  # noqa: E402
 project = "macs-zenoh"
 copyright = "the macs-zenoh authors, Apache-2.0"  # noqa: A001
 release = version = version_of("macs-zenoh")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton"]
 exclude_patterns = ["Thumbs.db", ".DS_Store"]
 
 html_theme = "furo"
@@ -59,14 +60,28 @@ def lead_inside(app: Sphinx, name: str, source: list[str]) -> None:
 def code_as_written(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
     """Docstrings write `name` for code, also before letters (`advertise`d), where reStructuredText wants a space."""
     text = re.sub(r"(?<![`:\w])`([^`\n]+)`(?!`)(\w?)", lambda code: _code(*code.groups()), "\n".join(lines))
+    text = re.sub(r"^Alias for field number \d+$", "", text, flags=re.MULTILINE)  # Python's own, of named tuples
+    text = re.sub(r"^(Args|Raises):\n((?:    .*\n?)+)", _fields, text, flags=re.MULTILINE)
     lines[:] = text.split("\n")
+
+
+def _fields(section: re.Match[str]) -> str:
+    """A section of names with texts, as reStructuredText has it."""
+    kind = {"Args": "param", "Raises": "raises"}[section[1]]
+    return "\n" + re.sub(r"^    (\w+): ", rf":{kind} \1: ", section[2], flags=re.MULTILINE)
 
 
 def _code(code: str, letter: str) -> str:
     return f"``{code}``" + (f"\\ {letter}" if letter else "")
 
 
+def signature(app: Sphinx, what: str, name: str, value: Any, *_: Any) -> tuple[str, None] | None:
+    """Structs have a field for each parameter, with ranges: too much for a line."""
+    return ("(…)", None) if isinstance(value, type) and issubclass(value, msgspec.Struct) else None
+
+
 def setup(app: Sphinx) -> None:
+    app.connect("autodoc-process-signature", signature)
     app.connect("autodoc-process-docstring", code_as_written)
     app.connect("builder-inited", write_pages)
     app.connect("source-read", lead_inside)

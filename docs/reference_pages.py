@@ -236,7 +236,7 @@ def _default(field: Any) -> str:
 def api() -> str:
     """What ``macs_zenoh`` exports, by what kind it is."""
     kinds: dict[str, list[str]] = {"Functions": [], "Classes": [], "Errors": []}
-    for name in macs_zenoh.__all__:
+    for name in public_names():
         value = getattr(macs_zenoh, name)
         is_class = isinstance(value, type)
         kind = "Errors" if is_class and issubclass(value, BaseException) else "Classes" if is_class else "Functions"
@@ -248,10 +248,33 @@ def api() -> str:
         for name in names:
             directive = "autofunction" if kind == "Functions" else "autoexception" if kind == "Errors" else "autoclass"
             lines += [f".. {directive}:: macs_zenoh.{name}"]
-            lines += ["   :members:", "   :undoc-members:"] if directive == "autoclass" else []
-            lines += [""]
+            lines += [*_members(getattr(macs_zenoh, name)), ""] if directive == "autoclass" else [""]
         lines += ["```", ""]
     return "\n".join(lines)
+
+
+def public_names() -> list[str]:
+    """What ``macs_zenoh`` exports, but for what needs a ROS that is not here."""
+    return [name for name in macs_zenoh.__all__ if _is_here(name)]
+
+
+def _is_here(name: str) -> bool:
+    try:
+        return bool(getattr(macs_zenoh, name))
+    except ImportError:
+        return False
+
+
+def _members(value: Any) -> list[str]:
+    """What is listed of a class: all, but of a struct its fields in one line, since types with ranges fill pages."""
+    shown = ["   :members:", "   :undoc-members:"]
+    if not (isinstance(value, type) and issubclass(value, msgspec.Struct)):
+        return shown
+    fields = [field.name for field in msgspec.structs.fields(value)]
+    where = ". Each is explained under Settings" if hasattr(value, "section") else ""
+    fields_line = f"   Fields: {', '.join(f'``{name}``' for name in fields)}{where}."
+    hidden = ", ".join([*fields, "section", "zenoh"])
+    return [*shown, f"   :exclude-members: {hidden}", "", fields_line]
 
 
 # Counters

@@ -178,7 +178,7 @@ class Agent:
     # -- receive -------------------------------------------------------------------------------------------------
 
     async def receive(self) -> Message:
-        """The next message sent to this agent's id, its group or everybody. Raises Closed once it is."""
+        """The next message sent to this agent's id, its group or everybody. Raises Closed once the agent is closed."""
         while not self._inbox:
             self._check_open()
             self._arrived.clear()
@@ -196,7 +196,7 @@ class Agent:
     def on_message(self, handler: OnMessage) -> Handle:
         """Pass messages to ``handler``, on the loop, instead of keeping them for `receive`; it should not raise.
 
-        There is one handler at a time: another one takes its place. Closed, messages are kept again.
+        There is one handler at a time; a new one takes its place. When the handle is closed, messages are kept again.
         """
         self._on_message = handler
         while self._inbox:
@@ -348,7 +348,7 @@ class Agent:
             timeout_s: how long the robots may take to answer.
 
         It holds for robots that come later or come back as well. Several subscriptions of one topic share what goes
-        over the mesh. Of what a latched topic holds, only the first gets its share.
+        over the mesh; what a latched topic holds comes to the first of them only.
 
         Raises Refused with the robot's reason when none of those online lets it, CallTimeout, Unreachable when no
         robot tells its type, UsageError, Closed.
@@ -364,7 +364,10 @@ class Agent:
         type: str | None = None,  # noqa: A002
         timeout_s: float = ANSWER_S,
     ) -> TopicPublisher:
-        """Be able to publish to a topic of robots, until the publisher is closed. As of `subscribe`."""
+        """Be able to publish to a topic of robots, until the publisher is closed.
+
+        Parameters and errors are those of `subscribe`.
+        """
         return await self._robot_nodes().advertise(topic, robot, group, type, timeout_s)
 
     async def publish(

@@ -224,9 +224,9 @@ class Headset:
             del self._open[request_id]
 
     async def ask_gateway(self, manager: str, data: Mapping[str, object], *, timeout_s: float = 5.0) -> bytes:
-        """Ask the gateway something that a manager answers which somebody added there; its answer's data.
+        """Ask a manager that somebody added to the gateway; returns its answer's data.
 
-        Raises Refused with its reason, CallTimeout, also when there is no such manager, which the gateway's log says.
+        Raises Refused with its reason, or CallTimeout, also when there is no such manager (see the gateway's log).
         """
         request_id = self._next_request
         self._next_request = (request_id + 1) % REQUEST_IDS
@@ -290,7 +290,7 @@ class Headset:
         agents: Collection[int] = (),
         groups: Collection[int] = (),
     ) -> None:
-        """Publish one message, after registering where that is still to be done.
+        """Publish one message; registers first where that is needed.
 
         A robot needs a moment to make the publisher and ROS another to find its subscribers, so the very first
         message may find nobody; keep an `advertise`d Publisher where that matters.
@@ -345,7 +345,7 @@ class Headset:
         groups: Collection[int] = (),
         buffer_size: int = DEFAULT_BUFFER_SIZE,
     ) -> ActionClient:
-        """Be able to give goals to an action that runs on these robots; ``buffer_size`` is for feedback."""
+        """Register to give goals to an action that runs on these robots; ``buffer_size`` is for feedback."""
         node = self._nodes.get((NodeType.ACTION, node_name(action)))
         if not isinstance(node, ActionClient):
             node = ActionClient(self, NodeSpec(NodeType.ACTION, action, data_type, buffer_size))

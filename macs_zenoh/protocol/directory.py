@@ -25,9 +25,12 @@ def published(zid: str) -> str:
 
 
 class AgentInfo(NamedTuple):
-    """One agent as the mesh sees it. ``type`` is the number; ``group`` 0 means none; ``zid`` is the Zenoh
-    session that declared it (the agent's own, or its gateway's), as it is `published`, and ``epoch`` which of all
-    that had the id in that session it is: what belongs to one of them is not the next one's."""
+    """One agent as the mesh sees it.
+
+    ``type`` is the number; ``group`` 0 means none. ``zid`` is the Zenoh session that declared it, the agent's own or
+    its gateway's, as it is `published`. ``epoch`` counts those that had this id in that session one after the other:
+    what belongs to one of them does not belong to the next.
+    """
 
     type: int
     id: int
