@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.key is not None:
         return _explain(args.key, as_json=args.json)
-    rows = [_row(plane, space) for plane, space in keyexpr.KEYS.items()]
+    rows = [_row(name, space) for name, space in keyexpr.KEYS.items()]
     if args.json:
         output.say(json.dumps(rows, indent=2))
     else:
@@ -38,9 +38,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _row(plane: str, space: Key) -> dict[str, str]:
+def _row(name: str, space: Key) -> dict[str, str]:
     return {
-        "plane": plane,
+        "space": name,
         "key": space.template,
         "publisher": space.publisher,
         "subscriber": space.subscriber,
@@ -50,9 +50,9 @@ def _row(plane: str, space: Key) -> dict[str, str]:
 
 def _table(rows: list[dict[str, str]]) -> Iterator[Block]:
     """Key space and key in columns, the sentences below each: they do not fit beside it on a terminal."""
-    width = max(len(row["plane"]) for row in rows)
+    width = max(len(row["space"]) for row in rows)
     for row in rows:
-        yield f"{row['plane']:{width}}  {row['key']}", HEADING
+        yield f"{row['space']:{width}}  {row['key']}", HEADING
         said = (("from", row["publisher"]), ("to", row["subscriber"]), ("payload", row["payload"]))
         yield Columns(said, indent=width + 4)
 
@@ -62,14 +62,14 @@ def _explain(key: str, *, as_json: bool) -> int:
     if known is None:
         output.note(f"macs keys: {key!r} is no concrete key of this mesh (`macs keys` lists them)")
         return 1
-    plane, fields = known
-    space = keyexpr.KEYS[plane]
+    name, fields = known
+    space = keyexpr.KEYS[name]
     if as_json:
-        output.say(json.dumps({**_row(plane, space), "fields": fields}))
+        output.say(json.dumps({**_row(name, space), "fields": fields}))
         return 0
     terminal.show(
-        (f"{plane}: {space.template}", HEADING),
-        Columns([(name, _shown(name, value)) for name, value in fields.items()], indent=2, gap=1),
+        (f"{name}: {space.template}", HEADING),
+        Columns([(field, _shown(field, value)) for field, value in fields.items()], indent=2, gap=1),
         f"from {space.publisher}",
         f"to {space.subscriber}",
         f"payload: {space.payload}",

@@ -415,12 +415,12 @@ KEYS: dict[str, Key] = {
     "last value": LAST,
     "ping": PING,
 }
-"""Every key space by the name of its plane."""
+"""Every key space by its name."""
 
 
 def parse(key: str) -> tuple[str, dict[str, FieldValue]] | None:
-    """Which plane a concrete key belongs to, and its fields; None for a key that is not ours."""
-    for plane, space in KEYS.items():
+    """Which key space a concrete key belongs to, and its fields; None for a key that is not ours."""
+    for name, space in KEYS.items():
         if (fields := space.parse(key)) is not None:
-            return plane, fields
+            return name, fields
     return None

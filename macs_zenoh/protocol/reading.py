@@ -119,11 +119,11 @@ class Reader:
         parsed = keyexpr.parse(key)
         if parsed is None:
             return None
-        plane, fields = parsed
+        space, fields = parsed
         kind = int(fields["from_type"])
         if len(self._senders) >= self.KNOWN:
             self._senders.clear()
-        sender = self._senders[key] = _Sender(kind, int(fields["from_id"]), type_name(kind), plane == "broadcast")
+        sender = self._senders[key] = _Sender(kind, int(fields["from_id"]), type_name(kind), space == "broadcast")
         return sender
 
     def _read_metadata(self, sender: _Sender, raw: bytes) -> Metadata:

@@ -126,7 +126,7 @@ FORGED = {
 async def test_the_sender_is_who_the_key_says(
     forged: bytes, router: str, start_gateway: StartGateway, connect: Connect
 ) -> None:
-    """Whatever metadata says, a headset is told the sender of the key, for each frame of a run and on every plane."""
+    """Whatever metadata says, a headset is told the sender of the key, for each frame of a run, by every key."""
     gateway = await start_gateway()
     true = Metadata(ROS, 7, 5, "Greeting").encode()
     async with socket(gateway) as headset, await Mesh.open(MeshSettings(connect=[router])) as robot:

@@ -306,19 +306,19 @@ def test_ros_arguments_go_to_the_end_of_the_line() -> None:
 
 
 def test_keys_prints_every_key_space(capsys: pytest.CaptureFixture[str]) -> None:
-    """The table has each plane with its key."""
+    """The table has each key space with its key."""
     assert main(["keys"]) == 0
     shown = capsys.readouterr().out
-    for plane, key in KEYS.items():
-        assert plane in shown
+    for name, key in KEYS.items():
+        assert name in shown
         assert key.template in shown
 
 
 def test_keys_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     """--json is the same table for programs."""
     assert main(["keys", "--json"]) == 0
-    assert {row["plane"]: row["key"] for row in json.loads(capsys.readouterr().out)} == {
-        plane: key.template for plane, key in KEYS.items()
+    assert {row["space"]: row["key"] for row in json.loads(capsys.readouterr().out)} == {
+        name: key.template for name, key in KEYS.items()
     }
 
 

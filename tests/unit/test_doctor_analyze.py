@@ -18,9 +18,6 @@ from bridge.doctor import report, transport
 from bridge.doctor.analyze import analyze, found, worst
 from bridge.doctor.checks import CHECKS, ERROR, GROUPS, NOTE, OK, WARNING, Severity
 from bridge.doctor.facts import Certificate, Clock, Echo, Endpoint, Facts, Rights, RouterInfo, Session, Tls
-from bridge.principal import Principal
-from macs_zenoh.config import GatewaySettings, OperatorSettings, RobotSettings, Settings
-from macs_zenoh.errors import UsageError
 from macs_zenoh.protocol import endpoints
 from macs_zenoh.protocol.keyexpr import LEASE, NAME, PRESENCE
 from macs_zenoh.protocol.ping import Pong
@@ -517,21 +514,6 @@ def test_the_worst_finding_counts() -> None:
 # -- looking -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("endpoint", "where"),
-    [
-        ("tcp/127.0.0.1:7447", ("127.0.0.1", 7447)),
-        ("tls/[::1]:7447#iface=lo", ("::1", 7447)),
-        ("tcp/router.site:7447?prio=6-7", ("router.site", 7447)),
-        ("unixsock-stream//run/zenoh.sock", None),
-        ("tcp/host", None),
-    ],
-)
-def test_an_endpoint_says_where_it_is(endpoint: str, where: tuple[str, int] | None) -> None:
-    """Host and port come out of endpoints that have them."""
-    assert endpoints.address_of(endpoint) == where
-
-
 def test_an_endpoint_may_bring_its_own_tls_settings() -> None:
     """What an endpoint says after # comes before the configuration; null there is nothing."""
     zenoh = {"root_ca_certificate": "a.pem", "connect_certificate": None}
@@ -539,22 +521,6 @@ def test_an_endpoint_may_bring_its_own_tls_settings() -> None:
     assert settings == {"root_ca_certificate": "b.pem", "enable_mtls": "true"}
     assert not transport.presents_certificate(settings)
     assert transport.presents_certificate({**settings, "connect_certificate": "c.pem"})
-
-
-def test_whose_rights_are_tried() -> None:
-    """The settings say who somebody is, or --as does; what is nobody is refused."""
-    assert str(Principal.of(Settings())) == ""
-    assert str(Principal.of(Settings(robot=RobotSettings(id=7)))) == "ros/7"
-    assert str(Principal.of(Settings(gateway=GatewaySettings(block=3)))) == "gateway/3"
-    assert str(Principal.of(Settings(gateway=GatewaySettings(blocks=[4, 5])))) == "gateway/4"
-    assert str(Principal.of(Settings(operator=OperatorSettings(id=5)))) == "operator/5"
-    assert Principal.parse("gateway/1").agent == (2, 511)
-    assert Principal.parse("ros/7").agent == (1, 7)
-    assert not Principal.parse("observer").joins
-    assert Principal.parse("operator/5").calls
-    for text in ("robot", "ros/", "gateway/256", "ros/65536", "1/x", "drone/1"):
-        with pytest.raises(UsageError):
-            Principal.parse(text)
 
 
 def test_a_pong_of_another_version_is_read() -> None:

@@ -31,7 +31,7 @@ from macs_zenoh.protocol.limits import KEY_BYTES
 FORBIDDEN = "/*$?#%"
 """Characters that Zenoh gives a meaning to, and the one that escapes them."""
 
-by_plane = pytest.mark.parametrize("plane", KEYS)
+by_space = pytest.mark.parametrize("space_name", KEYS)
 
 texts = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=12) | st.text(
     FORBIDDEN + "@~. aé\0\n", min_size=1, max_size=6
@@ -55,10 +55,10 @@ def fields_of(space: Key) -> st.SearchStrategy[dict[str, int | str]]:
 # -- what Zenoh would not survive ------------------------------------------------------------------------------------
 
 
-@by_plane
-def test_a_key_is_never_longer_than_zenoh_can_write(plane: str) -> None:
+@by_space
+def test_a_key_is_never_longer_than_zenoh_can_write(space_name: str) -> None:
     """Texts of any length make a key of less than 64 KiB, or are refused; so does what is subscribed to."""
-    space = KEYS[plane]
+    space = KEYS[space_name]
     for text in (
         "x" * 200,
         "\U0001f916" * 200,
@@ -79,31 +79,31 @@ def test_a_key_is_never_longer_than_zenoh_can_write(plane: str) -> None:
                 zenoh.KeyExpr(key)
 
 
-@by_plane
-def test_longer_keys_are_nobodys(plane: str) -> None:
+@by_space
+def test_longer_keys_are_nobodys(space_name: str) -> None:
     """What others put on a key of 60 000 characters is not looked at."""
-    space = KEYS[plane]
+    space = KEYS[space_name]
     assert space.parse(re.sub("{.*?}", "7" * 20_000, space.template)) is None
 
 
 # -- there and back --------------------------------------------------------------------------------------------------
 
 
-@by_plane
+@by_space
 @given(data=st.data())
-def test_a_key_is_parsed_into_what_it_was_built_of(plane: str, data: st.DataObject) -> None:
+def test_a_key_is_parsed_into_what_it_was_built_of(space_name: str, data: st.DataObject) -> None:
     """`parse` of `of` is the identity in every key space, and no other space takes the key for its own."""
-    fields = data.draw(fields_of(KEYS[plane]))
-    key = KEYS[plane].of(**fields)
-    assert KEYS[plane].parse(key) == fields
-    assert keyexpr.parse(key) == (plane, fields)
+    fields = data.draw(fields_of(KEYS[space_name]))
+    key = KEYS[space_name].of(**fields)
+    assert KEYS[space_name].parse(key) == fields
+    assert keyexpr.parse(key) == (space_name, fields)
 
 
-@by_plane
+@by_space
 @given(data=st.data())
-def test_zenoh_takes_a_key_as_it_is(plane: str, data: st.DataObject) -> None:
+def test_zenoh_takes_a_key_as_it_is(space_name: str, data: st.DataObject) -> None:
     """Every key is a canonical key expression that names exactly one key, whatever its fields contain."""
-    space = KEYS[plane]
+    space = KEYS[space_name]
     key = space.of(**data.draw(fields_of(space)))
     assert str(zenoh.KeyExpr(key)) == str(zenoh.KeyExpr.autocanonize(key)) == key
     assert key.count("/") == space.template.count("/")
@@ -112,12 +112,12 @@ def test_zenoh_takes_a_key_as_it_is(plane: str, data: st.DataObject) -> None:
     assert key.isprintable()
 
 
-@by_plane
+@by_space
 @settings(max_examples=40)
 @given(data=st.data())
-def test_every_includes_of(plane: str, data: st.DataObject) -> None:
+def test_every_includes_of(space_name: str, data: st.DataObject) -> None:
     """The expression for some fields includes each key with these fields, and none that differs in one of them."""
-    space = KEYS[plane]
+    space = KEYS[space_name]
     fields = data.draw(fields_of(space))
     key = zenoh.KeyExpr(space.of(**fields))
     for count in range(len(fields) + 1):
@@ -329,12 +329,12 @@ def test_a_key_fits_an_expression_as_zenoh_says(text: str, key: str) -> None:
     assert fits(text, key) == among == zenoh.KeyExpr(text).includes(zenoh.KeyExpr(key))
 
 
-@by_plane
+@by_space
 @settings(deadline=None)
 @given(data=st.data())
-def test_a_key_of_ours_fits_what_every_gives(plane: str, data: st.DataObject) -> None:
+def test_a_key_of_ours_fits_what_every_gives(space_name: str, data: st.DataObject) -> None:
     """The expression for some fields fits each key with these fields, whatever they contain."""
-    space = KEYS[plane]
+    space = KEYS[space_name]
     fields = data.draw(fields_of(space))
     some = data.draw(st.sets(st.sampled_from(space.fields)))
     assert fits(space.every(**{name: fields[name] for name in some}), space.of(**fields))
@@ -343,3 +343,54 @@ def test_a_key_of_ours_fits_what_every_gives(plane: str, data: st.DataObject) ->
 def test_many_wildcards_cost_little() -> None:
     """Judging a long key by an expression of many wildcards ends: it tries no combinations."""
     assert not fits("/".join(["**", "a"] * 30), "/".join(["a"] * 300 + ["b"]))
+
+
+# -- keys beside the table -------------------------------------------------------------------------------------------
+
+
+def test_a_sources_key_names_its_key_and_itself() -> None:
+    """What heartbeats are heard on is taken apart again; other keys name no source."""
+    assert zenoh.KeyExpr(keyexpr.sources("macs/from/ros/7/n")).includes(
+        zenoh.KeyExpr("macs/from/ros/7/n/@adv/pub/a1/3/_")
+    )
+    assert keyexpr.source_of("macs/from/ros/7/n/@adv/pub/a1/3/_") == ("macs/from/ros/7/n", "a1/3")
+    assert keyexpr.sources("macs/from/ros/7/n", "a1/3") == "macs/from/ros/7/n/@adv/pub/a1/3/**"
+    assert keyexpr.source_of("macs/from/ros/7/n") == ("", "")
+    assert [keyexpr.is_recovery(key) for key in keyexpr.with_recovery(["macs/x"])] == [False, True]
+
+
+@pytest.mark.parametrize("namespace", ["", "site1", "site1/hall2"])
+def test_a_namespace_is_found_before_a_key(namespace: str) -> None:
+    """What is put before a key is what is found there; routers' own keys get nothing."""
+    key = keyexpr.PRESENCE.of(type="ros", id=7, group=0, zid="a1")
+    inside = keyexpr.inside(namespace or None, key)
+    assert keyexpr.namespace_of(keyexpr.PRESENCE, inside) == namespace
+    assert keyexpr.namespace_of(keyexpr.LEASE, inside) is None
+    assert zenoh.KeyExpr(keyexpr.everywhere(keyexpr.PRESENCE)).includes(zenoh.KeyExpr(inside))
+    assert keyexpr.inside("site1", keyexpr.ROUTERS) == keyexpr.ROUTERS
+
+
+def test_an_expression_for_each_robot() -> None:
+    """Where an id is the only wildcard it is filled in; an expression without any is one key; others are not."""
+    assert keyexpr.of_each("macs/from/ros/*/nd__map", 1, [7, 8]) == [
+        "macs/from/ros/7/nd__map",
+        "macs/from/ros/8/nd__map",
+    ]
+    assert keyexpr.of_each("macs/from/ros/7/nd__map", 1, [7, 8]) == ["macs/from/ros/7/nd__map"]
+    for other in ("macs/from/ros/*/nd__*", "macs/from/**", "macs/from/unity/*/n"):
+        assert keyexpr.of_each(other, 1, [7, 8]) == []
+
+
+def test_expressions_that_another_one_covers_are_left_out() -> None:
+    """Each once, in their order; what is verbatim is covered by no wildcard."""
+    keys = ["macs/all/**", "macs/all/ros/7", "macs/all/**", "macs/all/@adv/**", "macs/group/3/ros"]
+    assert keyexpr.distinct(keys) == ("macs/all/**", "macs/all/@adv/**", "macs/group/3/ros")
+
+
+@pytest.mark.parametrize(
+    ("expression", "begins"),
+    [("macs/from/ros/*/n", "macs/from"), ("macs/**", None), ("macs", None), ("macs/f$*/x", None)],
+)
+def test_how_an_expression_begins(expression: str, begins: str | None) -> None:
+    """Two chunks, where they have no wildcards."""
+    assert keyexpr.begins(expression) == begins

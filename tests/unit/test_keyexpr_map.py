@@ -45,16 +45,16 @@ def code(cell: str) -> str:
 
 
 def test_the_key_spaces_are_those_of_the_code() -> None:
-    """Every plane is in the table, with the code's key, publisher, subscriber and payload, and no other."""
+    """Every key space is in the table, with the code's key, publisher, subscriber and payload, and no other."""
     assert TABLES["Key spaces"] == [
         {
-            "plane": plane,
+            "key space": name,
             "key": f"`{key.template}`",
             "published by": key.publisher,
             "subscribed by": key.subscriber,
             "payload": key.payload,
         }
-        for plane, key in KEYS.items()
+        for name, key in KEYS.items()
     ]
 
 
@@ -64,27 +64,27 @@ def test_every_field_is_explained() -> None:
     assert sorted(explained) == sorted({name for key in KEYS.values() for name in key.fields})
 
 
-def test_every_plane_has_an_example() -> None:
+def test_every_key_space_has_an_example() -> None:
     """No key space goes without an example of a key."""
-    assert {row["plane"] for row in EXAMPLES} == set(KEYS)
+    assert {row["key space"] for row in EXAMPLES} == set(KEYS)
 
 
 @pytest.mark.parametrize("row", EXAMPLES, ids=lambda row: code(row["key"]))
-def test_an_example_is_a_key_of_its_plane(row: dict[str, str]) -> None:
-    """Each example parses as a key of the plane it stands for, and is built from its fields again."""
+def test_an_example_is_a_key_of_its_space(row: dict[str, str]) -> None:
+    """Each example parses as a key of the space it stands for, and is built from its fields again."""
     parsed = keyexpr.parse(code(row["key"]))
     assert parsed is not None
-    plane, fields = parsed
-    assert plane == row["plane"]
-    assert KEYS[plane].of(**fields) == code(row["key"])
+    space, fields = parsed
+    assert space == row["key space"]
+    assert KEYS[space].of(**fields) == code(row["key"])
 
 
 @pytest.mark.parametrize("row", SUBSCRIPTIONS, ids=lambda row: code(row["key expression"]))
 def test_a_subscription_is_what_its_code_makes(row: dict[str, str]) -> None:
-    """The Python of each row makes its key expression, which touches the keys of one plane only."""
+    """The Python of each row makes its key expression, which touches the keys of one space only."""
     assert eval(code(row["in Python"]), vars(keyexpr)) == code(row["key expression"])  # our own page
     expression = zenoh.KeyExpr(code(row["key expression"]))
-    assert len([plane for plane, key in KEYS.items() if expression.intersects(zenoh.KeyExpr(key.every()))]) == 1
+    assert len([name for name, key in KEYS.items() if expression.intersects(zenoh.KeyExpr(key.every()))]) == 1
 
 
 def test_the_access_table_is_the_access_file() -> None:
