@@ -20,7 +20,8 @@ from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol import named
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.keyexpr import NAMED, PRESENCE, STREAM
-from macs_zenoh.protocol.messages import OPERATOR
+from macs_zenoh.protocol.messages import OPERATOR, Metadata, NodeType, StreamData, encode_management
+from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
 
 RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
@@ -102,6 +103,32 @@ async def test_what_the_rules_allow_works(as_user: Callable[[str], MeshSettings]
         await headset.call("ros", 7, "ask")  # by its answer the robot knows of the subscription
         Streams(robot).publish("nd__pose", b"topic data")
         assert await asyncio.wait_for(streamed.get(), 5) == b"topic data"
+
+
+async def test_an_agent_uses_a_robot_within_the_rules(as_user: Callable[[str], MeshSettings]) -> None:
+    """With the rights of a gateway's headset, an agent registers on a robot and receives its topic."""
+    async with (
+        macs_zenoh.join("ros", id=7, group=3, settings=as_user("robot-7")) as robot,
+        macs_zenoh.join("unity", id=9, settings=as_user("gateway-1")) as agent,
+    ):
+        asked: list[str] = []
+
+        async def add(call: macs_zenoh.Call) -> bytes:
+            asked.append(f"{call.sender_type}/{call.sender_id}")
+            return b""
+
+        robot.serve("add_node", add)
+        await online(agent, 1, 7)
+        poses = await agent.subscribe("/pose", robot=7, type="std_msgs/String", timeout_s=20)
+        assert asked == ["unity/9"]
+        metadata = Metadata(1, 7, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__pose", "std_msgs/String")
+        management = encode_management(StreamData({"2": [9]}))
+        frame = encode_frame(1, management=management, message=encode_message(metadata.encode(), b"topic data"))
+        waiting = asyncio.create_task(poses.receive())
+        while not waiting.done():
+            Streams(robot).publish("nd__pose", frame)  # until it knows of the subscription
+            await asyncio.sleep(0.05)
+        assert waiting.result().data == b"topic data"
 
 
 async def test_a_robot_cannot_speak_as_another(as_user: Callable[[str], MeshSettings]) -> None:
