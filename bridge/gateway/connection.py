@@ -10,11 +10,9 @@ import socket
 import struct
 import sys
 import termios
-import threading
 import time
 from collections import Counter
 from collections.abc import Collection, Sequence
-from contextlib import suppress
 from typing import Protocol, cast
 
 from macs_zenoh.protocol.addresses import joined, of_peer
@@ -30,8 +28,8 @@ from macs_zenoh.protocol.tcp_agent import Event, Joined, Left, Rejected, Sent, S
 from macs_zenoh.protocol.wire import FrameDecoder, Header, encode_message
 
 from .backpressure import Backpressure
-from .direct_writer import DirectWriter
 from .memory import Memory
+from .writer import BUFFER_BYTES, Writer
 
 log = logging.getLogger("macs.gateway")
 
@@ -51,9 +49,8 @@ LAST_TYPES = 4096
 VERDICTS = 1024
 """How many metadata are remembered per connection as already judged."""
 
-WRITE_BUFFER_BYTES = 256 << 10
-"""What the transport may hold before messages wait in the outbox, where a call can still overtake topic data."""
-
+USUAL_DEPTH = (10, False)
+"""What waits of a topic whose registration is not known any more."""
 
 READ_S = 0.02
 """How long what waits in a socket has before the agent's time is looked at again."""
@@ -86,14 +83,8 @@ class Owner(Protocol):
     def received(self, connection: Connection) -> None:
         """All events of one read were passed on."""
 
-    def dirty(self, connection: Connection) -> None:
-        """The connection has messages to flush."""
-
     def closed(self, connection: Connection) -> None:
         """The socket is gone."""
-
-    def stream_depth(self, connection: Connection, node: str) -> tuple[int, bool]:
-        """How many messages of a node may wait, and whether new ones are dropped rather than old ones."""
 
     def registered_there(self, connection: Connection, metadata: Metadata) -> bool:
         """Whether the agent registered a message's node on the robot that sends it."""
@@ -121,19 +112,13 @@ class Connection(asyncio.BufferedProtocol):
         self._memory = memory
         self._write_timeout_s = write_timeout_s
         self._transport: asyncio.Transport
-        self._ready: list[Chunk] = []
-        self._ready_bytes = 0
+        self._writer = Writer(self._outbox)
         self._loop = asyncio.get_running_loop()
-        self._direct_writer: DirectWriter | None = None
-        self._writing = threading.RLock()
-        """Held by whoever writes, the loop or a thread of Zenoh's, as long as older messages are on their way."""
-        self._rest = b""
-        """What the socket did not take of a message sent past the loop: nothing else may come before it."""
-        self._paused_at: float | None = None
-        self._resumed = 0
         self._timer: asyncio.TimerHandle | None = None
         self._complained: set[str] = set()
         self._nodes: dict[str, set[int]] = {}
+        self._depths: dict[str, tuple[int, bool]] = {}
+        """How many messages of a topic may wait, and whether new ones are dropped rather than old ones, by node."""
         self.node_count = 0
         """How many interface nodes the agent has, by type and name."""
         self._last_types: dict[str, int] = {}
@@ -187,7 +172,7 @@ class Connection(asyncio.BufferedProtocol):
         peer_name = transport.get_extra_info("peername")
         self.host = of_peer(str(peer_name[0])) if peer_name else "?"
         self.address = joined(self.host, peer_name[1]) if peer_name else "?"
-        transport.set_write_buffer_limits(high=WRITE_BUFFER_BYTES)
+        self._writer.attach(transport)
         transport.pause_reading()  # until it is greeted
         self._pauses = 1
         if not self.owner.opened(self):
@@ -206,7 +191,7 @@ class Connection(asyncio.BufferedProtocol):
         self.peer = peer
         self.greeted = True
         self.pace = self.owner.pace()
-        self._write([peer.welcome()])
+        self._writer.write([peer.welcome()])
         self.resume()
         self._schedule()
 
@@ -238,17 +223,13 @@ class Connection(asyncio.BufferedProtocol):
             connection.cut_unfinished()
 
     def pause_writing(self) -> None:
-        self._paused_at = time.monotonic()
+        self._writer.pause()
         self._account()
         self._schedule()
 
     def resume_writing(self) -> None:
-        with self._writing:
-            self._paused_at = None
-            while self._outbox and self._paused_at is None:  # writing may pause us again
-                self._write(self._outbox.take(WRITE_BUFFER_BYTES))
+        self._writer.resume()
         self._account()
-        self._resumed += 1
         if not self._outbox:
             self.congested = False
             self.backpressure.release()
@@ -257,10 +238,7 @@ class Connection(asyncio.BufferedProtocol):
         for timer in (self._timer, self._tolled, self.regrouping):
             if timer is not None:
                 timer.cancel()
-        with self._writing:
-            shortcut, self._direct_writer = self._direct_writer, None
-            if shortcut is not None:
-                shortcut.close()
+        self._writer.close_direct()
         if self._refused:
             return
         if self.greeted:
@@ -308,42 +286,45 @@ class Connection(asyncio.BufferedProtocol):
     # -- out -----------------------------------------------------------------------------------------------------
 
     def send_call(self, message: Chunk) -> None:
-        """Send in order. What waits is bounded: beyond that the newest is dropped and counted, because an existing
-        headset that is disconnected never comes back; one that does not read at all is disconnected in its time."""
-        self.send_calls([message])
+        """Send in order, now. What waits is bounded: beyond that the newest is dropped and counted, because an
+        existing headset that is disconnected never comes back; one that does not read at all is disconnected in its
+        time."""
+        self.gather_calls([message])
+        self._writer.flush()
 
-    def send_calls(self, messages: Sequence[Chunk]) -> None:
-        """The same for several."""
-        if self._paused_at is None:
-            self._gather(messages)
-            return
+    def gather_calls(self, messages: Sequence[Chunk]) -> bool:
+        """The same for several, with the next `flush`. Whether the caller has to see to that: what is gathered begins
+        with these."""
+        if not self._writer.full:
+            return self._gather(messages)
         for message in messages:
             if self._has_room(len(message)) and not self._outbox.put_call(message):
                 self._warn_once("outbox_full", f"it reads too slowly: {self._outbox.bytes} bytes are waiting")
             self._account()
         self.congested = self._outbox.bytes > self._outbox.limit_bytes // 4
+        return False
 
     @property
     def full(self) -> bool:
         """Whether what is sent now has to wait."""
-        return self._paused_at is not None
+        return self._writer.full
 
     @property
     def moved(self) -> object:
         """Another one whenever the agent has taken some of what is on its way to it."""
-        return self._resumed, self._transport.get_write_buffer_size() >> 18
+        return self._writer.resumed, self._transport.get_write_buffer_size() >> 18
 
-    def send_stream(self, node: str, messages: Sequence[Chunk], *, keep: bool = False) -> None:
-        """Send topic data of a node; the registration's buffer size bounds what waits, unless it is to be kept since
-        its sender is held back."""
-        if self._paused_at is None:
-            self._gather(messages)
-            return
-        depth, drop_new = (sys.maxsize, False) if keep else self.owner.stream_depth(self, node)
+    def gather_stream(self, node: str, messages: Sequence[Chunk], *, keep: bool = False) -> bool:
+        """Likewise topic data of a node; the registration's buffer size bounds what waits, unless it is to be kept,
+        since its sender is held back."""
+        if not self._writer.full:
+            return self._gather(messages)
+        depth, drop_new = (sys.maxsize, False) if keep else self._depths.get(node, USUAL_DEPTH)
         for message in messages:
             if self._has_room(len(message)):
                 self._outbox.put_stream(node, message, depth=depth, drop_new=drop_new)
                 self._account()
+        return False
 
     def _has_room(self, size: int) -> bool:
         """Whether so much more may wait, as far as others are concerned."""
@@ -355,44 +336,30 @@ class Connection(asyncio.BufferedProtocol):
     def _account(self) -> None:
         """Note what waits for this agent, here and in its transport."""
         waiting = self._outbox.bytes + self._transport.get_write_buffer_size()
-        if self._paused_at is None and not self._outbox:
+        if not self._writer.full and not self._outbox:
             waiting = 0
         self._memory.waiting.set(self, self.host, waiting)
 
     @property
     def free(self) -> bool:
         """Whether nothing waits to be sent, so that `send_now` can be tried. From any thread."""
-        return (
-            self._direct_writer is not None
-            and self._paused_at is None
-            and not (self._ready or self._rest or self._transport.is_closing())
-            and not self._transport.get_write_buffer_size()
-        )
+        return self._writer.free
 
     def send_now(self, message: bytes) -> None:
         """Send topic data in a thread of Zenoh's, after seeing that the agent is `free`: into the socket, and what it
         does not take soon on the loop."""
-        with self._writing:
-            sent = self._direct_writer.send(message) if self.free and self._direct_writer is not None else 0
-            if sent == len(message):
-                return
-            self._rest += message[sent:]
-        self._loop.call_soon_threadsafe(self.flush)
+        if not self._writer.write_now(message):
+            self._loop.call_soon_threadsafe(self.flush)
 
-    def _gather(self, messages: Sequence[Chunk]) -> None:
-        """Keep for the flush at the end of the batch, but no more than the transport may hold."""
+    def _gather(self, messages: Sequence[Chunk]) -> bool:
         size = sum(map(len, messages))
-        if size > WRITE_BUFFER_BYTES and not self._has_room(size):
-            return
-        if not self._ready:
-            self.owner.dirty(self)
-        self._ready += messages
-        self._ready_bytes += size
-        if self._ready_bytes > WRITE_BUFFER_BYTES:
-            self.flush()
+        if size > BUFFER_BYTES and not self._has_room(size):
+            return False
+        return self._writer.gather(messages, size)
 
-    def registered(self, node_name: str, node_type: int) -> None:
-        """The agent has an interface node of this name and type."""
+    def registered(self, node: AddNode) -> None:
+        """The agent has this interface node."""
+        node_name, node_type = node.node_name, node.node_type
         types = self._nodes.setdefault(node_name, set())
         self.node_count += node_type not in types
         types.add(node_type)
@@ -401,9 +368,9 @@ class Connection(asyncio.BufferedProtocol):
         if len(self._last_types) > LAST_TYPES:
             del self._last_types[next(iter(self._last_types))]
         self._verdicts.clear()
-        if node_type == NodeType.SUBSCRIBER and self._direct_writer is None and not self._transport.is_closing():
-            with suppress(OSError):  # without it topics take the usual way
-                self._direct_writer = DirectWriter(self._transport.get_extra_info("socket"))
+        if node_type == NodeType.SUBSCRIBER:
+            self._depths[node_name] = node.buffer_size, node.drop_new
+            self._writer.open_direct()
 
     def is_registered(self, node: AddNode) -> bool:
         """Whether the agent has this interface node already."""
@@ -414,6 +381,8 @@ class Connection(asyncio.BufferedProtocol):
         types = self._nodes.get(node_name, set())
         self.node_count -= node_type in types
         types.discard(node_type)
+        if node_type == NodeType.SUBSCRIBER:
+            self._depths.pop(node_name, None)
         if not types:
             self._nodes.pop(node_name, None)
         self._verdicts.clear()
@@ -472,21 +441,10 @@ class Connection(asyncio.BufferedProtocol):
             self.nodes_change()
             metadata = Metadata(message_manager=AgentsGone.manager)
             self.send_call(encode_message(metadata.encode(), encode_data(AgentsGone(gone))))
-            self.flush()
 
     def flush(self) -> None:
-        """Write what was sent since the last flush, in one go."""
-        with self._writing:
-            ready, self._ready, self._ready_bytes = self._ready, [], 0
-            self._write(ready)
-
-    def _write(self, chunks: list[Chunk]) -> None:
-        with self._writing:
-            rest, self._rest = self._rest, b""
-            if rest:
-                chunks = [rest, *chunks]
-            if chunks and not self._transport.is_closing():
-                self._transport.writelines(chunks)
+        """Write what was gathered since the last flush, in one go."""
+        self._writer.flush()
 
     def pause(self) -> None:
         """Stop reading from the agent until as many `resume` as `pause` were called."""
@@ -536,12 +494,7 @@ class Connection(asyncio.BufferedProtocol):
         self.peer.lost()
         level = logging.INFO if reason == "went offline" else logging.WARNING
         log.log(level, "%s leaves: %s", self, reason)
-        with self._writing:
-            self.flush()
-            if self._paused_at is None:
-                self._transport.close()
-            else:
-                self.abort()  # it does not read: closing politely would wait for ever
+        self._writer.close()
 
     def finish(self, reason: str) -> None:
         """Send all that waits, then FIN; `abort` whoever does not take it in time."""
@@ -550,10 +503,7 @@ class Connection(asyncio.BufferedProtocol):
         elif not self._transport.is_closing():
             self.peer.lost()
             log.info("%s leaves: %s", self, reason)
-            with self._writing:
-                self.flush()
-                self._write(self._outbox.take(self._outbox.limit_bytes))
-                self._transport.close()
+            self._writer.finish()
 
     def abort(self) -> None:
         """End the connection at once; does nothing to one that has ended."""
@@ -568,8 +518,9 @@ class Connection(asyncio.BufferedProtocol):
         if self._timer is not None:
             self._timer.cancel()
         due = self.peer.next_deadline()
-        if self._paused_at is not None:
-            due = min(due, self._paused_at + self._write_timeout_s)
+        paused_at = self._writer.paused_at
+        if paused_at is not None:
+            due = min(due, paused_at + self._write_timeout_s)
         now = time.monotonic()
         due = min(due, max(self.peer.heard_at + AWAY_S, now + LOOK_S))
         delay_s = max(0.0, due - now) + 0.001
@@ -581,7 +532,8 @@ class Connection(asyncio.BufferedProtocol):
         now = time.monotonic()
         if now < self.peer.next_deadline() or not self._must_be_read():
             self._events(self.peer.tick(now))
-        if self._paused_at is not None and now >= self._paused_at + self._write_timeout_s:
+        paused_at = self._writer.paused_at
+        if paused_at is not None and now >= paused_at + self._write_timeout_s:
             self.close(f"it has not read for {self._write_timeout_s:g} s")
         elif self.is_away(now) and _is_gone(self._transport.get_extra_info("socket")):
             self.close("its host does not answer")

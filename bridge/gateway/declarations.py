@@ -96,7 +96,6 @@ class AgentDeclarations:
         metadata = Metadata(*caller, message_manager=node.manager)
         # written anew: a robot program reads of it what was judged here, however it takes keys named twice
         robot.send_call(encode_message(metadata.encode(), encode_data(node)))
-        self._delivery.flush()
 
     def _expect(self, robot: Connection, registrant: AgentKey) -> None:
         """Whoever registers on a robot program is online now or soon. One who left while that was on its way never

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from macs_zenoh.errors import WireError
@@ -96,7 +96,7 @@ class Delivery:
         self._judges: dict[AgentKey, Judge] = {}
         self._registrants: dict[bytes, list[AgentKey]] = {}
         self._seen: dict[tuple[str, int], Seen] = {}
-        self._dirty: list[Connection] = []
+        self._gathered: list[Connection] = []
 
     def inbox(self, batch: Iterator[Sample]) -> None:
         """Frames sent to ids of ours."""
@@ -114,7 +114,7 @@ class Delivery:
             self._send_all(connection, self._read(key, payload, sender))
             if connection.congested:
                 self._hold_sender(sender, [connection])
-        self.flush()
+        self._flush()
 
     def group(self, batch: Iterator[Sample]) -> None:
         """Frames sent to groups that one of ours is in."""
@@ -130,7 +130,7 @@ class Delivery:
                     if takes_group_copy(header, connection.agent_id, sender, connection.peer.agent_type):
                         self._send(connection, frame, metadata)
             self._hold_sender(sender, members)
-        self.flush()
+        self._flush()
 
     def broadcast(self, batch: Iterator[Sample]) -> None:
         """Frames sent to everybody."""
@@ -144,7 +144,7 @@ class Delivery:
                 for connection in others:
                     self._send(connection, frame, metadata)
             self._hold_sender(sender, others)
-        self.flush()
+        self._flush()
 
     def stream(self, batch: Iterator[Sample]) -> None:
         """A robot's topic data, for those of its registrants that are ours."""
@@ -165,10 +165,10 @@ class Delivery:
                         if connection.existing and not fits:
                             self._send_fitting(connection, frame, metadata, topic_data(metadata), stream.node, keep)
                         else:
-                            connection.send_stream(stream.node, messages, keep=keep)
+                            self._gather_stream(connection, stream.node, messages, keep=keep)
                     else:
                         self._unregistered(connection, frame, metadata)
-        self.flush()
+        self._flush()
 
     def stream_at_once(self, key: str, payload: Payload) -> bool:
         """The same for one message in a thread of Zenoh's, if nothing about it is new and all its receivers are
@@ -211,15 +211,19 @@ class Delivery:
         seen = self._seen[key, len(payload)] = Seen(frame.beginning + CDR, frame.message_at, registrants)
         return seen
 
-    def dirty(self, connection: Connection) -> None:
-        """A connection has messages to flush."""
-        self._dirty.append(connection)
-
-    def flush(self) -> None:
+    def _flush(self) -> None:
         """Write what was gathered, one write per connection."""
-        dirty, self._dirty = self._dirty, []
-        for connection in dirty:
+        gathered, self._gathered = self._gathered, []
+        for connection in gathered:
             connection.flush()
+
+    def _gather_calls(self, connection: Connection, messages: Sequence[Buffer]) -> None:
+        if connection.gather_calls(messages):
+            self._gathered.append(connection)
+
+    def _gather_stream(self, connection: Connection, node: str, messages: Sequence[Buffer], *, keep: bool) -> None:
+        if connection.gather_stream(node, messages, keep=keep):
+            self._gathered.append(connection)
 
     def forget(self) -> None:
         """Agents came or went: look keys up anew."""
@@ -228,7 +232,7 @@ class Delivery:
     def _send(self, connection: Connection, frame: Frame, metadata: Metadata, *, by_id: bool = False) -> None:
         verdict = connection.verdict(metadata)
         if verdict is PASS or verdict is PASS_ONCE:
-            connection.send_calls(frame.messages)
+            self._gather_calls(connection, frame.messages)
         else:
             self._send_judged(connection, frame, metadata, verdict, by_id=by_id)
 
@@ -241,11 +245,11 @@ class Delivery:
                 messages += frame.messages
                 continue
             if messages:
-                connection.send_calls(messages)
+                self._gather_calls(connection, messages)
                 messages = []
             self._send_judged(connection, frame, metadata, verdict, by_id=True)
         if messages:
-            connection.send_calls(messages)
+            self._gather_calls(connection, messages)
 
     def _send_judged(
         self, connection: Connection, frame: Frame, metadata: Metadata, verdict: Verdict, *, by_id: bool
@@ -289,9 +293,9 @@ class Delivery:
         if not messages:
             return
         if stream is None:
-            connection.send_calls(messages)
+            self._gather_calls(connection, messages)
         else:
-            connection.send_stream(stream, messages, keep=keep)
+            self._gather_stream(connection, stream, messages, keep=keep)
 
     def _unregistered(self, connection: Connection, frame: Frame, metadata: Metadata) -> None:
         """Topic data for who did not register it there: a forged list; or it is older than the agent, which has

@@ -214,7 +214,6 @@ class Renumbering:
             connection.tell_gone(connection.robot_nodes.registrants())
         else:
             connection.send_call(connection.peer.welcome())
-            connection.flush()
             await self._robots.rename(old, new_id, told, slow)
         self._declarations.undeclare(old)
         old_token.close()

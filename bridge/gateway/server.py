@@ -42,7 +42,6 @@ from macs_zenoh.protocol.messages import (
     GoneAgent,
     Metadata,
     NodeRefused,
-    NodeType,
     OnlineReply,
     Refusal,
     encode_data,
@@ -358,19 +357,10 @@ class Gateway:
         if group is not None:
             self._unsubscribe(GROUP.every(type=group[0], group=group[1]))
 
-    def stream_depth(self, connection: Connection, node: str) -> tuple[int, bool]:
-        """What the headset asked for when it registered on this topic."""
-        registered = self._robots.find(connection.key, NodeType.SUBSCRIBER, node)
-        return (registered.buffer_size, registered.drop_new) if registered else (10, False)
-
     def registered_there(self, connection: Connection, metadata: Metadata) -> bool:
         """Whether an agent registered a message's node on the robot that sends it."""
         sender = metadata.sender_agent_type, metadata.sender_agent_id
         return sender[0] == ROS and self._robots.registered(connection.key, metadata, int(sender[1] or 0))
-
-    def dirty(self, connection: Connection) -> None:
-        """A connection has messages to flush."""
-        self._delivery.dirty(connection)
 
     # -- from a TCP agent to the mesh ----------------------------------------------------------------------------
 
@@ -415,7 +405,7 @@ class Gateway:
             if connection.existing and (other := connection.other_type(node)) is not None:
                 self._robots.take_back_all(connection.key, other, node.node_name)
                 connection.unregistered(node.node_name, other)
-            connection.registered(node.node_name, node.node_type)
+            connection.registered(node)
             if not connection.peer.extensions:  # an existing program, which cannot say it itself
                 node = structs.replace(node, unity_cdr=True)
         self._robots.register(node, event.robot_ids, event.groups)
@@ -449,7 +439,6 @@ class Gateway:
 
     def _reply(self, connection: Connection, metadata: Metadata, data: bytes) -> None:
         connection.send_call(encode_message(metadata.encode(), data))
-        self._delivery.flush()
 
     def _joined(self, connection: Connection, event: Joined) -> None:
         if self.agents.find(*connection.key) is connection:
@@ -559,7 +548,6 @@ class Gateway:
                 connection.robot_nodes.gone(gone)
                 connection.nodes_change()
                 connection.send_call(message)
-            self._delivery.flush()
         for change in changes:
             try:
                 self._robots.presence(change)

@@ -20,7 +20,7 @@ from bridge.headset import frames
 from bridge.headset.frames import NodeSpec
 from macs_zenoh import Agent, join
 from macs_zenoh.protocol.existing import CDR
-from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
+from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.protocol.outbox import Chunk, Outbox
 from macs_zenoh.protocol.tcp_agent import TcpAgent
 from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, encode_message, split_message
@@ -239,11 +239,8 @@ class Nobody:
 
     def opened(self, connection: Connection) -> bool:
         connection.greet(TcpAgent(256, 1, time.monotonic()))
-        connection.registered(TOPIC.name, NodeType.SUBSCRIBER)
+        connection.registered(AddNode(2, 256, NodeType.SUBSCRIBER, TOPIC.name, "/image", "sensor_msgs/Image", 100))
         return True
-
-    def stream_depth(self, connection: Connection, node: str) -> tuple[int, bool]:
-        return 100, False
 
     def __getattr__(self, name: str) -> Callable[..., None]:
         return lambda *args: None
@@ -289,7 +286,6 @@ async def test_the_rest_of_a_message_comes_before_anything_else(
     ours.send_now(large)
     assert not ours.free
     ours.send_call(answer)
-    ours.flush()
     assert await drained(other, len(large) + len(answer)) == large + answer
 
 
@@ -300,7 +296,6 @@ async def test_what_the_transport_holds_comes_first(connection: tuple[Connection
     while not ours._transport.get_write_buffer_size():
         sent += b"c" * 100_000
         ours.send_call(b"c" * 100_000)
-        ours.flush()
         await asyncio.sleep(0)
     got = other.recv(1 << 20)  # room, of which the transport does not know yet
     ours.send_now(b"topic")
@@ -352,7 +347,7 @@ async def test_nothing_passes_what_waits_in_the_outbox(
     sent = []
     while len(ours._outbox) < 8:
         sent.append(len(sent).to_bytes(4, "big") * 25_000)
-        ours.send_stream(TOPIC.name, [sent[-1]])
+        ours.gather_stream(TOPIC.name, [sent[-1]])
         ours.flush()
         await asyncio.sleep(0)
     newer = len(sent).to_bytes(4, "big") * 100

@@ -1,0 +1,166 @@
+"""What is written into a TCP agent's socket, by the loop or past it by a thread of Zenoh's: whole messages, in order.
+
+All that two threads share of a connection is here, under one lock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import socket
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+
+from macs_zenoh.protocol.outbox import Chunk, Outbox
+
+from .listener import descriptors
+
+BUFFER_BYTES = 256 << 10
+"""What the transport may hold before messages wait in the outbox, where a call can still overtake topic data."""
+
+
+class Writer:
+    """One connection's. What it cannot write waits in its ``outbox``, which its owner fills while it is `full`."""
+
+    def __init__(self, outbox: Outbox) -> None:
+        self.paused_at: float | None = None
+        """Since when the transport takes nothing more."""
+        self.resumed = 0
+        """How often it has taken something again."""
+        self._outbox = outbox
+        self._transport: asyncio.Transport
+        self._gathered: list[Chunk] = []
+        self._gathered_bytes = 0
+        self._direct: DirectWriter | None = None
+        self._lock = threading.RLock()
+        """Held by whoever writes, the loop or a thread of Zenoh's, as long as older messages are on their way."""
+        self._rest = b""
+        """What the socket did not take of a message sent past the loop: nothing else may come before it."""
+
+    def attach(self, transport: asyncio.Transport) -> None:
+        """The connection is there."""
+        self._transport = transport
+        transport.set_write_buffer_limits(high=BUFFER_BYTES)
+
+    # -- past the loop -------------------------------------------------------------------------------------------
+
+    def open_direct(self) -> None:
+        """Let threads write past the loop, if a descriptor is left: else topics take the usual way."""
+        if self._direct is None and not self._transport.is_closing():
+            with suppress(OSError):
+                self._direct = DirectWriter(self._transport.get_extra_info("socket"))
+
+    def close_direct(self) -> None:
+        """The connection has ended."""
+        with self._lock:
+            direct, self._direct = self._direct, None
+            if direct is not None:
+                direct.close()
+
+    @property
+    def free(self) -> bool:
+        """Whether nothing waits to be written, so that `write_now` can be tried. From any thread."""
+        return (
+            self._direct is not None
+            and self.paused_at is None
+            and not (self._gathered or self._rest or self._transport.is_closing())
+            and not self._transport.get_write_buffer_size()
+        )
+
+    def write_now(self, message: bytes) -> bool:
+        """Write past the loop. False when something is left, for the loop to `flush` soon."""
+        with self._lock:
+            sent = self._direct.send(message) if self.free and self._direct is not None else 0
+            if sent == len(message):
+                return True
+            self._rest += message[sent:]
+        return False
+
+    # -- on the loop ---------------------------------------------------------------------------------------------
+
+    @property
+    def full(self) -> bool:
+        """Whether what is sent now has to wait in the outbox."""
+        return self.paused_at is not None
+
+    def gather(self, messages: Sequence[Chunk], size: int) -> bool:
+        """Keep for the next `flush`, but no more than the transport may hold. Whether it is the first."""
+        first = not self._gathered
+        self._gathered += messages
+        self._gathered_bytes += size
+        if self._gathered_bytes > BUFFER_BYTES:
+            self.flush()
+        return first
+
+    def flush(self) -> None:
+        """Write what was gathered, in one go."""
+        with self._lock:
+            gathered, self._gathered, self._gathered_bytes = self._gathered, [], 0
+            self.write(gathered)
+
+    def write(self, chunks: list[Chunk]) -> None:
+        """Write at once, behind what is left of a message that went past the loop."""
+        with self._lock:
+            rest, self._rest = self._rest, b""
+            if rest:
+                chunks = [rest, *chunks]
+            if chunks and not self._transport.is_closing():
+                self._transport.writelines(chunks)
+
+    def pause(self) -> None:
+        """The transport takes nothing more."""
+        self.paused_at = time.monotonic()
+
+    def resume(self) -> None:
+        """It does again: write what waits, as far as it goes."""
+        with self._lock:
+            self.resumed += 1
+            self.paused_at = None
+            while self._outbox and self.paused_at is None:  # writing may pause us again
+                self.write(self._outbox.take(BUFFER_BYTES))
+
+    def close(self) -> None:
+        """Write what is gathered, then FIN; who does not read is cut, since that would wait for ever."""
+        with self._lock:
+            self.flush()
+            if self.paused_at is None:
+                self._transport.close()
+            else:
+                self._transport.abort()
+
+    def finish(self) -> None:
+        """Write all that waits, then FIN."""
+        with self._lock:
+            self.flush()
+            self.write(self._outbox.take(self._outbox.limit_bytes))
+            self._transport.close()
+
+
+class DirectWriter:
+    """Writes into a socket that somebody else owns, as much as it takes at once. Its callers see to the order.
+
+    It has a descriptor of its own: the owner may close his at any time, and its number can be another socket's then.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        """Raises OSError when there are no descriptors left."""
+        self._descriptor = os.dup(sock.fileno())
+        if self._descriptor >= descriptors():
+            os.close(self._descriptor)
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    def send(self, message: bytes) -> int:
+        """How many bytes the socket took. Of one that has failed, all: its owner will notice."""
+        try:
+            return os.write(self._descriptor, message)
+        except BlockingIOError:
+            return 0
+        except OSError:
+            return len(message)
+
+    def close(self) -> None:
+        """Give the descriptor back: until then the other side does not see the end of the connection."""
+        os.close(self._descriptor)
