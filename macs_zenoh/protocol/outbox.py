@@ -12,7 +12,8 @@ class Outbox:
 
     Calls, management and messages between agents are kept in order and go first. Topic data is kept per node: the
     last ``depth`` messages, or the first with ``drop_new``, nodes taking turns. ``limit_bytes`` bounds all of it:
-    topic data gives way to anything, calls to nothing. One message may always wait, however large.
+    topic data gives way to anything, calls to nothing. One message may always wait, however large, and
+    beside a call that is larger than the limit others have as much as without it: what is small is not lost for it.
 
     ``drops`` counts ``node_full_oldest``, ``node_full_newest`` and ``outbox_full``.
     """
@@ -23,6 +24,8 @@ class Outbox:
         self.drops: Counter[str] = Counter()
         self._calls: deque[Chunk] = deque()
         self._call_bytes = 0
+        self._large = 0
+        """Size of a waiting call that is larger than the limit."""
         self._streams: OrderedDict[str, deque[Chunk]] = OrderedDict()
 
     def __len__(self) -> int:
@@ -40,6 +43,8 @@ class Outbox:
             return False
         self._calls.append(message)
         self._call_bytes += len(message)
+        if len(message) > self.limit_bytes:
+            self._large = len(message)
         self.bytes += len(message)
         return True
 
@@ -73,6 +78,8 @@ class Outbox:
     def _next_call(self) -> Chunk:
         chunk = self._calls.popleft()
         self._call_bytes -= len(chunk)
+        if len(chunk) > self.limit_bytes:
+            self._large = 0
         return chunk
 
     def _next_stream(self) -> Chunk:
@@ -84,10 +91,12 @@ class Outbox:
         return chunk
 
     def _over(self, size: int) -> bool:
-        return self.bytes > 0 and self.bytes + size > self.limit_bytes
+        return self.bytes > 0 and (
+            self.bytes - self._large + size > self.limit_bytes or (self._large > 0 and size > self.limit_bytes)
+        )
 
     def _fits_beside_calls(self, size: int) -> bool:
-        return not self._calls or self._call_bytes + size <= self.limit_bytes
+        return not self._calls or self._call_bytes - self._large + size <= self.limit_bytes
 
     def _make_room(self, size: int, keep: str | None = None) -> None:
         """Let the node with the most bytes give up its oldest message until the new one fits."""
