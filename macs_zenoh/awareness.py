@@ -33,6 +33,7 @@ from .protocol.agent_id import AgentId
 from .protocol.keyexpr import LAST, NAME, NAMED, NAMED_ALL, WANTED
 from .protocol.named import Arrivals, Envelope, LastValues, Named, Names, Outcome, RateLimits, check_word
 from .protocol.wire import PROBE
+from .timeouts import within
 
 log = logging.getLogger("macs.awareness")
 
@@ -458,7 +459,7 @@ class Awareness:
         """Wait for a token to come or go; False when the deadline was earlier."""
         self._changed.clear()
         try:
-            await asyncio.wait_for(self._changed.wait(), max(0.0, deadline - time.monotonic()))
+            await within(self._changed.wait(), max(0.0, deadline - time.monotonic()))
         except asyncio.TimeoutError:
             return False
         return True

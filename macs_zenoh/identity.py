@@ -19,6 +19,7 @@ from .protocol import ids as blocks
 from .protocol.agent_id import AgentId
 from .protocol.ids import Contests
 from .protocol.keyexpr import LEASE, type_name
+from .timeouts import within
 
 log = logging.getLogger("macs.agent")
 
@@ -112,7 +113,7 @@ class Identity:
         deadline = time.monotonic() + self._mesh.settings.lease_ms / 1000 + 1.0
         while key in directory and time.monotonic() < deadline:
             with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._presence.change(), deadline - time.monotonic())
+                await within(self._presence.change(), deadline - time.monotonic())
 
     async def _lease(self) -> _Claim:
         tried: set[int] = set()

@@ -42,6 +42,7 @@ from .protocol.registrations import AgentKey, NodeKey, Task
 from .protocol.stream_reading import StreamReader
 from .protocol.wire import Layout
 from .registration_calls import RobotCalls, StreamChanges
+from .timeouts import within
 from .topics import (
     DEPTH,
     Chosen,
@@ -266,7 +267,7 @@ class Nodes:
             if waiting and left_s > 0:
                 node.changed.clear()
                 with suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(node.changed.wait(), left_s)
+                    await within(node.changed.wait(), left_s)
                 continue
             if any(robot in node.confirmed for robot in meant):
                 return

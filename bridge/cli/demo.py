@@ -11,6 +11,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 from macs_zenoh.errors import MacsError, Unreachable
+from macs_zenoh.timeouts import within
 
 if TYPE_CHECKING:
     from bridge.headset.client import Headset
@@ -83,7 +84,7 @@ class _Show:
         until = time.monotonic() + WATCH_S
         while (left_s := until - time.monotonic()) > 0:
             try:
-                sizes.append(len((await asyncio.wait_for(camera.__anext__(), left_s)).data))
+                sizes.append(len((await within(camera.__anext__(), left_s)).data))
             except asyncio.TimeoutError:
                 break
         if not sizes:
@@ -151,7 +152,7 @@ class _Poses:
 
 async def _first(subscription: Subscription, topic: str) -> Any:
     try:
-        return await asyncio.wait_for(subscription.__anext__(), PATIENCE_S)
+        return await within(subscription.__anext__(), PATIENCE_S)
     except asyncio.TimeoutError:
         raise Unreachable(topic, f"nothing came within {PATIENCE_S:g} s") from None
 

@@ -13,6 +13,7 @@ from contextlib import suppress
 from bridge.cli import output
 from bridge.cli.running import READY, STOP_WITH_STDIN
 from macs_zenoh.errors import MacsError
+from macs_zenoh.timeouts import within
 
 log = logging.getLogger("macs.up")
 
@@ -87,7 +88,7 @@ class Child:
         with suppress(ProcessLookupError):
             process.send_signal(signal.SIGTERM)
         try:
-            await asyncio.wait_for(process.wait(), within_s)
+            await within(process.wait(), within_s)
         except asyncio.TimeoutError:
             log.warning("%s did not stop within %.1f s, killed", self.name, within_s)
             with suppress(ProcessLookupError):

@@ -38,6 +38,7 @@ from macs_zenoh.config import GatewaySettings, RobotSettings, Settings, changed
 from macs_zenoh.errors import MacsError, Unreachable, UsageError
 from macs_zenoh.protocol import endpoints
 from macs_zenoh.protocol.addresses import EVERYWHERE, joined, reachable
+from macs_zenoh.timeouts import within
 
 log = logging.getLogger("macs.up")
 
@@ -256,7 +257,7 @@ async def _first_failure_or(work: asyncio.Task[int], tasks: list[asyncio.Task[No
 async def _when_ready(plan: Plan, programs: list[Child]) -> int:
     try:
         ready = asyncio.gather(*(child.ready.wait() for child in programs))
-        await asyncio.wait_for(ready, READY_S if plan.once else None)
+        await within(ready, READY_S if plan.once else None)
     except asyncio.TimeoutError:
         raise NotReady([child.name for child in programs if not child.ready.is_set()], plan.routers) from None
     if plan.demo:

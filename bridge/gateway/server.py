@@ -61,6 +61,7 @@ from macs_zenoh.protocol.tcp_agent import (
 )
 from macs_zenoh.protocol.wire import FrameDecoder, Layout, encode_message
 from macs_zenoh.registration_calls import RobotCalls, StreamChanges
+from macs_zenoh.timeouts import within
 
 from .admission import Admission
 from .agents import Agents, Group
@@ -234,7 +235,7 @@ class Gateway:
             for connection in connections:
                 connection.finish("the gateway stops")
             with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._all_closed.wait(), FLUSH_S)
+                await within(self._all_closed.wait(), FLUSH_S)
             for connection in connections:
                 connection.abort()
         self._forwarding.close()

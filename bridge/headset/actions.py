@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 from macs_zenoh.errors import CallTimeout, Refused, Unreachable, WireError
 from macs_zenoh.protocol.messages import ActionVerb
+from macs_zenoh.timeouts import within
 
 from . import frames
 from .frames import NodeSpec
@@ -174,7 +175,7 @@ class ActionClient(Node):
 
 async def _within(future: asyncio.Future[Any], what: str, timeout_s: float | None) -> Any:
     try:
-        return await asyncio.wait_for(asyncio.shield(future), timeout_s)
+        return await within(asyncio.shield(future), timeout_s)
     except asyncio.TimeoutError as error:
         raise CallTimeout(what, timeout_s or 0.0) from error
 

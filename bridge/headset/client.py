@@ -48,6 +48,7 @@ from macs_zenoh.protocol.messages import (
     node_name,
 )
 from macs_zenoh.protocol.wire import MAX_FRAME_BYTES, split_message
+from macs_zenoh.timeouts import within
 
 from . import frames
 from .actions import ActionClient
@@ -217,7 +218,7 @@ class Headset:
         self._open[request_id] = answer
         try:
             await self.send_frame(frames.online_request(self.id, request_id))
-            return decode_data(OnlineReply, await asyncio.wait_for(answer, timeout_s), ANSWER_BYTES)
+            return decode_data(OnlineReply, await within(answer, timeout_s), ANSWER_BYTES)
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"router {self.target}", timeout_s) from error
         finally:
@@ -234,7 +235,7 @@ class Headset:
         self._open[request_id] = answer
         try:
             await self.send_frame(frames.management(self.id, request_id, manager, data))
-            return _not_refused(await asyncio.wait_for(answer, timeout_s))
+            return _not_refused(await within(answer, timeout_s))
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"{manager} of gateway {self.target}", timeout_s) from error
         finally:
@@ -385,7 +386,7 @@ class Headset:
         self._asked[robot, request_id] = answer
         try:
             await self.send(data, to=ROS, ids=(robot,), manager=manager, request_id=request_id)
-            answered: bytes = await asyncio.wait_for(answer, timeout_s)
+            answered: bytes = await within(answer, timeout_s)
             return _not_refused(answered)
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"{manager} of robot {robot}", timeout_s) from error
@@ -418,7 +419,7 @@ class Headset:
         Raises CallTimeout after ``timeout_s``, Unreachable when the headset is closed and all is taken.
         """
         try:
-            return await asyncio.wait_for(self.__anext__(), timeout_s)
+            return await within(self.__anext__(), timeout_s)
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"a message from {self.target}", timeout_s or 0.0) from error
         except StopAsyncIteration:
@@ -477,7 +478,7 @@ class Headset:
             connection.abort()
             return
         with contextlib.suppress(Unreachable, asyncio.TimeoutError):
-            await asyncio.wait_for(connection.send(frames.go_offline(self.id)), _GOODBYE_S)
+            await within(connection.send(frames.go_offline(self.id)), _GOODBYE_S)
         await connection.close()
 
     # --- inside ---

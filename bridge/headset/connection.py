@@ -12,6 +12,7 @@ from macs_zenoh.errors import Unreachable
 from macs_zenoh.protocol import greetings
 from macs_zenoh.protocol.addresses import joined
 from macs_zenoh.protocol.wire import MessageDecoder
+from macs_zenoh.timeouts import within
 
 log = logging.getLogger("macs.headset")
 
@@ -48,7 +49,7 @@ class Connection:
         """Connect. Raises Unreachable."""
         target = joined(host, port)
         try:
-            reader, writer = await asyncio.wait_for(asyncio.open_connection(host, port), timeout_s)
+            reader, writer = await within(asyncio.open_connection(host, port), timeout_s)
         except asyncio.TimeoutError as error:
             raise Unreachable(target, f"no connection within {timeout_s:g} s") from error
         except OSError as error:
@@ -84,7 +85,7 @@ class Connection:
         try:
             reader, writer = await asyncio.open_connection(*self._place)
             writer.write(greetings.INIT_SYN)
-            return greetings.is_zenoh(await asyncio.wait_for(reader.read(greetings.ENOUGH_BYTES), _SILENT_S))
+            return greetings.is_zenoh(await within(reader.read(greetings.ENOUGH_BYTES), _SILENT_S))
         except (OSError, asyncio.TimeoutError):
             return False
         finally:
@@ -131,7 +132,7 @@ class Connection:
         with contextlib.suppress(OSError, asyncio.TimeoutError, RuntimeError):
             # Half-closing first: closing a socket with unread data would reset it and lose our last frames.
             self._writer.write_eof()
-            await asyncio.wait_for(self._read_to_end(), _GOODBYE_S)
+            await within(self._read_to_end(), _GOODBYE_S)
         self.abort()
 
     def abort(self) -> None:

@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 
 from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError
 from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, encode_data
+from macs_zenoh.timeouts import within
 
 from . import frames
 from .frames import NodeSpec
@@ -239,7 +240,7 @@ class ServiceClient(Node):
         self._open[agent, request_id] = answer
         try:
             await self._owner.send_frame(frame)
-            return await asyncio.wait_for(answer, timeout_s)
+            return await within(answer, timeout_s)
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"service {self.spec.tos_name} of robot {agent}", timeout_s) from error
         finally:

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, UsageError, WireError
 from macs_zenoh.protocol.keyexpr import type_name
+from macs_zenoh.timeouts import within
 from macs_zenoh.typed import Types, part_of_action, request_of, response_of
 
 from .actions import ABORTED, CANCELED, SUCCEEDED, Goal
@@ -340,7 +341,7 @@ class Session:
             began = time.monotonic()
             goal = await client.send_goal(agent, goal_cdr)
             try:
-                await asyncio.wait_for(steps(goal), args.timeout)
+                await within(steps(goal), args.timeout)
             except asyncio.TimeoutError:
                 await goal.cancel()
             except asyncio.CancelledError:
@@ -444,7 +445,7 @@ class Session:
                 raise Unreachable(self.headset.target, self.headset.why_ended)
 
         try:
-            await asyncio.wait_for(_unless_refused(take(), node), args.timeout)
+            await within(_unless_refused(take(), node), args.timeout)
         except asyncio.TimeoutError:
             log.info("%s: %d within %g s", what, taken, args.timeout)
             return 0 if taken and not args.count else 1
@@ -610,7 +611,7 @@ class Script:
             await self._wait_all(args.timeout)
             return
         try:
-            await asyncio.wait_for(self._session.wait_for(args.what, args.count), args.timeout)
+            await within(self._session.wait_for(args.what, args.count), args.timeout)
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"{args.count} of {args.what}", args.timeout) from error
 

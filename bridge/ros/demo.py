@@ -16,7 +16,6 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any
 
 import rclpy
@@ -177,15 +176,6 @@ class DemoRobot:
         self._image.publish(message)
 
 
-def _spin(node: Any) -> None:
-    try:
-        rclpy.spin(node)
-    except RuntimeError:
-        if rclpy.ok():
-            raise
-        # a callback that published in the moment in which a signal ended ROS
-
-
 def _others(node: Any) -> int:
     """How many nodes beside ours take the commands that are meant for us, once they had time to be found."""
     others, until = 0, time.monotonic() + DISCOVERY_S
@@ -204,24 +194,34 @@ def main(
     """
     log_to_stderr()
     log.setLevel(logging.INFO)
+    node = None
     try:
         rclpy.init(args=list(args) if args is not None else sys.argv)
         node = rclpy.create_node("demo_robot")
+        return _run(node, alone=alone, on_ready=on_ready)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
     except RuntimeError as error:
-        log.error("ROS 2 cannot be reached: %s", why(error))
-        return 1
-    try:
-        DemoRobot(node)
-        if alone and _others(node):
-            log.error("another node of this ROS domain takes %s: it would drive, too", COMMANDS)
+        if node is None:
+            log.error("ROS 2 cannot be reached: %s", why(error))
             return 1
-        on_ready()
-        log.info("demo robot: picture on /camera/image/compressed, /pose; drive it on /cmd_vel; service /set_lights")
-        with suppress(KeyboardInterrupt, ExternalShutdownException):
-            _spin(node)
+        if rclpy.ok():
+            raise
+        return 0  # a call into ROS in the moment in which a signal ended it
     finally:
-        node.destroy_node()
+        if node is not None:
+            node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _run(node: Any, *, alone: bool, on_ready: Callable[[], None]) -> int:
+    DemoRobot(node)
+    if alone and _others(node):
+        log.error("another node of this ROS domain takes %s: it would drive, too", COMMANDS)
+        return 1
+    on_ready()
+    log.info("demo robot: picture on /camera/image/compressed, /pose; drive it on /cmd_vel; service /set_lights")
+    rclpy.spin(node)
     return 0
 
 

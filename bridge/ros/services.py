@@ -26,6 +26,7 @@ from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
 from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.protocol.messages import ROS, AddNode, CallFailure, Metadata, NodeType, decode_data, encode_data
 from macs_zenoh.protocol.reading import Message
+from macs_zenoh.timeouts import within
 
 log = logging.getLogger("macs.ros")
 
@@ -178,7 +179,7 @@ class ClientNode(InterfaceNode):
 
     async def _call(self, message: Message) -> None:
         try:
-            response = await asyncio.wait_for(self._ask(message.data), self._deadline_s)
+            response = await within(self._ask(message.data), self._deadline_s)
         except CallFailed as error:
             self._fail(message, error)
         except asyncio.TimeoutError:

@@ -33,6 +33,7 @@ from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.protocol.messages import AddNode, NodeType, StreamData
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.recovery import SILENT_S
+from macs_zenoh.timeouts import within
 
 log = logging.getLogger("macs.ros")
 
@@ -404,7 +405,7 @@ class PublisherNode(TopicNode):
         """Let the subscriptions that exist find the new publisher: what is published before that, ROS loses."""
         if self._expected:
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._matched.wait(), self.MATCH_S)
+                await within(self._matched.wait(), self.MATCH_S)
 
     def _subscription_matched(self, status: Any) -> None:
         if status.current_count >= self._expected:

@@ -26,6 +26,7 @@ from macs_zenoh.config import MeshSettings, changed
 from macs_zenoh.errors import ConfigError, Unreachable
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol import endpoints
+from macs_zenoh.timeouts import within
 
 RETRY_S = 0.1
 
@@ -98,7 +99,7 @@ async def _reach(label: str, endpoint: str, timeout_s: float) -> None:
                 return
 
     try:
-        await asyncio.wait_for(connect(), timeout_s)
+        await within(connect(), timeout_s)
     except asyncio.TimeoutError:
         where = label if label == endpoint else f"{label} at {endpoint}"
         raise Unreachable(where, f"nobody listens there, tried for {timeout_s:g} s") from None

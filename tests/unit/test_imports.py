@@ -34,7 +34,7 @@ WITH_ASYNCIO = WITH_ZENOH | {
         "topics.py",
     )
 }
-NEEDED_FROM_OUTSIDE = {"msgspec", "zenoh", "tomli"}
+NEEDED_FROM_OUTSIDE = {"msgspec", "zenoh", "tomli", "async_timeout"}
 OFFERED = ROOT / "macs_zenoh" / "__init__.py"
 """It names what users import, of the bridge as well, for the type checker; it loads that when it is used."""
 INPUT_OUTPUT = {
