@@ -89,7 +89,7 @@ class InterfaceNodes:
 
     def __len__(self) -> int:
         """How many are registered; the emergency stop is always there."""
-        return len(self._nodes) - (self.stop is not None)
+        return sum(node is not self.stop for node in self)
 
     def get(self, node_type: int, node_name: str) -> InterfaceNode | None:
         """The first interface node of this name, None when nobody registered one."""

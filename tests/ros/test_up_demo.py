@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import os
 import re
+import signal
 import sys
 from collections.abc import Coroutine
 from typing import Any
 
+import pytest
 from geometry_msgs.msg import Twist
 from ros_peer import Peer
 
@@ -82,3 +84,30 @@ async def test_the_demo_shows_a_headset_that_sees_and_drives_a_robot(domain: int
     for step in ("connected", "who is here", "camera", "pose", "drive"):
         assert f"\n  {step} " in shown
     assert "FAILED" not in shown
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("moments", [range(1, 14), range(14, 27), range(27, 40)], ids=["early", "starting", "shown"])
+async def test_it_ends_whenever_it_is_told_to(domain: int, moments: range) -> None:
+    """SIGTERM at every tenth of a second of its start and show: it ends, with 0, without a traceback, and so have its
+    programs, which its output's end tells."""
+    for tenth in moments:
+        argv = [sys.executable, "-m", "bridge", "up", "--demo", "--port", "0", "--router-port", "0"]
+        process = await asyncio.create_subprocess_exec(
+            *argv,
+            cwd=ROOT,
+            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+        )
+        reading = asyncio.create_task(process.communicate())
+        await asyncio.sleep(tenth / 10)
+        process.send_signal(signal.SIGTERM)
+        try:
+            text = (await asyncio.wait_for(reading, 20))[0].decode()
+        except asyncio.TimeoutError:
+            process.kill()
+            raise AssertionError(f"told after {tenth / 10} s, it did not end") from None
+        # before Python has come to where it takes signals, they end it as they end any program
+        assert process.returncode == 0 or (tenth < 10 and process.returncode == -signal.SIGTERM), text
+        assert "Traceback" not in text, f"told after {tenth / 10} s: {text}"
