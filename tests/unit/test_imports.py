@@ -29,6 +29,7 @@ WITH_ASYNCIO = WITH_ZENOH | {
         "identity.py",
         "nodes.py",
         "presence.py",
+        "timeouts.py",
         "registration_calls.py",
         "streams.py",
         "topics.py",
