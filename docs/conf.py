@@ -80,7 +80,14 @@ def signature(app: Sphinx, what: str, name: str, value: Any, *_: Any) -> tuple[s
     return ("(…)", None) if isinstance(value, type) and issubclass(value, msgspec.Struct) else None
 
 
+def no_edit_of_generated(app: Sphinx, name: str, template: str, context: dict[str, Any], doctree: Any) -> None:
+    """What is made from the code has no file in the repository to edit."""
+    if name.startswith("generated/"):
+        context["page_source_suffix"] = ""
+
+
 def setup(app: Sphinx) -> None:
+    app.connect("html-page-context", no_edit_of_generated)
     app.connect("autodoc-process-signature", signature)
     app.connect("autodoc-process-docstring", code_as_written)
     app.connect("builder-inited", write_pages)
