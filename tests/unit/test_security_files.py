@@ -221,7 +221,7 @@ TRAFFIC = """
 traffic:
   - {match: "macs/from/ros/*/nd__camera$*", max_hz: 15, priority: data_low}
   - {match: "macs/from/ros/*/nd__pose", max_hz: 50}
-  - {match: "macs/from/ros/7/nd__log", max_hz: 5, reliable: 100}
+  - {match: "macs/from/ros/7/nd__log", max_hz: 5, cache: 100}
   - {match: "macs/from/ros/7/**", max_bytes: 5000000, priority: data_high}
   - {match: "macs/to/ros/**", priority: interactive_high}
   - {match: "macs/to/**", priority: data}
