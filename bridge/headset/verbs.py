@@ -229,6 +229,7 @@ def _add_send(verbs: Any) -> None:
         verbs,
         "send",
         "send text to agents by id, by group or to all",
+        'Prints {"to": "ros", "ids": [1, 2], "groups": [], "bytes": 5}, with "absent" where ids are not online.\n\n'
         "examples:\n"
         "  macs headset 127.0.0.1:7000 send 'look here' --to unity --groups 3\n"
         "  macs headset 127.0.0.1:7000 send hello --to ros --ids 1,2\n"

@@ -90,3 +90,11 @@ def test_help_in_a_script_writes_nothing(capsys: pytest.CaptureFixture[str]) -> 
     with pytest.raises(UsageError, match="usage:"):
         script_parser().parse_args(["online", "--help"])
     assert not capsys.readouterr().out
+
+
+def test_each_verb_says_what_it_prints(capsys: pytest.CaptureFixture[str]) -> None:
+    """Results are for programs, so help shows their form."""
+    for verb in ("online", "sub", "pub", "call", "serve", "goal", "ask", "send", "listen"):
+        with pytest.raises(SystemExit):
+            parse("h:1", verb, "--help")
+        assert "prints {" in capsys.readouterr().out.lower(), verb
