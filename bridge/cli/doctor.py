@@ -17,7 +17,7 @@ examples:
 
 what it prints:
   Routers
-    ok       tcp/10.0.0.1:7447: Zenoh 1.10.2, 0.9 ms there and back, 41 MB/s
+    ok       tcp/10.0.0.1:7447: Zenoh 1.10.2, 0.9 ms there and back, about 330 Mbit/s
     warning  tcp/10.0.0.2:7447: nobody listens there
              → start the router there, or correct host and port
 

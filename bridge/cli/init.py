@@ -9,10 +9,10 @@ examples:
   macs init site --into hall-1                         two routers, a gateway, a robot, and a policy for certificates
 
 what it prints:
-  ./robot.toml
-  ./macs-robot.service
-  ./robot.launch.py
-  ./macs.toml"""
+  macs-robot/robot.toml
+  macs-robot/macs-robot.service
+  macs-robot/robot.launch.py
+  macs-robot/macs.toml"""
 
 from __future__ import annotations
 

@@ -15,7 +15,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from bridge.cli import VERBS, build_parser, ls, main, options, robots, stop, supervisor, terminal, up
+from bridge.cli import VERBS, build_parser, doctor, ls, main, options, robots, stop, supervisor, terminal, up
+from bridge.doctor.analyze import found
+from bridge.doctor.checks import Severity
+from bridge.doctor.facts import Facts, Own
 from bridge.headset.verbs import script_parser
 from macs_zenoh.config import MeshSettings, OperatorSettings, Settings
 from macs_zenoh.errors import ConfigError
@@ -365,6 +368,26 @@ def test_ls_prints_what_its_help_shows() -> None:
     blocks = ls._text(agents, [Named("drone0", 1, 7, robot.zid)], told, [], verbose=False)
     blocks += ls._shown_infrastructure(ls._infrastructure(agents, pongs, routers))
     assert terminal.drawn(blocks, io.StringIO()).splitlines() == promised("ls")
+
+
+def test_doctor_prints_what_its_help_shows() -> None:
+    """The example is what it says of one router that answers and one that does not."""
+    version, throughput = "Zenoh 1.10.2", ", about 330 Mbit/s"
+    findings = [
+        found("router_ok", "tcp/10.0.0.1:7447", version=version, round_trip="0.9 ms", throughput=throughput),
+        found("refused", "tcp/10.0.0.2:7447", severity=Severity.WARNING),
+    ]
+    blocks = list(doctor.shown(findings, Facts(at_s=0.0, own=Own(), probe_bytes=2_800_000)))
+    assert terminal.drawn(blocks, io.StringIO()).splitlines() == promised("doctor")
+
+
+def test_init_prints_what_its_help_shows(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The files that it has written, where nobody said where to."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["init", "robot"]) == 0
+    assert capsys.readouterr().out.splitlines() == promised("init")
 
 
 def test_stop_prints_what_its_help_shows() -> None:
