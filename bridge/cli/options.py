@@ -16,6 +16,7 @@ from bridge.principal import GRAMMAR, Principal
 from macs_zenoh import config
 from macs_zenoh.config import MeshSettings, Settings
 from macs_zenoh.errors import UsageError
+from macs_zenoh.protocol import endpoints
 
 
 def add_log_options(parser: argparse.ArgumentParser, verbose: str = "log more") -> None:
@@ -106,7 +107,11 @@ def defaults() -> Settings:
 
 
 def _routers_of_environment() -> list[str] | None:
-    return os.environ.get(CONNECT, "").replace(",", " ").split() or None
+    routers = os.environ.get(CONNECT, "").replace(",", " ").split()
+    for router in routers:
+        if problem := endpoints.problem(router):
+            raise UsageError(f"{CONNECT}: {router!r} {problem}")
+    return routers or None
 
 
 def start_logging(args: argparse.Namespace) -> None:

@@ -21,7 +21,7 @@ from bridge.doctor.checks import Severity
 from bridge.doctor.facts import Facts, Own
 from bridge.headset.verbs import script_parser
 from macs_zenoh.config import MeshSettings, OperatorSettings, Settings
-from macs_zenoh.errors import ConfigError
+from macs_zenoh.errors import ConfigError, UsageError
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.keyexpr import KEYS
 from macs_zenoh.protocol.named import Named
@@ -245,7 +245,7 @@ def test_the_environment_names_routers_unless_somebody_does(
     file.write_text('[mesh]\nconnect = ["tcp/file:1"]\n')
     assert options.settings(parsed(verb, "--settings", str(file))).mesh.connect == ["tcp/file:1"]
     monkeypatch.setenv("MACS_CONNECT", "nonsense")
-    with pytest.raises(ConfigError, match="connect"):
+    with pytest.raises(UsageError, match="MACS_CONNECT: 'nonsense' is not a Zenoh endpoint"):
         options.settings(parsed(verb))
 
 
