@@ -233,6 +233,13 @@ class Nodes:
                 raise answer
         return type_behind(topic, kind, told)
 
+    def means(self, user: NodeUser, robot: int) -> bool:
+        """Whether a robot is one of those that a user named, by its id or its group."""
+        if robot in user.robots:
+            return True
+        found = self.agent.directory.get(ROS, robot) if user.groups else None
+        return found is not None and found.group in user.groups
+
     def _online(self, robots: Collection[int], groups: Collection[int]) -> list[int]:
         return [robot.id for robot in self.agent.directory.of_type(ROS) if robot.id in robots or robot.group in groups]
 
@@ -248,6 +255,7 @@ class Nodes:
         if is_new or node.wanted.buffer_size < depth or covered != set(self._online(user.robots, user.groups)):
             node.wanted = structs.replace(node.wanted, buffer_size=max(node.wanted.buffer_size, depth))
             node.refused.clear()
+            node.confirmed.clear()  # all of them are asked again
             self._calls.register(node.wanted, sorted(user.robots), sorted(user.groups))
         try:
             await self._answered(user, node, timeout_s)
@@ -309,13 +317,11 @@ class Nodes:
             data = self._reader.read(key, name, payload, self.agent.key)
             if node is None or not data:
                 continue
-            found = self.agent.directory.get(ROS, robot)
-            group = found.group if found is not None else 0
             messages = [
                 TopicMessage(robot, node.topic, node.wanted.data_exchange_type, cdr, self.types) for cdr in data
             ]
             for user in list(node.users):
-                if robot in user.robots or group in user.groups:
+                if self.means(user, robot):
                     self._give(user, messages)
 
     def _give(self, user: NodeUser, messages: Iterable[TopicMessage]) -> None:
@@ -362,10 +368,8 @@ class Nodes:
         told = (node.key, robot, reason)
         if told not in self._logged and len(self._logged) < KNOWN:
             self._logged.add(told)
-            log.warning(
-                "ros/%d does not take part in %s: %s (logged once)", message.sender_id, node.topic, refusal.reason
-            )
-        _tell_refused(node, message.sender_id, refusal.reason)
+            log.warning("ros/%d does not take part in %s: %s (logged once)", robot, node.topic, reason)
+        self._tell_refused(node, robot, reason)
         return True
 
     def _node_refused(self, _: AgentKey, refused: NodeRefused) -> None:
@@ -374,7 +378,12 @@ class Nodes:
             node.confirmed.discard(refused.robot_id)
             node.refused[refused.robot_id] = refused.reason
             node.changed.set()
-            _tell_refused(node, refused.robot_id, refused.reason)
+            self._tell_refused(node, refused.robot_id, refused.reason)
+
+    def _tell_refused(self, node: Node, robot: int, reason: str) -> None:
+        for user in list(node.users):
+            if robot == 0 or self.means(user, robot):
+                user.told_refused(robot, reason)
 
     def _confirmed(self, task: Task) -> None:
         node = self._nodes.get((task.node.node_type, task.node.node_name))
@@ -423,11 +432,6 @@ class Nodes:
         for answer in self._open.values():
             if not answer.done():
                 answer.set_exception(Closed(str(self.agent.key)))
-
-
-def _tell_refused(node: Node, robot: int, reason: str) -> None:
-    for user in list(node.users):
-        user.told_refused(robot, reason)
 
 
 def _reasons(refused: Mapping[int, str]) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import builtins
+import logging
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ from .typed import Types
 
 if TYPE_CHECKING:
     from .nodes import Nodes
+
+log = logging.getLogger("macs.agent")
 
 DEPTH = 10
 """Messages that are held for one node, at the robot and here, unless asked otherwise: a headset's default."""
@@ -109,7 +112,9 @@ class NodeUser:
     @property
     def refused(self) -> dict[int, str]:
         """The robots that do not take part, and why; 0: all of them."""
-        return dict(self._node.refused)
+        return {
+            robot: why for robot, why in self._node.refused.items() if robot == 0 or self._nodes.means(self, robot)
+        }
 
     def on_refused(self, callback: OnRefused) -> Handle:
         """Call ``callback(robot, reason)`` when a robot refuses the node from now on, or something sent for it."""
@@ -118,7 +123,10 @@ class NodeUser:
     def told_refused(self, robot: int, reason: str) -> None:
         """A robot refuses this."""
         for callback in self._on_refused:
-            callback(robot, reason)
+            try:
+                callback(robot, reason)
+            except Exception:  # whoever listens; what else is to be done goes on
+                log.exception("a callback of %s failed", self.topic)
 
     def close(self) -> None:
         """Not needed any more: robots are told, unless others here use it. Closing twice is allowed."""

@@ -117,6 +117,34 @@ async def test_some_may_refuse_and_all_may_not(router: str) -> None:
         await until(lambda: not second.registrants, PATIENCE_S)
 
 
+async def test_a_refusal_concerns_whom_it_is_about(router: str, caplog: pytest.LogCaptureFixture) -> None:
+    """What one robot refuses is no matter of who uses another; a callback that fails costs nothing else."""
+    async with (
+        robot(router, 1) as first,
+        robot(router, 2) as second,
+        macs_zenoh.join("unity", id=300, connect=[router]) as agent,
+    ):
+        await knows(agent, 1, 2)
+        one, two = [await agent.subscribe(TOPIC, robot=number, type=STRING) for number in (1, 2)]
+        told: list[str] = []
+
+        def fail(robot: int, reason: str) -> None:
+            told.append("two")
+            raise RuntimeError("the program's own fault")
+
+        one.on_refused(lambda robot, reason: told.append("one"))
+        two.on_refused(fail)
+        second.refusal = "no more"
+        with pytest.raises(macs_zenoh.Refused):
+            await agent.subscribe(TOPIC, robot=2, type=STRING, depth=20)
+        assert set(told) == {"two"}
+        assert (one.refused, two.refused) == ({}, {2: "no more"})
+        assert "a callback of /chatter failed" in caplog.text
+        second.refusal = ""
+        await hears(await agent.subscribe(TOPIC, robot=2, type=STRING), 2)
+        await until(lambda: first.registrants == second.registrants == {300}, PATIENCE_S)
+
+
 async def test_reasons_are_told_by_robot(router: str) -> None:
     """Robots that refuse for different reasons are named with them."""
     async with (
