@@ -10,5 +10,8 @@ joins them directly, and is what a gateway without any cost would reach. Before 
 some messages whose every byte is compared. A run waits for every message; what did not arrive is a line below the
 table, and the round in which that happened counts as nothing.
 
+A sender that repeats one frame shows a gateway at its best. In the case ``differing`` each message has a number, a
+request id and a length of its own, destinations take turns, and the receiver counts what is lost or out of order.
+
 Times are taken from the first byte sent to the last one received by the last receiver, by one clock (CLOCK_MONOTONIC).
 """

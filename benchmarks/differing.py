@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from .cases import rate, size_text
+from .cases import RawZenoh, rate, size_text
 from .figures import Figure
 from .plan import KIB, MIB, QUIET_S, Plan, Run, in_turn
 from .processes import Program, ProgramFailed, Stage
@@ -74,15 +74,21 @@ def differing(stage: Stage, plan: Plan) -> Iterator[Figure]:
     near, far = stage.gateway(router), stage.gateway(router)
     relay = stage.relay()
     paths = {"relay": (relay, relay), "one gateway": (near, near), "two gateways": (near, far)}
+    zenoh = RawZenoh.start(stage, router, direct=False)
     for receivers, each, sizes in ((1, False, SIZES), (2, True, SIZES), (10, False, (64, 64 * KIB, MIB))):
         lines = [connect(stage, path, *ports, receivers) for path, ports in paths.items()]
         for size in sizes:
-            values = in_turn(plan.rounds, {line.path: run_of(plan, line, size, each=each) for line in lines})
-            baseline = values.pop("relay")
+            runs = {line.path: run_of(plan, line, size, each=each) for line in lines}
+            if receivers == 1:
+                runs["raw Zenoh"] = zenoh.run(plan, size, plan.count(size))
+            values = in_turn(plan.rounds, runs)
+            baseline, raw = values.pop("relay"), values.pop("raw Zenoh", None)
             for path, rates in values.items():
-                name = f"{receivers}{' in turn' if each else ''}, {path}, {size_text(size)}"
+                name = f"differing, 1 to {receivers}{' in turn' if each else ''}, {path}, {size_text(size)}"
                 bound = 0.9 if path == "one gateway" else None
-                yield rate(f"differing, 1 to {name}", size, rates, baseline, "plain relay", at_least=bound)
+                yield rate(name, size, rates, baseline, "plain relay", at_least=bound)
+                if raw is not None:
+                    yield rate(name, size, rates, raw, "raw Zenoh")
         for line in lines:
             line.sender.stop()
             line.receiver.stop()
