@@ -131,22 +131,25 @@ async def _serve(settings: Settings) -> int:
     from bridge.doctor.first import told_while_waiting
     from bridge.gateway import Gateway
     from macs_zenoh import managers
+    from macs_zenoh.locked_out import locked_out
     from macs_zenoh.mesh import Mesh
 
     _raise_descriptor_limit()
     memory.give_back()
     own = managers.load(settings.gateway.managers)
     waiting = told_while_waiting(settings.mesh)
-    async with await Mesh.open(settings.mesh, traffic=settings.traffic, on_waiting=waiting) as mesh:
-        gateway = Gateway(mesh, settings.gateway, own)
-        try:
-            await gateway.start()
-            if not settings.gateway.allow and not is_local(settings.gateway.host):
-                log.warning(
-                    "%s is open: whoever reaches it is a headset; --allow says which networks", gateway.address
-                )
-            running.say_ready(f"gateway on {gateway.address}")
-            await asyncio.Event().wait()
-        finally:
-            await gateway.close()
-    return 0
+    listening = settings.gateway
+    while True:
+        async with await Mesh.open(settings.mesh, traffic=settings.traffic, on_waiting=waiting) as mesh:
+            gateway = Gateway(mesh, listening, own)
+            try:
+                await gateway.start()
+                if not listening.allow and not is_local(listening.host):
+                    log.warning(
+                        "%s is open: whoever reaches it is a headset; --allow says which networks", gateway.address
+                    )
+                running.say_ready(f"gateway on {gateway.address}")
+                await locked_out(mesh)
+                listening = changed(listening, port=gateway.port)  # headsets that come back look for it there
+            finally:
+                await gateway.close()

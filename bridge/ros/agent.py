@@ -29,6 +29,7 @@ from macs_zenoh import managers
 from macs_zenoh.agent import Agent, Call
 from macs_zenoh.config import RobotSettings, Settings
 from macs_zenoh.errors import MacsError, Refused, WireError
+from macs_zenoh.locked_out import locked_out
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import Mesh, now_s
 from macs_zenoh.protocol.directory import AgentInfo
@@ -396,8 +397,18 @@ async def run(
     on_ready: Callable[[Agent], None] | None = None,
     stop: asyncio.Event | None = None,
 ) -> None:
-    """Be a robot until ``stop`` is set or the task is cancelled. See `open_robot`."""
-    async with open_robot(settings, ros_args=ros_args, on_waiting=on_waiting) as robot:
-        if on_ready is not None:
-            on_ready(robot.agent)
-        await (stop or asyncio.Event()).wait()
+    """Be a robot until ``stop`` is set or the task is cancelled; with another session when routers do not let this one
+    in any more (`macs_zenoh.locked_out`). See `open_robot`."""
+    stopping = asyncio.ensure_future((stop or asyncio.Event()).wait())
+    try:
+        while not stopping.done():
+            async with open_robot(settings, ros_args=ros_args, on_waiting=on_waiting) as robot:
+                if on_ready is not None:
+                    on_ready(robot.agent)
+                leaving = asyncio.ensure_future(locked_out(robot.agent.mesh))
+                try:
+                    await asyncio.wait([stopping, leaving], return_when=asyncio.FIRST_COMPLETED)
+                finally:
+                    leaving.cancel()
+    finally:
+        stopping.cancel()

@@ -27,6 +27,7 @@ WITH_ASYNCIO = WITH_ZENOH | {
         "agent.py",
         "awareness.py",
         "identity.py",
+        "locked_out.py",
         "nodes.py",
         "presence.py",
         "timeouts.py",

@@ -1,0 +1,78 @@
+"""Somebody takes a session's Zenoh id while its link is lost: the program goes on under another one."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+from ros_peer import until
+
+from bridge.ros import agent
+from macs_zenoh import join, locked_out
+from macs_zenoh.agent import Agent
+from macs_zenoh.config import MeshSettings, RobotSettings, Settings
+from macs_zenoh.mesh import Mesh
+from tests.links import Link, counted
+from tests.routers import Router
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(locked_out, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(locked_out, "AGAIN_S", 0.1)
+
+
+def zenoh_id(mesh: Mesh) -> str:
+    return str(mesh._session.zid())
+
+
+@asynccontextmanager
+async def stolen(mesh: Mesh, link: Link, router: Router) -> AsyncIterator[None]:
+    """A thief has the session's id: it was there when the link was lost."""
+    link.cut()
+    await until(lambda: not mesh.linked)
+    settings = MeshSettings(connect=[router.endpoint], overrides=[f'id:"{zenoh_id(mesh)}"'])
+    async with await Mesh.open(settings):
+        link.mend()
+        yield
+
+
+async def test_who_is_locked_out_notices_and_who_is_cut_off_is_not() -> None:
+    """A link that is lost, and comes back, is none; the same with a thief is."""
+    async with (
+        Router() as router,
+        counted(router.endpoint) as link,
+        await Mesh.open(MeshSettings(connect=[link.endpoint])) as mesh,
+    ):
+        noticed = asyncio.create_task(locked_out.locked_out(mesh))
+        link.cut()
+        await until(lambda: not mesh.linked)
+        await asyncio.sleep(0.5)
+        link.mend()
+        await until(lambda: mesh.linked, 30)
+        await asyncio.sleep(0.5)
+        assert not noticed.done()
+        async with stolen(mesh, link, router):
+            await asyncio.wait_for(noticed, 60)
+            assert not mesh.linked
+
+
+async def test_a_robot_goes_on_under_another_id(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As long as the thief stays: the robot is online again, with another session, and answers."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    came: list[Agent] = []
+    stop = asyncio.Event()
+    async with Router() as router, counted(router.endpoint) as link:
+        settings = Settings(mesh=MeshSettings(connect=[link.endpoint]), robot=RobotSettings(id=7, stop_topic=""))
+        async with join("operator", id=5, settings=MeshSettings(connect=[router.endpoint])) as operator:
+            running = asyncio.create_task(agent.run(settings, on_ready=came.append, stop=stop))
+            await until(lambda: came, 30)
+            before = zenoh_id(came[0].mesh)
+            async with stolen(came[0].mesh, link, router):
+                await until(lambda: len(came) == 2, 60)
+                assert zenoh_id(came[1].mesh) != before
+                await operator.call("ros", 7, "status", timeout_s=20)
+            stop.set()
+            await asyncio.wait_for(running, 30)
