@@ -90,6 +90,8 @@ class Arrivals:
         self._large_bytes = 0
         self._large_lock = threading.Lock()
         self._turn = threading.Lock()
+        self._handing_over = False
+        """Whether the loop has the turn."""
         self._busy_until = 0.0
         self.asked: deque[zenoh.Query] = deque()
         """Queries on their way to the loop: an emergency stop can be among them, so no sample overtakes them."""
@@ -216,14 +218,20 @@ class Arrivals:
 
     def make_room(self) -> None:
         """Hand over what waits, if much of it was put by the loop's own thread, which handles it as well: whoever puts
-        there for others calls this after each put, and goes on when there is room. Not within a handler."""
+        there for others calls this after each put, and goes on when there is room. Nothing within a handler."""
+        if self._handing_over:
+            return
         if self.looped > self.LOOPED or (self.looped and self._large_bytes > self.LIMIT_BYTES // 4):
             self._deliver()
 
     def _deliver(self) -> None:
         self._waiting = False
         with self._turn:
-            self._deliver_batch()
+            self._handing_over = True
+            try:
+                self._deliver_batch()
+            finally:
+                self._handing_over = False
 
     def _deliver_batch(self) -> None:
         queue, now = self._queue, time.monotonic()

@@ -156,6 +156,9 @@ async def test_no_sample_goes_past_a_question(mesh: Mesh, sender: Mesh) -> None:
     receiver.numbers.clear()
     asked = asyncio.create_task(sender.query(key, b"", timeout_s=5))
     await asyncio.sleep(0)  # it is asked now
+    deadline = time.monotonic() + 5
+    while not mesh._arrivals.asked and time.monotonic() < deadline:  # the loop stands still
+        time.sleep(0.005)
     for i in range(3):  # and the loop of who is asked has something else to do
         time.sleep(0.05)
         sender.put(KEY, i.to_bytes(4, "big"), Traffic.COMMAND)

@@ -13,8 +13,13 @@ import pytest
 from benchmarks import sequence
 from benchmarks.headset import TOPIC, Headset
 from bridge.headset import frames
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.mesh import Mesh, Sample
+from macs_zenoh.mesh.arrivals import Arrivals
+from tests.integration.conftest import until
 from tests.programs import Program, free_port
 
+KEY, ECHO = "macs/to/ros/7/from/unity/256", "macs/to/ros/8/from/unity/256"
 SETTINGS = """[gateway]
 robots = "any"
 max_commands_per_s = 0
@@ -169,3 +174,27 @@ async def registered(robot: Headset, headsets: list[Headset]) -> None:
     robot.socket.settimeout(10)
     while told.count(b"nd__bench") < len(headsets):
         told += await asyncio.to_thread(robot.socket.recv, 65536)
+
+
+async def test_what_the_loop_puts_waits_for_itself(router: str) -> None:
+    """Who makes room after each put on the loop loses nothing of any number, and keeps the order; a handler that puts
+    and makes room, which is inside of it, does not wait for itself."""
+    got: list[int] = []
+    echoed: list[int] = []
+    async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
+
+        def note(batch: Iterator[Sample]) -> None:
+            for _, payload in batch:
+                got.append(int(payload))
+                mesh.put(ECHO, payload)
+                mesh.make_room()
+
+        mesh.subscribe(KEY, note)
+        mesh.subscribe(ECHO, lambda batch: echoed.extend(int(payload) for _, payload in batch))
+        count = 3 * Arrivals.LIMIT
+        for number in range(count):
+            mesh.put(KEY, b"%d" % number)
+            mesh.make_room()
+        await until(lambda: len(echoed) == count, 30)
+        assert got == echoed == list(range(count))
+        assert not mesh.drops["loop_behind"]
