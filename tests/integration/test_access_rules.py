@@ -185,7 +185,7 @@ async def test_an_observer_sees_who_is_online(as_user: Callable[[str], MeshSetti
         macs_zenoh.join("ros", id=7, group=3, settings=as_user("robot-7")),
         await Mesh.open(as_user("observer")) as mesh,
     ):
-        keys = await mesh.tokens(PRESENCE.every())
+        keys = await mesh.tokens(PRESENCE.every(), timeout_s=20)
     assert [fields["id"] for key in keys if (fields := PRESENCE.parse(key))] == [7]
 
 

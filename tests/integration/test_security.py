@@ -302,7 +302,9 @@ async def test_presence_by_role(site: Site) -> None:
         await until(lambda: all(who <= seen[key] for _, key, who in TOKENS))
         for name, key, who in TOKENS:
             assert seen[key] == who, (name, key)
-            found = {watcher for watcher in names for each in [await watches[watcher].tokens(key)] if each}
+            found = {
+                watcher for watcher in names for each in [await watches[watcher].tokens(key, timeout_s=20)] if each
+            }
             assert found == who, (name, key)
         for declared in tokens + watching:
             declared.close()
@@ -443,7 +445,7 @@ async def test_a_client_that_says_it_is_a_router_may_no_more(site: Site) -> None
             await asyncio.sleep(0.05)
         assert {bytes(payload) for _, payload in (*stream, *inbox)} == {b"true"}
         assert {bytes(payload) for got in taken for _, payload in got} == {b"forged", b"x"}  # its own
-        assert await anna.tokens("macs/live/**") == ["macs/live/ros/8/3/a8"]
+        assert await anna.tokens("macs/live/**", timeout_s=20) == ["macs/live/ros/8/3/a8"]
         for token in tokens:
             token.close()
 
