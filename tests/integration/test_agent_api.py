@@ -84,13 +84,13 @@ async def test_drain_waits_for_what_was_sent_before(router: str) -> None:
         macs_zenoh.join("unity", id=300, connect=[router]) as headset,
     ):
         await until(lambda: len(headset.online()) == len(robot.online()) == 2, 20)
-        headset.send(bytes(30 << 20), to="ros", ids=[7])
+        headset.send(bytes(12 << 20), to="ros", ids=[7])
         headset.send(b"after it", to="ros", ids=[7])
         draining = asyncio.ensure_future(headset.drain())
         await asyncio.sleep(0)
         assert not draining.done()
         await asyncio.wait_for(draining, 60)
-        assert len((await asyncio.wait_for(robot.receive(), 60)).data) == 30 << 20
+        assert len((await asyncio.wait_for(robot.receive(), 60)).data) == 12 << 20
         assert (await asyncio.wait_for(robot.receive(), 20)).data == b"after it"
 
 
