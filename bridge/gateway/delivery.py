@@ -153,6 +153,7 @@ class Delivery:
             if stream is None:
                 continue  # the last registrant has just left
             robot = self._agents.find(*stream.robot)
+            may_hold: bool | None = None
             for frame, metadata in self._read(key, payload, stream.robot):
                 registered = stream.registrants if stream.carries(metadata) else NOBODY
                 fits, messages = frame.carries(CDR, least_bytes(metadata)), frame.messages
@@ -161,7 +162,11 @@ class Delivery:
                     if connection is None:
                         continue
                     if registrant in registered:
-                        keep = connection.full and self._holds_robot(robot, connection)
+                        keep = False
+                        if robot is not None and connection.full:
+                            if may_hold is None:  # once for the sample: it looks at everybody
+                                may_hold = self._all_are_full(robot)
+                            keep = may_hold and connection.backpressure.hold(robot, connection.moved, ROBOT_HOLD_S)
                         if connection.existing and not fits:
                             self._send_fitting(connection, frame, metadata, topic_data(metadata), stream.node, keep)
                         else:
@@ -342,16 +347,14 @@ class Delivery:
             if receiver.congested and (connection := self._agents.find(*sender)) is not None:
                 receiver.backpressure.hold(connection, receiver.moved)
 
-    def _holds_robot(self, robot: Connection | None, receiver: Connection) -> bool:
-        """Slow down a robot program on this gateway, for a receiver that is full. Not while anybody else who
-        registered there could take more: a headset that reads slowly must not slow down the others' topics."""
-        if robot is None:
-            return False
+    def _all_are_full(self, robot: Connection) -> bool:
+        """Whether nobody who registered on a robot program of this gateway could take more, so that it may be held: a
+        headset that reads slowly must not slow down the others' topics."""
         for registrant in robot.robot_nodes.registrants():
             other = self._agents.find(registrant.agent_type, registrant.agent_id)
-            if other is not receiver and (other is None or not other.full):
+            if other is None or not other.full:
                 return False
-        return receiver.backpressure.hold(robot, receiver.moved, ROBOT_HOLD_S)
+        return True
 
     def _read_registrants(self, key: str, frame: Frame) -> list[AgentKey]:
         """Each registrant, once. The list changes only with registrations, so each is read once."""
