@@ -17,6 +17,7 @@ from msgspec import Meta
 
 from ..errors import BadField, BadJson, UsageError
 from .keyexpr import NAME, WANTED, type_name
+from .limits import NESTING
 from .wire import encode_message, split_message
 
 _K = TypeVar("_K")
@@ -74,6 +75,8 @@ def encode(envelope: Envelope, data: bytes | bytearray | memoryview) -> bytes:
 def decode(payload: bytes) -> tuple[Envelope, bytes]:
     """Take a message apart. Raises BadSizes, TooLong, BadJson, BadField."""
     text, data = split_message(payload)
+    if text.count(b"[") + text.count(b"{") > NESTING:  # it is flat; how deep Python follows differs by version
+        raise BadJson("envelope", f"more than {NESTING} objects and lists")
     try:
         return _decoder.decode(text), bytes(data)
     except msgspec.ValidationError as error:
