@@ -227,7 +227,7 @@ class Agent:
         for key, payload, age_s, now in batch:
             for message in self._reader.read(key, payload, me, by_group=by_group):
                 if guard.judge(message, key, age_s, now):
-                    self._on_message(message)
+                    self._on_message(message._replace(age_s=age_s))
 
     def _subscribe(self, key: str, *, by_group: bool = False) -> Subscription:
         """Receive what comes on a key."""

@@ -87,7 +87,7 @@ class Nodes:
         self._types: Types | None = None
         self._services: dict[tuple[str, int], ServiceUser] = {}
         self._publishers: dict[tuple[str, frozenset[int], frozenset[int]], TopicPublisher] = {}
-        self._next_request = itertools.cycle(range(REQUEST_IDS)).__next__
+        self._next_request = itertools.count().__next__
         self._open: dict[tuple[int, str, int], asyncio.Future[bytes]] = {}
         """Calls by robot, node name and request id."""
         self._tasks: set[asyncio.Task[None]] = set()
@@ -167,7 +167,7 @@ class Nodes:
 
     async def _ask(self, user: ServiceUser, robot: int, request: bytes, left_s: float, timeout_s: float) -> bytes:
         name = node_name(user.topic)
-        number = self._next_request()
+        number = self._next_request() % REQUEST_IDS
         # by naming CallFailure a caller asks to be told why there is no answer
         metadata = Metadata(
             request_id=number,

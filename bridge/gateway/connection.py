@@ -143,6 +143,8 @@ class Connection(asyncio.BufferedProtocol):
         self.congested = False
         """Whether so much waits for this agent that its senders should slow down."""
         self.backpressure = Backpressure()
+        self.robot_backpressure = Backpressure()
+        """For robot programs, which can wait longer."""
         self._toll = Toll(REQUESTS_PER_S)
         self._tolled: asyncio.TimerHandle | None = None
         self.grouped_at = -math.inf
@@ -233,6 +235,7 @@ class Connection(asyncio.BufferedProtocol):
         if not self._outbox:
             self.congested = False
             self.backpressure.release()
+            self.robot_backpressure.release()
 
     def connection_lost(self, exc: Exception | None) -> None:
         for timer in (self._timer, self._tolled, self.regrouping):
@@ -244,6 +247,7 @@ class Connection(asyncio.BufferedProtocol):
         if self.greeted:
             self.peer.lost()
         self.backpressure.release()
+        self.robot_backpressure.release()
         self._memory.unfinished.note(self, self.host, 0)
         self._memory.waiting.set(self, self.host, 0)
         self.owner.closed(self)

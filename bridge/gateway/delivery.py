@@ -18,6 +18,7 @@ from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.existing import CDR, PASS, PASS_ONCE, Data, Verdict, fitting, least_bytes, refuses, topic_data
 from macs_zenoh.protocol.judging import Judge
 from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue
+from macs_zenoh.protocol.least_bytes import TEXT_TYPE, is_whole
 from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, decode_management
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.routing import takes_group_copy
@@ -69,6 +70,8 @@ class Seen(NamedTuple):
     beginning: bytes
     message_at: int
     registrants: list[AgentKey]
+    is_text: bool
+    """Whether its data has a length in it, which each message is judged by."""
 
 
 class Delivery:
@@ -156,7 +159,8 @@ class Delivery:
             may_hold: bool | None = None
             for frame, metadata in self._read(key, payload, stream.robot):
                 registered = stream.registrants if stream.carries(metadata) else NOBODY
-                fits, messages = frame.carries(CDR, least_bytes(metadata)), frame.messages
+                fits = frame.carries(CDR, least_bytes(metadata)) and is_whole(frame.body, metadata.data_exchange_type)
+                messages = frame.messages
                 for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
                     connection = self._agents.find(*registrant)
                     if connection is None:
@@ -166,7 +170,9 @@ class Delivery:
                         if robot is not None and connection.full:
                             if may_hold is None:  # once for the sample: it looks at everybody
                                 may_hold = self._all_are_full(robot)
-                            keep = may_hold and connection.backpressure.hold(robot, connection.moved, ROBOT_HOLD_S)
+                            keep = may_hold and connection.robot_backpressure.hold(
+                                robot, connection.moved, ROBOT_HOLD_S
+                            )
                         if connection.existing and not fits:
                             self._send_fitting(connection, frame, metadata, topic_data(metadata), stream.node, keep)
                         else:
@@ -186,6 +192,8 @@ class Delivery:
             seen = self._look(key, payload, stream)
             if seen is None:
                 return False
+        if seen.is_text and not is_whole(memoryview(payload)[len(seen.beginning) - len(CDR) :], TEXT_TYPE):
+            return False
         receivers = []
         for registrant in seen.registrants:
             connection = self._agents.find(*registrant)
@@ -213,7 +221,8 @@ class Delivery:
             self._seen.clear()
         if judged.true != frame.metadata or not frame.carries(CDR, least_bytes(judged.metadata)):
             return None
-        seen = self._seen[key, len(payload)] = Seen(frame.beginning + CDR, frame.message_at, registrants)
+        is_text = judged.metadata.data_exchange_type == TEXT_TYPE
+        seen = self._seen[key, len(payload)] = Seen(frame.beginning + CDR, frame.message_at, registrants, is_text)
         return seen
 
     def _flush(self) -> None:

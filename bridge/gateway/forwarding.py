@@ -102,7 +102,7 @@ class Forwarding:
             self.flush()
             self._put_singly(route.keys, sent, traffic)
         else:
-            self._gather(route.name, route.keys, sent, traffic, apart=route.apart)
+            self._gather(connection, route.name, route.keys, sent, traffic, apart=route.apart)
 
     def stream(self, connection: Connection, event: Streamed) -> None:
         """Put a robot program's topic data where its registrants listen."""
@@ -112,16 +112,16 @@ class Forwarding:
             self.flush()
             self._put_singly([key], sent, STREAM)
         else:
-            self._gather(key, [key], sent, STREAM, apart=False)
+            self._gather(connection, key, [key], sent, STREAM, apart=False)
 
     def finish(self, connection: Connection) -> None:
         """All that one read of a socket brought is forwarded."""
         if self._runs:
             self.flush()
         if self._waited:
-            for route, newest in self._waited.values():
+            waited, self._waited = self._waited, {}
+            for route, newest in waited.values():
                 self._put(route.keys, newest.frame.data, COMMAND)
-            self._waited.clear()
         if self._mesh.backlogged:
             self._backpressure.hold(connection, self._mesh.backlog_sent)
 
@@ -140,7 +140,9 @@ class Forwarding:
             connection.complain("too_many_strangers", problem, route.left_out)
         return route
 
-    def _gather(self, name: str, keys: list[str], sent: Sent, traffic: Traffic, *, apart: bool) -> None:
+    def _gather(
+        self, connection: Connection, name: str, keys: list[str], sent: Sent, traffic: Traffic, *, apart: bool
+    ) -> None:
         size = len(sent.frame.data)
         run = self._runs.get(name)
         if run is None or run.traffic is not traffic or run.bytes + size > Mesh.LARGE_BYTES:
@@ -150,7 +152,7 @@ class Forwarding:
             self._apart = apart
         run.read.append((sent.frame, sent.metadata))
         run.bytes += size
-        if not sent.readable:
+        if not sent.readable or sent.metadata.sender_agent_id != connection.agent_id:  # judged under its former id
             run.readable = False
 
     def _put_singly(self, keys: list[str], sent: Sent, traffic: Traffic) -> None:
@@ -180,6 +182,8 @@ class Forwarding:
         else:
             passing = connection.pace.request(count, now)
         if passing is Passing.NOW:
+            if self._waited and self._waited.pop((sent.frame.destination, metadata.node_name), None) is not None:
+                connection.complain("too_old", "commands that waited with newer ones")
             return True
         if passing is Passing.FLOODED:
             connection.complain("flooded", "it sends robots more than one agent may", count)

@@ -392,7 +392,8 @@ class Gateway:
 
     def _register(self, connection: Connection, event: Registering) -> None:
         """An agent registers on a node of robots, or takes that back."""
-        node = event.node
+        kind, agent_id = connection.key  # it may have become another one than when it said this
+        node = structs.replace(event.node, registrant_agent_type=kind, registrant_agent_id=agent_id)
         if isinstance(node, AddNode):
             why = None
             if not connection.is_registered(node):

@@ -23,6 +23,7 @@ from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.requests import STATUS, ControlReply, ControlRequest, control, status
 from bridge.ros.rules import Rules
+from bridge.ros.safety import EmergencyStop
 from bridge.ros.session import RosSession
 from bridge.ros.stop_line import StopLine
 from macs_zenoh import managers
@@ -70,6 +71,7 @@ class RobotAgent:
         settings: RobotSettings,
         managers: Managers | None = None,
         guard: Guard | None = None,
+        emergency_stop: EmergencyStop | None = None,
     ) -> None:
         self._managers = managers or {}
         self._guard = guard
@@ -85,6 +87,7 @@ class RobotAgent:
             Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots),
             send=self._send,
             rules=Rules(settings),
+            stop=emergency_stop or EmergencyStop(),
             group_of=self._group_of,
             is_online=lambda agent: agent in self.agent.directory,
             prioritise_stream=self.streams.prioritise,
@@ -256,9 +259,10 @@ class RobotAgent:
         if topic and topic != stop.key.node_name:  # a gateway asks, as what a headset sent may be a stop
             raise Refused(f"{topic[:80]} is not the emergency stop of this robot, which is {stop.topic}")
         presses = call.data != b"false"
-        stop.set(sender, presses)
         if presses and self._guard is not None:
+            # before it stops: a release that is on its way must not come between the two
             self._guard.pressed(sender, now_s())
+        stop.set(sender, presses)
 
     async def _stopped(self, _call: Call) -> bytes:
         return self._state()
@@ -346,6 +350,7 @@ async def open_robot(
     domain_id: int | None = None,
     ros_args: Sequence[str] = (),
     on_waiting: Callable[[str], None] | None = None,
+    emergency_stop: EmergencyStop | None = None,
 ) -> AsyncIterator[RobotAgent]:
     """Start ROS, join the mesh and serve until the end of the block.
 
@@ -354,6 +359,7 @@ async def open_robot(
         domain_id: None takes ``ROS_DOMAIN_ID``.
         ros_args: ROS arguments, as ``["--ros-args", "-r", "__ns:=/robot7"]``.
         on_waiting: called once while no router answers.
+        emergency_stop: its state, when the robot was there before: a stop holds however its sessions end.
 
     ROS parameters win over ``settings`` (see `parameters`).
 
@@ -377,7 +383,7 @@ async def open_robot(
             guard=guard,
             on_waiting=on_waiting,
         ) as agent:
-            ros_agent = RobotAgent(agent, session, robot, own, guard)
+            ros_agent = RobotAgent(agent, session, robot, own, guard, emergency_stop)
             await ros_agent.start()
             log.info("robot %d serves %s", agent.id, session.full_name)
             try:
@@ -400,9 +406,12 @@ async def run(
     """Be a robot until ``stop`` is set or the task is cancelled; with another session when routers do not let this one
     in any more (`macs_zenoh.locked_out`). See `open_robot`."""
     stopping = asyncio.ensure_future((stop or asyncio.Event()).wait())
+    emergency_stop = EmergencyStop()
     try:
         while not stopping.done():
-            async with open_robot(settings, ros_args=ros_args, on_waiting=on_waiting) as robot:
+            async with open_robot(
+                settings, ros_args=ros_args, on_waiting=on_waiting, emergency_stop=emergency_stop
+            ) as robot:
                 if on_ready is not None:
                     on_ready(robot.agent)
                 leaving = asyncio.ensure_future(locked_out(robot.agent.mesh))

@@ -81,6 +81,11 @@ class EarlyMessages:
         mine = ((own, waiting) for (who, own), waiting in self._waiting.items() if who == sender)
         return [(own, early.message) for own, waiting in mine if key in (None, own) for early in waiting]
 
+    def waited_s(self, key: NodeKey, message: Message, now: float) -> float:
+        """For how long one of them has waited here."""
+        mine = self._waiting.get((_sender(message), key), ())
+        return next((now - (early.deadline - self.HOLD_S) for early in mine if early.message is message), 0.0)
+
     def remove(self, key: NodeKey, message: Message) -> None:
         """One message waits no more."""
         self._take(_sender(message), key, lambda early: early.message is message)

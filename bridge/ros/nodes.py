@@ -202,7 +202,10 @@ class InterfaceNodes:
 
     def _stopped(self, by: str) -> None:
         for node in self:
-            node.emergency_stop(by)
+            try:
+                node.emergency_stop(by)
+            except Exception:  # the others are stopped all the same
+                log.exception("%s: stopping it failed", node.topic)
 
     def remove(self, request: RemoveNode) -> None:
         """Take a registrant off a node; the last one removes it. Asking for what is not there changes nothing."""
@@ -279,7 +282,8 @@ class InterfaceNodes:
         for own, message in self._early.of(sender, key):
             passed = True
             try:
-                passed = self._deliver(own, message)
+                aged = self._aged(own, message)
+                passed = aged is None or self._deliver(own, aged)
             finally:
                 if passed:
                     self._early.remove(own, message)
@@ -317,10 +321,23 @@ class InterfaceNodes:
             for message in self._early.waiting_for(key):
                 may_act = isinstance(node, StopNode) or self.rights.may_act(message.sender_type, message.sender_id)
                 if may_act and self._meant(key, message) is node:
+                    aged = self._aged(key, message)
                     try:
-                        node.receive(message)
+                        if aged is not None:
+                            node.receive(aged)
                     finally:
                         self._early.remove(key, message)
+
+    def _aged(self, key: NodeKey, message: Message) -> Message | None:
+        """A message as old as it has become while it waited here; None for a command that is too old by now."""
+        age_s = message.age_s + self._early.waited_s(key, message, time.monotonic())
+        most_s = self.robot.rules.settings.max_command_age_s
+        stops = self.stop is not None and key == self.stop.key
+        if key.node_type == NodeType.PUBLISHER and not stops and 0 < most_s < age_s:
+            reason = f"a command waited for {age_s:.2f} s, the last of it for its registration"
+            self.drops.note("too_old", f"{key.node_name[:80]} from {Registrant.of(message)}", reason)
+            return None
+        return message._replace(age_s=age_s)
 
     def last_words(self) -> None:
         """This program is about to end without closing anything: no last command may stay. From any thread."""

@@ -45,6 +45,10 @@ UNREAD = 256
 """More messages of our own do not wait to be read."""
 
 
+PRESSED = b"\x01"
+"""The data of a message that stops, behind its CDR header."""
+
+
 class StopState(Struct, frozen=True):
     """What one agent says of the stop."""
 
@@ -109,9 +113,12 @@ class SharedStop:
     def publish(self, publisher: Any, state: bytes) -> None:
         """Publish on the topic of the stop; our subscription to it knows that this is our own. From any thread."""
         published: list[float] = [time.time_ns(), math.inf]
-        self._own.append(published)
-        publisher.publish(state)
-        published[1] = time.time_ns()
+        if state[4:5] == PRESSED:  # nothing else is taken for a press, and a press that comes meanwhile is a press
+            self._own.append(published)
+        try:
+            publisher.publish(state)
+        finally:
+            published[1] = time.time_ns()
 
     def tell(self) -> None:
         """Tell the state as it is now. From any thread."""
@@ -163,7 +170,7 @@ class SharedStop:
             )
 
     def _pressed(self, cdr: bytes, info: Mapping[str, Any]) -> None:
-        if bytes(cdr[4:5]) != b"\x01" or self._is_own(info["source_timestamp"]):
+        if bytes(cdr[4:5]) != PRESSED or self._is_own(info["source_timestamp"]):
             return
         count = self._robot.session.node.count_publishers
         agents = count(self._topic + AGENTS)

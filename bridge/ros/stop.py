@@ -173,8 +173,10 @@ class StopNode(InterfaceNode):
 
     def _has_stopped(self) -> None:
         by = self.robot.stop.by
-        self._on_stop(by)
-        self._tell()
+        try:
+            self._on_stop(by)
+        finally:
+            self._tell()
         log.warning("emergency stop by %s; commands are refused until it is released", by)
 
     def _has_been_released(self) -> None:
@@ -184,5 +186,7 @@ class StopNode(InterfaceNode):
     def _tell(self) -> None:
         publisher, shared = self._publisher, self._shared
         if publisher is not None and shared is not None:
-            shared.publish(publisher, STATES[self.robot.stop.stopped])
-            shared.tell()
+            try:
+                shared.publish(publisher, STATES[self.robot.stop.stopped])
+            finally:
+                shared.tell()

@@ -420,7 +420,8 @@ class PublisherNode(TopicNode):
                 self._publish_stop(self.deadman.why)
 
     def close(self) -> None:
-        publisher, self._publisher = self._publisher, None
+        with self.lock:  # somebody may be publishing its stop message
+            publisher, self._publisher = self._publisher, None
         if publisher is None:
             return
         node = self.robot.session.node

@@ -143,14 +143,24 @@ class Arrivals:
         """The same for what is judged before it may wait, and where Zenoh's thread must never wait: what the gate does
         not admit is not even copied, what it takes is done, and for the rest there is room or there is not."""
         queue, own = self._queue, self._own
+        behind: Counter[str] = Counter()
+        """Of each key, how many wait for the loop that are large, or came after such a one: nothing overtakes them."""
+        counting = threading.Lock()
 
-        def handle(samples: Iterator[tuple[str, Payload, float, float]]) -> None:
+        def handle(samples: Iterator[tuple[str, Payload, float, float, bool]]) -> None:
             on_aged(aged(samples))
 
-        def aged(samples: Iterator[tuple[str, Payload, float, float]]) -> Iterator[Aged]:
-            for key, payload, age_s, at in samples:
+        def aged(samples: Iterator[tuple[str, Payload, float, float, bool]]) -> Iterator[Aged]:
+            for key, payload, age_s, at, counted in samples:
                 now = now_s()
-                yield key, payload, age_s + now - at, now
+                try:
+                    yield key, payload, age_s + now - at, now
+                finally:
+                    if counted:
+                        with counting:
+                            behind[key] -= 1
+                            if not behind[key]:
+                                del behind[key]
 
         def receive(sample: zenoh.Sample) -> None:
             try:
@@ -169,14 +179,21 @@ class Arrivals:
                 payload = encoded.to_bytes()
                 if stamp := sample.timestamp:
                     age_s = gate.age(key, stamp.get_id(), stamp.get_time_as_ntp64().as_secs_f64(), now)
-                if size <= self.AT_ONCE_BYTES and self._try(gate.first, key, payload, age_s, now):
+                if key in behind:
+                    self._try(gate.rescue, key, payload, now)  # a stop waits for nothing
+                elif size <= self.AT_ONCE_BYTES and self._try(gate.first, key, payload, age_s, now):
                     return
                 if urgent and not gate.admits(key, size, False, now):
                     return  # it is no command, whatever its priority says
             if len(queue) >= self.LIMIT or not self._takes_room_for(len(payload)):
                 self._behind("loop_behind")
                 return
-            queue.append((handle, (key, payload, age_s, now), False))
+            with counting:
+                counted = len(payload) > self.AT_ONCE_BYTES or key in behind
+                behind[key] += counted
+                if not counted:
+                    del behind[key]
+            queue.append((handle, (key, payload, age_s, now, counted), False))
             if not self._waiting:
                 self._wake_loop()
 
@@ -222,10 +239,13 @@ class Arrivals:
         if self._handing_over:
             return
         if self.looped > self.LOOPED or (self.looped and self._large_bytes > self.LIMIT_BYTES // 4):
-            self._deliver()
+            self._deliver_now()
 
     def _deliver(self) -> None:
         self._waiting = False
+        self._deliver_now()
+
+    def _deliver_now(self) -> None:
         with self._turn:
             self._handing_over = True
             try:

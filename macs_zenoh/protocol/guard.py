@@ -92,17 +92,18 @@ class Ages:
     HALF_S = 30.0
     FORGET_S = 600.0
     """Two clocks drift apart: what was found so long ago says nothing."""
-    STANDS_S = 1e-5
+    STANDS_S = 1e-6
     """A hybrid clock that was put forward stands still until time has come up to it, but for a tick per sample."""
 
     class _Way:
         """What one sender's samples with the stamps of one clock have said."""
 
-        __slots__ = ("at", "before", "first", "least", "others", "since", "stamp")
+        __slots__ = ("at", "before", "first", "least", "others", "since", "stamp", "stands")
 
         def __init__(self, stamp: float, now: float, others: float) -> None:
             self.stamp, self.at, self.since, self.first = stamp, now, now, now
             self.least = self.before = now - stamp
+            self.stands = False
             self.others = others
             """The delay that others had when this one was new; infinite when there was nobody."""
 
@@ -129,7 +130,8 @@ class Ages:
         stands = abs(stamp - way.stamp) < self.STANDS_S and now - way.at > 100 * self.STANDS_S
         way.stamp, way.at = stamp, now
         delay = now - stamp
-        if stands:  # the smallest is from when it was put forward
+        stood, way.stands = way.stands, stands
+        if stands and stood:  # the smallest is from when it was put forward; once, two may have been put in one moment
             way.least, way.before, way.since = delay, delay, now
         elif now - way.since > self.HALF_S:
             way.before, way.least, way.since = way.least, delay, now

@@ -48,9 +48,13 @@ ANSWERS: dict[str, int] = {"std_srvs/SetBool": _HEADER + 4 + _TEXT, "std_srvs/Tr
 """Of the answers of services."""
 
 
+TEXT_TYPE = "std_msgs/String"
+"""The type whose messages are nothing but text."""
+
+
 def is_whole(data: memoryview, type_name: str) -> bool:
     """Whether text that a message consists of is all there; of other types nothing is known here."""
-    if type_name != "std_msgs/String" or len(data) < _HEADER + _TEXT:
+    if type_name != TEXT_TYPE or len(data) < _HEADER + _TEXT:
         return True
     size: int = struct.unpack_from("<I", data, _HEADER)[0]
     return _HEADER + 4 + size <= len(data)

@@ -27,6 +27,8 @@ class Outbox:
         self._large = 0
         """Size of a waiting call that is larger than the limit."""
         self._streams: OrderedDict[str, deque[Chunk]] = OrderedDict()
+        self._stream_bytes: dict[str, int] = {}
+        """Of each node that something waits of."""
 
     def __len__(self) -> int:
         return len(self._calls) + sum(map(len, self._streams.values()))
@@ -62,6 +64,7 @@ class Outbox:
             self._drop_oldest(node, "node_full_oldest", keep=node)
         self._make_room(len(message), keep=node)
         waiting.append(message)
+        self._stream_bytes[node] = self._stream_bytes.get(node, 0) + len(message)
         self.bytes += len(message)
 
     def take(self, limit_bytes: int) -> list[Chunk]:
@@ -86,9 +89,17 @@ class Outbox:
         node, waiting = next(iter(self._streams.items()))
         chunk = waiting.popleft()
         del self._streams[node]
+        self._count_out(node, chunk)
         if waiting:
             self._streams[node] = waiting  # to the back: nodes take turns
         return chunk
+
+    def _count_out(self, node: str, chunk: Chunk) -> None:
+        left = self._stream_bytes[node] - len(chunk)
+        if left:
+            self._stream_bytes[node] = left
+        else:
+            del self._stream_bytes[node]
 
     def _over(self, size: int) -> bool:
         return self.bytes > 0 and (
@@ -101,14 +112,16 @@ class Outbox:
     def _make_room(self, size: int, keep: str | None = None) -> None:
         """Let the node with the most bytes give up its oldest message until the new one fits."""
         while self._streams and self._over(size):
-            heaviest = max(self._streams, key=lambda node: sum(map(len, self._streams[node])))
+            heaviest = max(self._streams, key=lambda node: self._stream_bytes.get(node, 0))
             self._drop_oldest(heaviest, "outbox_full", keep)
 
     def _drop_oldest(self, node: str, name: str, keep: str | None = None) -> None:
         """Drop a node's oldest message, and the node with its last one. ``keep`` is the node whose next message is
         about to be put: it keeps its turn."""
         waiting = self._streams[node]
-        self.bytes -= len(waiting.popleft())
+        dropped = waiting.popleft()
+        self.bytes -= len(dropped)
+        self._count_out(node, dropped)
         if not waiting and node != keep:
             del self._streams[node]
         self.drops[name] += 1

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from ..errors import BadField, WireError
 from .messages import Metadata, NodeType, StreamData, decode_management
-from .wire import Layout, parse_frames
+from .wire import Frame, Layout, parse_frames
 
 KNOWN = 512
 """How many beginnings are remembered as already read: of a topic's messages only the data changes."""
@@ -24,27 +24,35 @@ class StreamReader:
     def __init__(self, layout: Layout, on_bad: Callable[[str, WireError], None]) -> None:
         self._layout = layout
         self._on_bad = on_bad
-        self._is_mine: dict[tuple[str, tuple[int, int], bytes, bytes], bool] = {}
+        self._known: dict[tuple[str, tuple[int, int], bytes, bytes], bool] = {}
 
     def read(self, key: str, node: str, payload: bytes | bytearray, me: tuple[int, int]) -> list[bytes]:
         """The data of each message of a sample that lists ``me`` (type, id), of the interface node ``node``."""
-        data: list[bytes] = []
         try:
-            for frame in parse_frames(payload, self._layout):
-                management, metadata = frame.management, frame.metadata
-                known = (node, me, management, metadata)
-                mine = self._is_mine.get(known)
-                if mine is None:
-                    mine = _is_for(node, me, management, metadata)
-                    if len(management) + len(metadata) <= KNOWN_BYTES:
-                        if len(self._is_mine) >= KNOWN:
-                            self._is_mine.clear()
-                        self._is_mine[known] = mine
-                if mine:
-                    data.append(bytes(frame.body))
+            frames = parse_frames(payload, self._layout)
         except WireError as error:
             self._on_bad(key, error)
+            return []
+        data: list[bytes] = []
+        for frame in frames:
+            try:
+                if self._is_mine(node, me, frame):
+                    data.append(bytes(frame.body))
+            except WireError as error:
+                self._on_bad(key, error)
         return data
+
+    def _is_mine(self, node: str, me: tuple[int, int], frame: Frame) -> bool:
+        management, metadata = frame.management, frame.metadata
+        known = (node, me, management, metadata)
+        mine = self._known.get(known)
+        if mine is None:
+            mine = _is_for(node, me, management, metadata)
+            if len(management) + len(metadata) <= KNOWN_BYTES:
+                if len(self._known) >= KNOWN:
+                    self._known.clear()
+                self._known[known] = mine
+        return mine
 
 
 def _is_for(node: str, me: tuple[int, int], management: bytes, metadata: bytes) -> bool:

@@ -6,7 +6,7 @@ import asyncio
 import random
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Hashable, Iterator
 from contextlib import suppress
 
 import pytest
@@ -214,3 +214,57 @@ async def test_threads_of_zenoh_stay_attached(mesh: Mesh, sender: Mesh) -> None:
         sender.put(KEY, b"x", Traffic.COMMAND)
         await asyncio.sleep(0.01)
     assert max(counts) > 5
+
+
+class Admitting:
+    """A gate that takes everything at once, and notes what it took."""
+
+    def __init__(self, taken: list[int]) -> None:
+        self.taken = taken
+        self.rescued: list[int] = []
+
+    def admits(self, key: str, size: int, urgent: bool, now: float) -> bool:
+        return True
+
+    def age(self, key: str, clock: Hashable, stamp: float, now: float) -> float:
+        return 0.0
+
+    def first(self, key: str, payload: Payload, age_s: float, now: float) -> bool:
+        self.taken.append(number(payload))
+        return True
+
+    def rescue(self, key: str, payload: Payload, now: float) -> None:
+        self.rescued.append(number(payload))
+
+
+def held_up_until(condition: Callable[[], object]) -> None:
+    """The loop is held up, but not Zenoh's threads."""
+    deadline = time.monotonic() + 20
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+async def test_nothing_overtakes_a_large_command(mesh: Mesh, sender: Mesh) -> None:
+    """A sample too large to be taken in Zenoh's thread waits for the loop, and those of its sender behind it; a stop
+    among these is looked for at once. Afterwards samples are taken at once again."""
+    taken: list[int] = []
+    gate = Admitting(taken)
+
+    def handle(batch: Iterator[tuple[str, Payload, float, float]]) -> None:
+        taken.extend(number(payload) for _, payload, _, _ in batch)
+
+    mesh.subscribe_guarded(KEY, handle, gate)
+    await until(lambda: (sender.put(KEY, bytes(4), Traffic.CALL), taken)[1])
+    await asyncio.sleep(0.1)
+    taken.clear()
+    sender.put(KEY, (1).to_bytes(4, "big") + bytes(200_000), Traffic.CALL)
+    sender.put(KEY, (2).to_bytes(4, "big"), Traffic.CALL)
+    await asyncio.sleep(0)
+    time.sleep(0.3)
+    assert taken == []
+    assert gate.rescued == [2]
+    await until(lambda: len(taken) == 2)
+    assert taken == [1, 2]
+    sender.put(KEY, (3).to_bytes(4, "big"), Traffic.CALL)
+    time.sleep(0.3)
+    assert taken == [1, 2, 3]

@@ -62,7 +62,7 @@ class Reader:
         }
         self._running: dict[str, asyncio.subprocess.Process] = {}
         self._reading: list[asyncio.Task[None]] = []
-        for path in (ROOT / "config").rglob("*.*"):
+        for path in filter(Path.is_file, (ROOT / "config").rglob("*.*")):
             copy = folder / path.relative_to(ROOT)
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_text(self._config(path), encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -60,19 +61,21 @@ async def test_who_is_locked_out_notices_and_who_is_cut_off_is_not() -> None:
 
 
 async def test_a_robot_goes_on_under_another_id(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As long as the thief stays: the robot is online again, with another session, and answers."""
+    """As long as the thief stays: the robot is online again, with another session, and answers; stopped, as it was."""
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
     came: list[Agent] = []
     stop = asyncio.Event()
     async with Router() as router, counted(router.endpoint) as link:
-        settings = Settings(mesh=MeshSettings(connect=[link.endpoint]), robot=RobotSettings(id=7, stop_topic=""))
+        settings = Settings(mesh=MeshSettings(connect=[link.endpoint]), robot=RobotSettings(id=7))
         async with join("operator", id=5, settings=MeshSettings(connect=[router.endpoint])) as operator:
             running = asyncio.create_task(agent.run(settings, on_ready=came.append, stop=stop))
             await until(lambda: came, 30)
             before = zenoh_id(came[0].mesh)
+            await operator.call("ros", 7, "stop", b"true", timeout_s=20)
             async with stolen(came[0].mesh, link, router):
                 await until(lambda: len(came) == 2, 60)
                 assert zenoh_id(came[1].mesh) != before
-                await operator.call("ros", 7, "status", timeout_s=20)
+                status = json.loads(await operator.call("ros", 7, "status", timeout_s=20))
+                assert status["stopped"] is True, status
             stop.set()
             await asyncio.wait_for(running, 30)
