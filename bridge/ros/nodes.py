@@ -330,10 +330,12 @@ class InterfaceNodes:
 
     def _aged(self, key: NodeKey, message: Message) -> Message | None:
         """A message as old as it has become while it waited here; None for a command that is too old by now."""
+        if key.node_type != NodeType.PUBLISHER:
+            return message
         age_s = message.age_s + self._early.waited_s(key, message, time.monotonic())
         most_s = self.robot.rules.settings.max_command_age_s
         stops = self.stop is not None and key == self.stop.key
-        if key.node_type == NodeType.PUBLISHER and not stops and 0 < most_s < age_s:
+        if not stops and 0 < most_s < age_s:
             reason = f"a command waited for {age_s:.2f} s, the last of it for its registration"
             self.drops.note("too_old", f"{key.node_name[:80]} from {Registrant.of(message)}", reason)
             return None

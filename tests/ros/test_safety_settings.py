@@ -31,7 +31,7 @@ async def test_a_dead_man_that_does_not_fit_its_type_is_told_at_the_start(
     async with site(domain, tmp_path, WRONG) as place, place.robot() as robot:
         await until(lambda: any("Twist has no field linaer" in line for line in robot.log), 20)
         code, out, errors = await ended("doctor", "--json", "--quick", "-e", place.router.endpoint)
-        assert code == 3, errors
+        assert code == 1, errors
         found = [finding for finding in json.loads(out)["findings"] if finding["id"] == "wrong_settings"]
         assert [finding["severity"] for finding in found] == ["error"]
 
