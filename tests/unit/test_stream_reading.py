@@ -69,8 +69,8 @@ def test_what_is_remembered_is_bounded(reader: StreamReader) -> None:
     """However many beginnings a robot thinks of, so many are kept, and none that is long."""
     for other in range(KNOWN + 10):
         reader.read(KEY, "nd__pose", frame({"2": [5], "1": [other]}), ME)
-    assert len(reader._is_mine) <= KNOWN
-    before = len(reader._is_mine)
+    assert len(reader._known) <= KNOWN
+    before = len(reader._known)
     long = frame({"2": [5, *range(100, 100 + KNOWN_BYTES // 3)]})
     assert reader.read(KEY, "nd__pose", long, ME) == [b"\0\1\0\0x"]
-    assert len(reader._is_mine) == before
+    assert len(reader._known) == before
