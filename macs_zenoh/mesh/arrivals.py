@@ -179,10 +179,11 @@ class Arrivals:
                 payload = encoded.to_bytes()
                 if stamp := sample.timestamp:
                     age_s = gate.age(key, stamp.get_id(), stamp.get_time_as_ntp64().as_secs_f64(), now)
-                if key in behind:
-                    self._try(gate.rescue, key, payload, now)  # a stop waits for nothing
-                elif size <= self.AT_ONCE_BYTES and self._try(gate.first, key, payload, age_s, now):
-                    return
+                if size <= self.AT_ONCE_BYTES:
+                    if key in behind:
+                        self._try(gate.rescue, key, payload, now)  # a stop waits for nothing
+                    elif self._try(gate.first, key, payload, age_s, now):
+                        return
                 if urgent and not gate.admits(key, size, False, now):
                     return  # it is no command, whatever its priority says
             if len(queue) >= self.LIMIT or not self._takes_room_for(len(payload)):
@@ -190,9 +191,8 @@ class Arrivals:
                 return
             with counting:
                 counted = len(payload) > self.AT_ONCE_BYTES or key in behind
-                behind[key] += counted
-                if not counted:
-                    del behind[key]
+                if counted:
+                    behind[key] += 1
             queue.append((handle, (key, payload, age_s, now, counted), False))
             if not self._waiting:
                 self._wake_loop()
