@@ -544,6 +544,16 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     traffic: list[TrafficRule] = []
 
 
+def read_text(path: str | os.PathLike[str]) -> str:
+    """The text of a file that somebody wrote for us. Raises `ConfigError`: it cannot be read, or is not UTF-8."""
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(str(path), error.strerror or str(error)) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(str(path), f"not UTF-8 at byte {error.start}") from error
+
+
 def load(*paths: str | os.PathLike[str]) -> Settings:
     """Read settings files (TOML); of several, a later one wins, setting by setting.
 
@@ -553,13 +563,7 @@ def load(*paths: str | os.PathLike[str]) -> Settings:
     settings = Settings()
     for path in paths:
         source = str(path)
-        try:
-            text = Path(path).read_text(encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(source, error.strerror or str(error)) from error
-        except UnicodeDecodeError as error:
-            raise ConfigError(source, f"not UTF-8 at byte {error.start}") from error
-        for name, section in _document(text, source).items():
+        for name, section in _document(read_text(path), source).items():
             before = document.get(name)
             if isinstance(before, dict) and isinstance(section, dict):
                 section = {**before, **section}

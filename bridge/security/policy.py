@@ -23,13 +23,12 @@ import ipaddress
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
 
-from macs_zenoh.config import AgentId, AgentName, GatewaySettings, GroupId, MeshSettings, TrafficRule
+from macs_zenoh.config import AgentId, AgentName, GatewaySettings, GroupId, MeshSettings, TrafficRule, read_text
 from macs_zenoh.errors import ConfigError, MissingExtra
 from macs_zenoh.protocol import endpoints
 
@@ -241,14 +240,7 @@ def kind_of(node: Node) -> str:
 
 def load(path: str | os.PathLike[str]) -> Policy:
     """Read a policy. Raises `ConfigError`: it cannot be read, is not YAML, or says what cannot be."""
-    source = str(path)
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(source, error.strerror or str(error)) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(source, f"not UTF-8 at byte {error.start}") from error
-    return parse(text, source)
+    return parse(read_text(path), str(path))
 
 
 def parse(text: str, source: str = "policy") -> Policy:
