@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.isolation import isolate
+from tests.support.isolation import isolate
 
 NEED_ROS_TESTS = "MACS_NEED_ROS_TESTS"
 """Set by ``make test`` and CI: a run in which no ROS test passed is a failed run."""

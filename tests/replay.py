@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tests.unit.recordings import VECTORS, reading, snake
+from tests.support.recordings import VECTORS, reading, snake
 
 HEADER = struct.Struct("<B10H10BII")
 ROS, UNITY = 1, 2

@@ -40,9 +40,9 @@ from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.messages import OPERATOR, ROS
-from tests.links import Link, counted
-from tests.programs import ROOT, Program, free_port
-from tests.routers import Router
+from tests.support.links import Link, counted
+from tests.support.programs import ROOT, Program, free_port
+from tests.support.routers import Router
 
 COUNT_EVERY_S = 0.02
 HEADSETS = 6

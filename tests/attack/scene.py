@@ -38,8 +38,8 @@ from macs_zenoh.protocol.limits import UNFINISHED_IN_ALL_BYTES, WAITING_IN_ALL_B
 from macs_zenoh.protocol.messages import OPERATOR
 from tests.attack.judge import Memory, Report, Window
 from tests.attack.table import Attack
-from tests.programs import ROOT, Program, free_port
-from tests.routers import Router
+from tests.support.programs import ROOT, Program, free_port
+from tests.support.routers import Router
 
 MIB = 1 << 20
 ROBOT = 1

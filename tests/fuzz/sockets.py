@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bridge.headset.client import Headset
-from tests.programs import Program, free_port
+from tests.support.programs import Program, free_port
 
 VECTORS = Path(__file__).parents[1] / "vectors"
 CONNECTIONS = 8

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import AsyncExitStack
 
 import pytest
@@ -13,10 +11,9 @@ from bridge.gateway import Gateway
 from bridge.headset.client import Headset
 from macs_zenoh.config import GatewaySettings, MeshSettings, TrafficRule, changed
 from macs_zenoh.mesh import Mesh
-from tests.programs import free_port
-
-StartGateway = Callable[..., Awaitable[Gateway]]
-Connect = Callable[..., Awaitable[Headset]]
+from tests.support.given import Connect, StartGateway
+from tests.support.programs import free_port
+from tests.support.waiting import until  # noqa: F401 - until all that is under way takes it from there
 
 
 @pytest.fixture
@@ -54,11 +51,3 @@ async def connect() -> AsyncIterator[Connect]:
             return headset
 
         yield connect
-
-
-async def until(condition: Callable[[], object], timeout_s: float = 5.0) -> None:
-    """Wait until the condition holds; fail when it does not."""
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "this did not happen in time"
-        await asyncio.sleep(0.005)

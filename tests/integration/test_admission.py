@@ -21,8 +21,9 @@ from macs_zenoh.protocol import ping
 from macs_zenoh.protocol.keyexpr import LEASE, PING
 from macs_zenoh.protocol.messages import ROS, UNITY, Configuration, Welcome, decode_data, encode_management
 from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, split_message
-from tests.integration.conftest import StartGateway, until
-from tests.programs import Program, free_port
+from tests.support.given import StartGateway
+from tests.support.programs import Program, free_port
+from tests.support.waiting import until
 
 
 class Plain:

@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 import macs_zenoh
-from tests.integration.conftest import until
+from tests.support.waiting import until
 
 
 async def test_what_says_who_is_there_says_where_to_send(router: str) -> None:

@@ -22,8 +22,8 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
-from tests.integration.conftest import until
-from tests.routers import Router
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 PATIENCE_S = 20
 TOPIC = "/chatter"

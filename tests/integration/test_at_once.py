@@ -16,7 +16,7 @@ from macs_zenoh.errors import NotServed
 from macs_zenoh.mesh import Mesh, Payload, Sample, Traffic
 from macs_zenoh.mesh.arrivals import Arrivals
 from macs_zenoh.protocol.keyexpr import CALL
-from tests.integration.conftest import until
+from tests.support.waiting import until
 
 KEY, OTHER_KEY = "macs/to/ros/7/from/unity/256", "macs/to/ros/7/from/unity/257"
 PAUSE_S = 3 * Arrivals.CALM_S

@@ -14,8 +14,8 @@ from macs_zenoh.awareness import Awareness, Received
 from macs_zenoh.errors import Unreachable, UsageError
 from macs_zenoh.protocol.keyexpr import NAME, NAMED, NAMED_ALL
 from macs_zenoh.protocol.named import Outcome
-from tests.integration.conftest import until
-from tests.programs import Program, free_port, macs
+from tests.support.programs import Program, free_port, macs
+from tests.support.waiting import until
 
 Meet = Callable[..., Awaitable[Awareness]]
 

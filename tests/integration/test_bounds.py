@@ -22,8 +22,9 @@ from macs_zenoh.protocol.messages import (
     encode_management,
 )
 from macs_zenoh.protocol.wire import MACS, MessageDecoder, encode_frame, encode_message, split_message
-from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_limits import answers, memory_bytes, site
+from tests.support.given import Connect, StartGateway
+from tests.support.waiting import until
 
 MANY_KEYS = b"{%s}" % ",".join(f'"key{n}":0' for n in range(2_200_000)).encode()
 LISTS = b'{"messageManager":"OnlineAgentsGetter","x":[%s0]}' % (b"[]," * (10 << 20))

@@ -15,7 +15,7 @@ import pytest
 
 import macs_zenoh
 from bridge.headset.client import Headset
-from tests.programs import ROOT, Program, ended, free_port, macs
+from tests.support.programs import ROOT, Program, ended, free_port, macs
 
 
 @pytest.fixture

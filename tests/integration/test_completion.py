@@ -12,7 +12,7 @@ import sys
 import pytest
 
 import macs_zenoh
-from tests.programs import ROOT, ended
+from tests.support.programs import ROOT, ended
 
 
 async def offered(line: str, **environment: str) -> list[str]:

@@ -31,9 +31,10 @@ from bridge.security.generate import generate
 from macs_zenoh import config
 from macs_zenoh.config import MeshSettings, Settings, changed
 from macs_zenoh.mesh import Mesh
-from tests.integration.conftest import until
-from tests.programs import ROOT, Program, free_port
-from tests.routers import Router, zenohd
+from tests.support.programs import ROOT, Program, free_port
+from tests.support.routers import Router
+from tests.support.tools import zenohd
+from tests.support.waiting import until
 
 if sys.version_info >= (3, 11):
     import tomllib

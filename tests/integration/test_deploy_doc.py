@@ -20,8 +20,9 @@ from pathlib import Path
 import pytest
 
 from bridge.headset.client import Headset
-from tests.programs import ROOT, free_port
-from tests.routers import LINE_BYTES, zenohd
+from tests.support.processes import LINE_BYTES
+from tests.support.programs import ROOT, free_port
+from tests.support.tools import zenohd
 
 PAGE = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
 

@@ -25,7 +25,8 @@ from macs_zenoh.protocol.outbox import Chunk, Outbox
 from macs_zenoh.protocol.tcp_agent import TcpAgent
 from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, encode_message, split_message
 from macs_zenoh.streams import Streams
-from tests.integration.conftest import StartGateway, until
+from tests.support.given import StartGateway
+from tests.support.waiting import until
 
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy" fixture is deprecated')
 

@@ -15,10 +15,10 @@ import macs_zenoh
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import LEASE, NAME, PRESENCE
-from tests.certificates import Authority
 from tests.integration.test_access_rules import RULES, USERS, credentials
-from tests.programs import ROOT, Program, free_port
-from tests.routers import Router
+from tests.support.certificates import Authority
+from tests.support.programs import ROOT, Program, free_port
+from tests.support.routers import Router
 
 POLICY = """\
 routers: [{name: site, addresses: [127.0.0.1]}]

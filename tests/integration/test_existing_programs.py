@@ -33,7 +33,8 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.routing import call, unicast_key
 from macs_zenoh.protocol.wire import encode_frame, encode_message
-from tests.integration.conftest import Connect, StartGateway, until
+from tests.support.given import Connect, StartGateway
+from tests.support.waiting import until
 
 TYPES = {"nd__chatter": "std_msgs/String", "nd__cmd": "std_msgs/String", "nd__set": "std_srvs/SetBool"}
 TYPES["nd__serve"] = "std_srvs/SetBool"

@@ -11,7 +11,7 @@ from bridge.headset.client import Headset
 from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
-from tests.programs import Program, free_port
+from tests.support.programs import Program, free_port
 
 
 def chatter(registrants: list[int], text: bytes) -> bytes:

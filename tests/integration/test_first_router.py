@@ -10,8 +10,8 @@ import zenoh
 
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
-from tests.integration.conftest import until
-from tests.programs import free_port
+from tests.support.programs import free_port
+from tests.support.waiting import until
 
 
 async def test_the_next_router_is_tried_at_the_start(router: str) -> None:

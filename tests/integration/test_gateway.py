@@ -26,7 +26,8 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, encode_message, split_message
 from macs_zenoh.streams import Streams
-from tests.integration.conftest import Connect, StartGateway, until
+from tests.support.given import Connect, StartGateway
+from tests.support.waiting import until
 
 METADATA = Metadata(message_manager="Greeting").encode()
 

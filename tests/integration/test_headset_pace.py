@@ -14,8 +14,9 @@ from macs_zenoh.agent import Agent
 from macs_zenoh.protocol.messages import Metadata
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import encode_frame, encode_message
-from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_gateway import Socket, socket
+from tests.support.given import Connect, StartGateway
+from tests.support.waiting import until
 
 MOVE, STOP = ("nd__cmd_vel", "geometry_msgs/Twist"), ("nd__emergency_stop", "std_msgs/Bool")
 

@@ -19,7 +19,7 @@ from macs_zenoh.protocol.keyexpr import NAME, PING
 from macs_zenoh.protocol.messages import Metadata
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.test_bounds import Raw
-from tests.programs import Program, ended, free_port
+from tests.support.programs import Program, ended, free_port
 
 EVIL = "x\x1b[2J\x1b]0;owned\x07\r\n12:00:00 I macs.gateway: all is well\x9b31m\u202e\x7f"
 

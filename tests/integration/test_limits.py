@@ -27,8 +27,9 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
-from tests.integration.conftest import Connect, StartGateway, until
-from tests.programs import Program, free_port
+from tests.support.given import Connect, StartGateway
+from tests.support.programs import Program, free_port
+from tests.support.waiting import until
 
 CONFIGURATION = encode_frame(
     management=b'{"agentType":2,"agentId":2,"groupId":0,"requestId":1,"messageManager":"AgentclientConfigurer"}'

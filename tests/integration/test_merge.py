@@ -44,10 +44,10 @@ from macs_zenoh.protocol.registrations import AgentKey, Task
 from macs_zenoh.protocol.wire import Layout, MessageDecoder, encode_frame, encode_message, split_message
 from macs_zenoh.registration_calls import RobotCalls
 from macs_zenoh.streams import Streams
-from tests.integration.conftest import until
-from tests.links import Link, counted
-from tests.programs import Program, macs
-from tests.routers import Router
+from tests.support.links import Link, counted
+from tests.support.programs import Program, macs
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 RIGHT_S = 3.0
 """How soon after the merge everything must be right."""

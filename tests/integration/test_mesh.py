@@ -13,8 +13,8 @@ from macs_zenoh.config import GatewaySettings, MeshSettings
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.mesh.outgoing import Outgoing
 from macs_zenoh.protocol.keyexpr import PING
-from tests.integration.conftest import until
-from tests.routers import Router
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 KEY = "macs/to/unity/0/1/unity/2"
 LARGE = Mesh.LARGE_BYTES + 1

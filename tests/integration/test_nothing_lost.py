@@ -16,8 +16,8 @@ from bridge.headset import frames
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.mesh.arrivals import Arrivals
-from tests.integration.conftest import until
-from tests.programs import Program, free_port
+from tests.support.programs import Program, free_port
+from tests.support.waiting import until
 
 KEY, ECHO = "macs/to/ros/7/from/unity/256", "macs/to/ros/8/from/unity/256"
 SETTINGS = """[gateway]

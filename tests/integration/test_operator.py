@@ -15,9 +15,10 @@ import pytest
 
 import macs_zenoh
 from macs_zenoh.errors import Refused
-from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_gateway import socket
-from tests.programs import ROOT, ended, macs
+from tests.support.given import Connect, StartGateway
+from tests.support.programs import ROOT, ended, macs
+from tests.support.waiting import until
 
 MANY = 12
 

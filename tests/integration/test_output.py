@@ -17,7 +17,7 @@ import pytest
 import macs_zenoh
 from bridge.headset.client import Headset
 from macs_zenoh import awareness
-from tests.programs import ROOT, Program, free_port
+from tests.support.programs import ROOT, Program, free_port
 
 
 async def shell(command: str, **env: str) -> tuple[int | None, str, str]:

@@ -28,7 +28,7 @@ from macs_zenoh.protocol.keyexpr import type_number
 from macs_zenoh.protocol.messages import Metadata, decode_data, encode_data
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.test_gateway import Socket, socket
-from tests.programs import ROOT, Program, ended, free_port, macs
+from tests.support.programs import ROOT, Program, ended, free_port, macs
 
 EXAMPLES = ROOT / "examples"
 PAGE = (ROOT / "docs" / "managers.md").read_text(encoding="utf-8")

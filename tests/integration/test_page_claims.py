@@ -9,7 +9,7 @@ import pytest
 import macs_zenoh
 from bridge.gateway.server import Gateway
 from bridge.headset.client import Headset
-from tests.integration.conftest import Connect, StartGateway
+from tests.support.given import Connect, StartGateway
 
 
 async def test_what_waits_beyond_its_limit_is_dropped_and_the_connection_stays(

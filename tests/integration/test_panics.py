@@ -12,7 +12,7 @@ from contextlib import suppress
 import pytest
 
 from tests.panicking import panicking
-from tests.programs import ROOT, Program, free_port
+from tests.support.programs import ROOT, Program, free_port
 
 PANICKED = 70
 

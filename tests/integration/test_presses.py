@@ -10,7 +10,8 @@ import macs_zenoh
 from macs_zenoh.agent import Agent, Call
 from macs_zenoh.protocol.messages import Metadata, NodeType
 from macs_zenoh.protocol.wire import encode_frame, encode_message
-from tests.integration.conftest import Connect, StartGateway, until
+from tests.support.given import Connect, StartGateway
+from tests.support.waiting import until
 
 STOP = Metadata(node_type=NodeType.PUBLISHER, node_name="nd__emergency_stop", data_exchange_type="std_msgs/Bool")
 PRESS, RELEASE = b"\x00\x01\x00\x00\x01", b"\x00\x01\x00\x00\x00"

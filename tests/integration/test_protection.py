@@ -32,8 +32,9 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.routing import call, unicast_key
 from macs_zenoh.protocol.wire import PROBE, encode_frame, encode_message
 from macs_zenoh.streams import Streams
-from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_gateway import Socket, socket
+from tests.support.given import Connect, StartGateway
+from tests.support.waiting import until
 
 TEXT = CDR + b"\x05\x00\x00\x00text\x00"
 

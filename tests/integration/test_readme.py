@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import macs_zenoh
-from tests.programs import ROOT, Program, free_port
+from tests.support.programs import ROOT, Program, free_port
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 LOCAL_ROUTER = "tcp/127.0.0.1:7447"

@@ -31,9 +31,9 @@ from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, StreamData
 from macs_zenoh.protocol.named import Outcome
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
-from tests.integration.conftest import until
-from tests.programs import free_port
-from tests.routers import Router
+from tests.support.programs import free_port
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
 

@@ -17,7 +17,6 @@ from contextlib import suppress
 import pytest
 
 from bridge.gateway import Gateway
-from tests.integration.conftest import StartGateway, until
 from tests.replay import (
     INSTEAD,
     NAMES,
@@ -43,6 +42,8 @@ from tests.replay import (
     sender,
     split,
 )
+from tests.support.given import StartGateway
+from tests.support.waiting import until
 
 MARKER = "ReplayMarker"
 """Manager of a message that shows a headset that all before it was dealt with."""

@@ -11,9 +11,9 @@ import pytest
 
 import macs_zenoh
 from macs_zenoh.agent import Agent
-from tests.integration.conftest import until
-from tests.links import Link, counted
-from tests.programs import Program, free_port
+from tests.support.links import Link, counted
+from tests.support.programs import Program, free_port
+from tests.support.waiting import until
 
 MENDED_S = 20.0
 """Two looks a second apart, the restart, and room for a busy machine."""

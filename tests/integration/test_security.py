@@ -33,10 +33,10 @@ from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_
 from macs_zenoh.protocol.named import Outcome
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
-from tests.integration.conftest import until
 from tests.integration.test_reliable import Numbers, Stream
-from tests.programs import ROOT, Program, ended, free_port, macs
-from tests.routers import Router
+from tests.support.programs import ROOT, Program, ended, free_port, macs
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 NOW = dt.datetime.now(dt.timezone.utc)
 

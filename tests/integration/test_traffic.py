@@ -28,11 +28,12 @@ from macs_zenoh.protocol.messages import Metadata, NodeRefused, NodeType, Stream
 from macs_zenoh.protocol.named import Outcome
 from macs_zenoh.protocol.policing import BURST_S
 from macs_zenoh.protocol.wire import encode_frame, encode_message, parse_frames
-from tests.integration.conftest import Connect, StartGateway, until
 from tests.integration.test_gateway import socket
-from tests.links import counted
-from tests.programs import Program
-from tests.routers import Router
+from tests.support.given import Connect, StartGateway
+from tests.support.links import counted
+from tests.support.programs import Program
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 CAMERA = STREAM.of(type="ros", id=7, node="nd__camera_front")
 OTHER_CAMERA = STREAM.of(type="ros", id=7, node="nd__camera_back")

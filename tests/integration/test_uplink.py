@@ -8,8 +8,8 @@ import macs_zenoh
 from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
-from tests.integration.conftest import Connect, StartGateway
-from tests.links import counted
+from tests.support.given import Connect, StartGateway
+from tests.support.links import counted
 
 IMAGE_BYTES = 100_000
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from bridge.cli import VERBS
-from tests.programs import ROOT
+from tests.support.programs import ROOT
 
 SETTINGS = ["macs.toml", "one-host/robot.toml", "systemd/macs-robot.service", "security/site.yaml"]
 INTERFACES = ["as2_ca_msgs/package.xml", "as2_ca_msgs/msg/InterAgentMessage.msg"]

@@ -29,7 +29,8 @@ from macs_zenoh.protocol.messages import (
     encode_management,
 )
 from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, split_message
-from tests.integration.conftest import Connect, StartGateway, until
+from tests.support.given import Connect, StartGateway
+from tests.support.waiting import until
 
 
 class Agent:

@@ -13,9 +13,9 @@ import pytest
 
 from bridge.headset.client import Headset
 from macs_zenoh.errors import Unreachable
-from tests.certificates import Authority
-from tests.programs import Program, ended, free_port
-from tests.routers import Router
+from tests.support.certificates import Authority
+from tests.support.programs import Program, ended, free_port
+from tests.support.routers import Router
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Ends of a network test, a process each: ``python -m tests.network.ends robot|ros|headset OPTIONS``, see `inside`.
 
-Each reads requests from standard input, one JSON array ``[method, arguments]`` per line, answers each with one line,
-and ends with its input. A message is the CDR of a std_msgs/String: its number, the time when it was sent, and filling.
+Each does what it is asked (`tests.support.workers`). A message is the CDR of a std_msgs/String: its number, the time
+when it was sent, and filling.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import asyncio
 import importlib
 import json
 import logging
-import os
 import struct
 import sys
 import time
@@ -34,6 +33,7 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
+from tests.support.workers import serve
 
 TYPE = "std_msgs/String"
 HEADER = b"\0\1\0\0"
@@ -234,7 +234,7 @@ async def _robot(stack: AsyncExitStack, options: dict[str, Any]) -> _End:
 
 
 async def _ros(stack: AsyncExitStack, options: dict[str, Any]) -> _End:
-    from tests.ros.ros_peer import Peer
+    from tests.support.ros_peer import Peer
 
     peer = Peer(options["domain"])
     stack.callback(peer.session.close)
@@ -246,30 +246,12 @@ async def _headset(stack: AsyncExitStack, options: dict[str, Any]) -> _End:
     return HeadsetEnd(await stack.enter_async_context(headset))
 
 
-async def serve(kind: str, options: dict[str, Any]) -> None:
-    """Do what is asked on standard input, until it ends."""
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # Zenoh logs to standard output
-
-    def say(answer: dict[str, Any]) -> None:
-        answers.write(json.dumps(answer) + "\n")
-        answers.flush()
-
-    loop = asyncio.get_running_loop()
-    requests = asyncio.StreamReader()
-    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(requests), sys.stdin)
+async def run(kind: str, options: dict[str, Any]) -> None:
+    """Be such an end until the input ends."""
     async with AsyncExitStack() as stack:
-        end = await {"robot": _robot, "ros": _ros, "headset": _headset}[kind](stack, options)
-        say({"done": None})
-        while line := await requests.readline():
-            what, arguments = json.loads(line)
-            try:
-                say({"done": await getattr(end, what)(**arguments)})
-            except Exception as error:
-                logging.exception("%s failed", what)
-                say({"failed": repr(error)})
+        await serve({"robot": _robot, "ros": _ros, "headset": _headset}[kind](stack, options))
 
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO)
-    asyncio.run(serve(sys.argv[1], json.loads(sys.argv[2])))
+    asyncio.run(run(sys.argv[1], json.loads(sys.argv[2])))

@@ -25,7 +25,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
-from tests.programs import ROOT
+from tests.support.programs import ROOT
 
 PREFIX = "macs-test"
 

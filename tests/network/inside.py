@@ -16,13 +16,11 @@ import asyncio
 import itertools
 import json
 import statistics
-import sys
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Any, NamedTuple
 
-from tests.programs import ROOT, START_S, STOP_S
+from tests.support.workers import Worker
 
 
 class Received(NamedTuple):
@@ -37,52 +35,11 @@ class Received(NamedTuple):
     sender: int
 
 
-class Inside:
-    """A process of `tests.network.ends`, ready when the block is entered, gone when it is left."""
+class Inside(Worker):
+    """A process of `tests.network.ends`."""
 
     def __init__(self, end: str, *, within: Sequence[str] = (), **options: Any) -> None:
-        self._command = [*within, sys.executable, "-m", "tests.network.ends", end, json.dumps(options)]
-        self._process: asyncio.subprocess.Process
-        self._errors: asyncio.Task[None]
-        self._turn = asyncio.Lock()
-        self.log: list[str] = []
-
-    async def __aenter__(self) -> Inside:
-        pipe = asyncio.subprocess.PIPE
-        self._process = await asyncio.create_subprocess_exec(
-            *self._command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=pipe, limit=64 << 20
-        )
-        self._errors = asyncio.create_task(self._keep_log())
-        try:
-            await self._answer(START_S)
-        except BaseException:
-            await self.stop()
-            raise
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self.stop()
-
-    async def stop(self) -> None:
-        """End it, and wait until it has ended."""
-        if self._process.returncode is None:
-            assert self._process.stdin is not None
-            self._process.stdin.close()  # it ends with its input
-        try:
-            await asyncio.wait_for(self._process.wait(), STOP_S)
-        except asyncio.TimeoutError:
-            self._process.kill()
-            await self._process.wait()
-        self._errors.cancel()
-
-    async def ask(self, what: str, timeout_s: float = 30.0, **arguments: Any) -> Any:
-        """Call one of its methods and return the answer. AssertionError with its log when it fails."""
-        async with self._turn:
-            assert self._process.stdin is not None
-            self._process.stdin.write(json.dumps([what, arguments]).encode() + b"\n")
-            return await self._answer(timeout_s)
+        super().__init__("tests.network.ends", end, json.dumps(options), within=within)
 
     async def received(self, topic: str) -> list[Received]:
         """What came on a topic since it was asked for the last time."""
@@ -111,22 +68,6 @@ class Inside:
             assert time.monotonic() < deadline, f"{what} {arguments} is still {answer} after {timeout_s} s"
             await asyncio.sleep(0.02)
         return answer
-
-    async def _answer(self, timeout_s: float) -> Any:
-        assert self._process.stdout is not None
-        line = await asyncio.wait_for(self._process.stdout.readline(), timeout_s)
-        if not line:
-            await asyncio.wait_for(self._process.wait(), STOP_S)
-            await self._errors
-        assert line, f"{' '.join(self._command)} ended: {self.log[-20:]}"
-        answer = json.loads(line)
-        assert "failed" not in answer, f"{answer['failed']} {self.log[-10:]}"
-        return answer["done"]
-
-    async def _keep_log(self) -> None:
-        assert self._process.stderr is not None
-        while line := await self._process.stderr.readline():
-            self.log.append(line.decode(errors="replace").rstrip())
 
 
 def quantile(values: Sequence[float], share: float) -> float:

@@ -13,8 +13,8 @@ from bridge.security import policy
 from bridge.security.generate import generate
 from tests.network.hosts import Network
 from tests.network.inside import Inside
-from tests.programs import ROOT, Program
-from tests.routers import Router
+from tests.support.programs import ROOT, Program
+from tests.support.routers import Router
 
 WAN = ROOT / "config" / "wan"
 CLOUD = "10.214.0.1"

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import pytest
 
 from tests.network.inside import Inside, Received, longest_gap_s, lost
-from tests.programs import Program, free_port
-from tests.routers import Router
+from tests.support.programs import Program, free_port
+from tests.support.routers import Router
 
 HZ = 200
 WINDOW_S = 10.0

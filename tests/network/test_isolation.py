@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import pytest
 
 from tests.network.inside import Inside, Received, lost, median_ms
-from tests.programs import Program, free_port
-from tests.routers import Router
+from tests.support.programs import Program, free_port
+from tests.support.routers import Router
 
 RAISED = 1.2
 """Commands may take so much longer: a limit that the project promises."""

@@ -12,8 +12,8 @@ import pytest
 
 from tests.network.hosts import Link, Network
 from tests.network.inside import Inside
-from tests.programs import Program
-from tests.routers import Router
+from tests.support.programs import Program
+from tests.support.routers import Router
 
 MERGED_S = 3.0
 """So soon after the link is back everybody sees who is there, and no two have one id: a limit the project promises."""

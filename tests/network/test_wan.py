@@ -24,8 +24,8 @@ from bridge.security.policy import load
 from macs_zenoh.config import MeshSettings, changed
 from tests.network.hosts import Host, Network
 from tests.network.inside import Inside, lost, median_ms, quantile
-from tests.programs import ROOT, Program
-from tests.routers import Router
+from tests.support.programs import ROOT, Program
+from tests.support.routers import Router
 
 RTT_MS = 100.0
 """Of the whole path; the home's uplink has 80 ms of it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from tests.programs import ROOT
+from tests.support.programs import ROOT
 
 
 def panicking(where: str, when: Path | None = None) -> dict[str, str]:

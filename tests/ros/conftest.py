@@ -17,11 +17,10 @@ import pytest
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.pop("ROS_STATIC_PEERS", None)
 
-from ros_peer import Peer
-
 from bridge.interfaces import build
 from bridge.ros.session import RosSession
-from tests.isolation import worker_number
+from tests.support.isolation import worker_number
+from tests.support.ros_peer import Peer
 
 DOMAINS = 100
 _domains = itertools.cycle(range(1, 1 + DOMAINS))

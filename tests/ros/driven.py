@@ -12,14 +12,15 @@ from typing import Any
 
 from geometry_msgs.msg import Twist
 from rclpy.serialization import serialize_message
-from ros_peer import Peer, drive, until
 
 from macs_zenoh import join
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, encode_data, node_name
-from tests.programs import Program
-from tests.routers import Router
+from tests.support.programs import Program
+from tests.support.ros_peer import Peer, drive
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 STOPPED = -1.0
 """What `Heard.values` shows of a stop message."""

@@ -11,7 +11,6 @@ import pytest
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_peer import Peer, adding, pause, until
 
 from bridge.headset.actions import ABORTED, CANCELED, SUCCEEDED, ActionClient, Goal
 from bridge.headset.frames import NodeSpec
@@ -26,6 +25,8 @@ from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.protocol.messages import ActionVerb, Metadata, NodeType
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import MACS, split_message
+from tests.support.ros_peer import Peer, adding, pause
+from tests.support.waiting import until
 
 COUNT = "macs_test_msgs/Count"
 

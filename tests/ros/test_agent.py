@@ -12,7 +12,6 @@ from geometry_msgs.msg import Twist
 from msgspec.structs import replace
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from ros_peer import Peer, adding, command, get, removing, until
 from std_msgs.msg import Bool, String
 
 import macs_zenoh
@@ -36,6 +35,8 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.messages import encode_data as encode
 from macs_zenoh.protocol.routing import call
 from macs_zenoh.protocol.wire import parse_frame
+from tests.support.ros_peer import Peer, adding, command, removing
+from tests.support.waiting import get, until
 
 ROBOT = 7
 

@@ -13,7 +13,6 @@ import pytest
 from geometry_msgs.msg import Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
-from ros_peer import Peer, get, set_bool, until
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
@@ -28,6 +27,8 @@ from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.protocol.keyexpr import UNICAST
 from macs_zenoh.protocol.messages import NodeType
 from macs_zenoh.protocol.wire import parse_frame
+from tests.support.ros_peer import Peer, set_bool
+from tests.support.waiting import get, until
 
 ROBOT = 7
 PATIENCE_S = 20

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import macs_zenoh
-from tests.programs import ROOT, Program, free_port
+from tests.support.programs import ROOT, Program, free_port
 
 PAGE = (ROOT / "docs" / "agents.md").read_text(encoding="utf-8")
 EXAMPLE = (ROOT / "examples" / "follow_robot.py").read_text(encoding="utf-8")

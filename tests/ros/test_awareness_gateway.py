@@ -27,8 +27,9 @@ from macs_zenoh import awareness
 from macs_zenoh.config import AwarenessSettings, MeshSettings, Settings
 from macs_zenoh.errors import ConfigError, UsageError
 from macs_zenoh.mesh import Mesh
-from tests.programs import ROOT, Program, free_port, macs
-from tests.ros.ros_peer import Peer, get, until
+from tests.support.programs import ROOT, Program, free_port, macs
+from tests.support.ros_peer import Peer
+from tests.support.waiting import get, until
 
 StartGateway = Callable[..., Awaitable[Gateway]]
 

@@ -19,8 +19,9 @@ from std_msgs.msg import String
 from bridge.awareness.afferent import CONFIG_FILE, QUEUE, GatewayClientAfferent, Mode
 from bridge.awareness.client import GatewayClient, Module
 from bridge.awareness.node import SERVICE_QOS, UNDELIVERED_TOPIC
-from tests.programs import Program, free_port
-from tests.ros.ros_peer import Peer, get, until
+from tests.support.programs import Program, free_port
+from tests.support.ros_peer import Peer
+from tests.support.waiting import get, until
 
 TOPIC_ONLY = ("awareness", "--transport", "topic", "--name", "drone0")
 

@@ -12,8 +12,8 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from tests.programs import ROOT, free_port
-from tests.ros.ros_peer import until
+from tests.support.programs import ROOT, free_port
+from tests.support.waiting import until
 
 PAGE = (ROOT / "docs" / "awareness.md").read_text(encoding="utf-8")
 STAYS = ("macs router", "macs awareness", "python listener.py", "python planner.py")

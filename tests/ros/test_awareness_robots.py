@@ -15,9 +15,10 @@ from as2_ca_msgs.msg import LocalGenericMessage
 from std_msgs.msg import String
 
 from bridge.awareness.client import GatewayClient
-from tests.links import Link, counted
-from tests.programs import Program, free_port, macs
-from tests.ros.ros_peer import Peer, get, until
+from tests.support.links import Link, counted
+from tests.support.programs import Program, free_port, macs
+from tests.support.ros_peer import Peer
+from tests.support.waiting import get, until
 
 LARGE = 10_000
 """Bytes of a message that would be noticed on a link."""

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 from geometry_msgs.msg import Twist
-from ros_peer import Peer, adding, command, drive, until
 from std_msgs.msg import Bool
 
 from bridge.ros.agent import open_robot
@@ -23,7 +22,9 @@ from macs_zenoh import join
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule
 from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, encode_data, node_name
 from macs_zenoh.protocol.reading import Message
-from tests.routers import Router
+from tests.support.ros_peer import Peer, adding, command, drive
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 RULES = [
     TopicRule(match="/cmd_vel", deadman_s=0.3, deadman_message={"linear": {"z": -1}}),

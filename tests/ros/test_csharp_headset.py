@@ -13,8 +13,9 @@ import pytest
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
-from tests.programs import ROOT, Program, free_port
-from tests.ros.ros_peer import Peer, get, say_hello, set_bool
+from tests.support.programs import ROOT, Program, free_port
+from tests.support.ros_peer import Peer, say_hello, set_bool
+from tests.support.waiting import get
 
 SOURCE = ROOT / "examples" / "unity" / "MacsHeadset.cs"
 

@@ -17,8 +17,9 @@ from rclpy.serialization import serialize_message
 
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Publisher
-from tests.programs import Program, free_port
-from tests.ros.ros_peer import Peer, get
+from tests.support.programs import Program, free_port
+from tests.support.ros_peer import Peer
+from tests.support.waiting import get
 
 SILENCE_S = 0.5
 LEASE_S = 1.0

@@ -15,12 +15,13 @@ from typing import Any
 import pytest
 from geometry_msgs.msg import PoseStamped, Twist
 from rclpy.qos import qos_profile_sensor_data
-from ros_peer import Peer, get
 from sensor_msgs.msg import CompressedImage
 from std_srvs.srv import SetBool
 
 from bridge.ros import graph
 from bridge.ros.demo import Camera, Unicycle
+from tests.support.ros_peer import Peer
+from tests.support.waiting import get
 
 
 def test_a_unicycle_drives_a_circle() -> None:

@@ -16,8 +16,9 @@ import macs_zenoh
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Incoming
 from macs_zenoh.protocol.messages import Functionality, decode_data
-from tests.programs import Program, free_port, macs
-from tests.ros.ros_peer import Peer, get
+from tests.support.programs import Program, free_port, macs
+from tests.support.ros_peer import Peer
+from tests.support.waiting import get
 
 
 @dataclass

@@ -12,8 +12,9 @@ from pathlib import Path
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
-from tests.programs import ROOT, Program, free_port, macs
-from tests.ros.ros_peer import Peer, get, say_hello, set_bool
+from tests.support.programs import ROOT, Program, free_port, macs
+from tests.support.ros_peer import Peer, say_hello, set_bool
+from tests.support.waiting import get
 
 PAGE = (ROOT / "docs" / "headset.md").read_text(encoding="utf-8")
 

@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
-from ros_peer import Peer, until
 from std_msgs.msg import String
 
 from bridge.ros.session import RosSession
+from tests.support.ros_peer import Peer
+from tests.support.waiting import until
 
 
 class Heard:

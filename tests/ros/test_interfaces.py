@@ -15,8 +15,9 @@ from as2_ca_msgs.msg import InterAgentMessage
 
 from bridge.interfaces import Package, build
 from macs_zenoh.errors import ConfigError, Unreachable
-from tests.programs import ROOT
-from tests.ros.ros_peer import Peer, get, until
+from tests.support.programs import ROOT
+from tests.support.ros_peer import Peer
+from tests.support.waiting import get, until
 
 AS2_CA_MSGS = ROOT / "interfaces" / "as2_ca_msgs"
 

@@ -13,8 +13,8 @@ import pytest
 from std_msgs.msg import String
 
 from bridge.headset.client import Headset
-from tests.programs import Program, free_port
-from tests.ros.ros_peer import Peer
+from tests.support.programs import Program, free_port
+from tests.support.ros_peer import Peer
 
 BACK_S = 5.0
 """How long the stream may take to be back before the test gives up; it takes well under a second, see the output."""

@@ -11,7 +11,6 @@ import pytest
 import unity_serializer
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from ros_peer import Peer, adding, removing, until
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, String
 
@@ -24,6 +23,8 @@ from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.protocol.messages import Metadata, StreamData, decode_management
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import parse_frame
+from tests.support.ros_peer import Peer, adding, removing
+from tests.support.waiting import until
 
 
 def latched(depth: int = 1, **more: Any) -> QoSProfile:

@@ -8,15 +8,15 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import pytest
-from ros_peer import until
 
 from bridge.ros import agent
 from macs_zenoh import join, locked_out
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings
 from macs_zenoh.mesh import Mesh
-from tests.links import Link, counted
-from tests.routers import Router
+from tests.support.links import Link, counted
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 
 @pytest.fixture(autouse=True)

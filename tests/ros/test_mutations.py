@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_peer import Peer, adding, until
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
@@ -23,7 +22,9 @@ from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import UNICAST
 from macs_zenoh.protocol.messages import Metadata, NodeType, encode_data, node_name
 from macs_zenoh.protocol.wire import encode_frame, encode_message
-from tests.programs import free_port
+from tests.support.programs import free_port
+from tests.support.ros_peer import Peer, adding
+from tests.support.waiting import until
 
 ROBOT = 7
 SET = "std_srvs/SetBool"

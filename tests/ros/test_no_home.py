@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.programs import ROOT, Program, free_port
+from tests.support.programs import ROOT, Program, free_port
 
 PROGRAMS = {
     "agent": ["-m", "bridge", "agent", "--id", "3", "-e"],

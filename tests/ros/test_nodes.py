@@ -10,7 +10,6 @@ import pytest
 from geometry_msgs.msg import Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from ros_peer import Peer, adding, command, get, removing, until
 from std_msgs.msg import String, UInt8MultiArray
 
 from bridge.ros.early import EarlyMessages, NodeKey
@@ -22,6 +21,8 @@ from macs_zenoh.config import RobotSettings
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import DataRefused, Metadata, NodeType, StreamData, decode_data, decode_management
 from macs_zenoh.protocol.wire import parse_frame
+from tests.support.ros_peer import Peer, adding, command, removing
+from tests.support.waiting import get, until
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 from geometry_msgs.msg import Twist
-from ros_peer import Peer
 
 from bridge.headset.client import Headset
 from macs_zenoh.protocol.messages import Functionality, FunctionalityRequest, decode_data
-from tests.programs import Program, ended, free_port
+from tests.support.programs import Program, ended, free_port
+from tests.support.ros_peer import Peer
 
 SETTINGS = """
 [robot]

@@ -16,8 +16,9 @@ from std_msgs.msg import String
 
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Publisher
-from tests.programs import Program, ended, free_port, macs
-from tests.ros.ros_peer import Peer, get
+from tests.support.programs import Program, ended, free_port, macs
+from tests.support.ros_peer import Peer
+from tests.support.waiting import get
 
 SETTINGS = """
 [robot]

@@ -15,7 +15,7 @@ from bridge.ros.agent import open_robot
 from bridge.ros.session import RosSession
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings
 from macs_zenoh.errors import ConfigError
-from tests.programs import Program, free_port
+from tests.support.programs import Program, free_port
 
 CONFIG = Path(__file__).parents[2] / "config"
 BASE = Settings(mesh=MeshSettings(connect=["tcp/10.0.0.9:1"]), robot=RobotSettings(id=4, group=2))

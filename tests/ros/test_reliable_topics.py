@@ -10,7 +10,6 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
 
 import pytest
-from ros_peer import Peer, adding, until
 from std_msgs.msg import String
 
 from bridge.gateway import Gateway
@@ -23,8 +22,10 @@ from bridge.ros.session import RosSession
 from macs_zenoh.config import GatewaySettings, MeshSettings, RobotSettings, Settings, TopicRule
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.messages import NodeType
-from tests.programs import free_port
-from tests.routers import Router
+from tests.support.programs import free_port
+from tests.support.ros_peer import Peer, adding
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 HZ = 100
 AWAY_S = 4.0

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 from geometry_msgs.msg import Twist
 from rclpy.serialization import serialize_message
-from ros_peer import Peer, adding, drive, get, removing, until
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
@@ -33,7 +32,9 @@ from macs_zenoh.protocol.messages import ActionVerb, AddNode, CallFailure, Metad
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.routing import call, inbox, keys_of
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, parse_frame
-from tests.programs import free_port
+from tests.support.programs import free_port
+from tests.support.ros_peer import Peer, adding, drive, removing
+from tests.support.waiting import get, until
 
 ROBOT = 7
 OPERATOR, STRANGER = 5, 6

@@ -13,7 +13,7 @@ from bridge.ros.agent import open_robot
 from macs_zenoh.config import MeshSettings, RobotSettings, Settings
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.messages import Metadata
-from tests.programs import free_port
+from tests.support.programs import free_port
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

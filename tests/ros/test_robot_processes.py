@@ -25,8 +25,9 @@ from std_srvs.srv import SetBool, Trigger
 from bridge.headset.actions import SUCCEEDED
 from bridge.headset.client import Headset
 from macs_zenoh.errors import Refused, Unreachable
-from tests.programs import ROOT, Program, ended, free_port, macs
-from tests.ros.ros_peer import Peer, until
+from tests.support.programs import ROOT, Program, ended, free_port, macs
+from tests.support.ros_peer import Peer
+from tests.support.waiting import until
 
 SET = "std_srvs/SetBool"
 

@@ -9,7 +9,6 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 import zenoh
-from ros_peer import Peer, adding, removing, until
 from std_msgs.msg import String
 from zenoh import Priority
 
@@ -20,6 +19,8 @@ from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule, 
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.messages import encode_data
+from tests.support.ros_peer import Peer, adding, removing
+from tests.support.waiting import until
 
 ROBOT = 7
 

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from geometry_msgs.msg import Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_peer import Peer, adding, command, drive, get, until
 from std_msgs.msg import Bool
 
 from bridge.ros.interface import Registrant, Robot
@@ -22,6 +21,8 @@ from bridge.ros.session import RosSession
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import NodeType
+from tests.support.ros_peer import Peer, adding, command, drive
+from tests.support.waiting import get, until
 
 SILENCE_S = 0.3
 FIVE, SIX = Registrant(2, 5), Registrant(2, 6)

@@ -11,13 +11,14 @@ from pathlib import Path
 
 import pytest
 from driven import STOPPED, Heard, driving, hear, may_command, site
-from ros_peer import Peer, until
 
 from macs_zenoh import join
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh.panics import PANICKED
 from tests.panicking import panicking
-from tests.programs import ROOT, Program, free_port
+from tests.support.programs import ROOT, Program, free_port
+from tests.support.ros_peer import Peer
+from tests.support.waiting import until
 
 LONG = """
 [[robot.rules]]

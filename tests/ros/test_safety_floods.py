@@ -16,7 +16,6 @@ from pathlib import Path
 import pytest
 from driven import SETTINGS, STOPPED, Heard, driving, hear, may_command, send_bool, site
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_peer import Peer, until
 from std_msgs.msg import Bool
 from test_safety_shared import told
 
@@ -25,6 +24,8 @@ from macs_zenoh.protocol.keyexpr import CALL, GROUP
 from macs_zenoh.protocol.messages import Metadata, NodeType
 from macs_zenoh.protocol.routing import unicast_key
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from tests.support.ros_peer import Peer
+from tests.support.waiting import until
 
 ROBOT, FLOODER = 1, 4000
 GROWTH_MIB = 150

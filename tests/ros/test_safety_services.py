@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from driven import hear
 from rclpy.serialization import serialize_message
-from ros_peer import Peer, adding, drive, get, until
 from std_srvs.srv import SetBool, Trigger
 
 from bridge.ros import services
@@ -21,6 +20,8 @@ from bridge.ros.session import RosSession
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, node_name
 from macs_zenoh.protocol.reading import Message
+from tests.support.ros_peer import Peer, adding, drive
+from tests.support.waiting import get, until
 
 RULES = [
     TopicRule(match="/state", allow_while_stopped=True),

@@ -7,13 +7,14 @@ from pathlib import Path
 
 from driven import site
 from geometry_msgs.msg import Twist
-from ros_peer import Peer, until
 
 from bridge.ros.checked import CheckedSettings
 from bridge.ros.interface import Drops
 from bridge.ros.rules import Rules
 from macs_zenoh.config import RobotSettings, TopicRule
-from tests.programs import ended
+from tests.support.programs import ended
+from tests.support.ros_peer import Peer
+from tests.support.waiting import until
 
 WRONG = """
 [[robot.rules]]

@@ -15,7 +15,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_peer import Peer, until
 from std_msgs.msg import Bool
 
 from bridge.ros.safety import EmergencyStop
@@ -23,6 +22,8 @@ from bridge.ros.shared_stop import A_NODE
 from macs_zenoh import join
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Refused
+from tests.support.ros_peer import Peer
+from tests.support.waiting import until
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

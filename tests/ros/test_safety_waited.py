@@ -7,10 +7,11 @@ import signal
 from pathlib import Path
 
 from driven import STOPPED, driving, hear, may_command, send, send_bool, site
-from ros_peer import Peer, until
 from test_safety_shared import told
 
-from tests.links import counted
+from tests.support.links import counted
+from tests.support.ros_peer import Peer
+from tests.support.waiting import until
 
 
 async def test_a_suspended_agent_does_not_make_up_for_lost_time(domain: int, peer: Peer, tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_peer import Peer, adding, get, removing, until
 from std_msgs.msg import String
 from std_srvs.srv import Empty, SetBool, Trigger
 
@@ -25,6 +24,8 @@ from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, encode_data, node_name
 from macs_zenoh.protocol.reading import Message
+from tests.support.ros_peer import Peer, adding, removing
+from tests.support.waiting import get, until
 
 DEADLINE_S = 0.5
 SET = "std_srvs/SetBool"

@@ -8,11 +8,12 @@ import sys
 import threading
 
 import pytest
-from ros_peer import Peer, get, until
 from std_msgs.msg import String
 
 from bridge.ros.session import RosSession
 from macs_zenoh.errors import Unreachable
+from tests.support.ros_peer import Peer
+from tests.support.waiting import get, until
 
 
 async def test_jobs_run_in_order_in_one_thread(session: RosSession) -> None:

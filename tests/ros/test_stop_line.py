@@ -7,7 +7,6 @@ import threading
 from typing import Any
 
 import pytest
-from ros_peer import until
 
 from bridge.ros.agent import open_robot
 from bridge.ros.stop_line import apart
@@ -16,7 +15,8 @@ from macs_zenoh.config import MeshSettings, RobotSettings, Settings
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.guard import Guard
 from macs_zenoh.protocol.messages import Metadata
-from tests.routers import Router
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 ROBOT = 7
 

@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from ros_peer import Peer, adding, command, get, until
 from std_msgs.msg import String
 
 from bridge.ros.interface import Robot
@@ -19,6 +18,8 @@ from bridge.ros.topics import RateLimit
 from macs_zenoh.config import RobotSettings, TopicRule
 from macs_zenoh.protocol.messages import NodeType
 from macs_zenoh.protocol.wire import parse_frame
+from tests.support.ros_peer import Peer, adding, command
+from tests.support.waiting import get, until
 
 
 def test_the_latest_of_those_that_come_too_soon_is_sent() -> None:

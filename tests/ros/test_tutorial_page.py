@@ -11,7 +11,7 @@ from contextlib import AsyncExitStack
 from typing import Any
 
 from bridge.cli import build_parser
-from tests.programs import ROOT, Program, ended, free_port
+from tests.support.programs import ROOT, Program, ended, free_port
 
 PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
 SERVING = {"router", "gateway", "agent"}

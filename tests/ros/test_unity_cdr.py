@@ -12,7 +12,6 @@ import pytest
 import unity_serializer
 from geometry_msgs.msg import Point
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_peer import Peer, adding, command, get, until
 from sensor_msgs.msg import BatteryState, CameraInfo, JointState, LaserScan, PointCloud2
 from std_msgs.msg import Bool, ByteMultiArray, Empty, Float64MultiArray, Int64MultiArray, String
 from std_srvs.srv import Empty as EmptyService
@@ -27,6 +26,8 @@ from bridge.ros.types import least_cdr_bytes
 from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
 from macs_zenoh.protocol.messages import Metadata, NodeType, node_name
 from macs_zenoh.protocol.reading import Message
+from tests.support.ros_peer import Peer, adding, command
+from tests.support.waiting import get, until
 
 pytestmark = pytest.mark.timeout(600)  # the first of them compiles its messages, on a busy machine for minutes
 

@@ -12,8 +12,9 @@ from std_msgs.msg import String
 
 from bridge.cli import build_parser
 from macs_zenoh.config import GatewaySettings, MeshSettings
-from tests.programs import ROOT, Program, free_port, macs
-from tests.ros.ros_peer import Peer, get
+from tests.support.programs import ROOT, Program, free_port, macs
+from tests.support.ros_peer import Peer
+from tests.support.waiting import get
 
 PAGE = (ROOT / "docs" / "unity.md").read_text(encoding="utf-8")
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 from geometry_msgs.msg import Twist
-from ros_peer import Peer
 
 import macs_zenoh
-from tests.programs import ROOT, free_port
+from tests.support.programs import ROOT, free_port
+from tests.support.ros_peer import Peer
 
 
 def demo(*argv: str, env: dict[str, str]) -> Coroutine[Any, Any, asyncio.subprocess.Process]:

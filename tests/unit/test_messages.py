@@ -12,7 +12,6 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from recordings import reading
 
 from macs_zenoh.errors import BadField, BadJson, TooLong, UnknownManager, WireError
 from macs_zenoh.protocol import messages
@@ -40,6 +39,7 @@ from macs_zenoh.protocol.messages import (
     encode_management,
     node_name,
 )
+from tests.support.recordings import reading
 
 ADD_NODE = {
     "registrantAgentType": 2,

@@ -12,7 +12,6 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import BY_NAME, RECORDINGS, Recording, one_by_one, reading
 
 from macs_zenoh.errors import (
     BadField,
@@ -63,6 +62,7 @@ from macs_zenoh.protocol.tcp_agent import (
     TcpAgent,
 )
 from macs_zenoh.protocol.wire import MACS, Layout, encode_frame, encode_message, parse_frame, split_message
+from tests.support.recordings import BY_NAME, RECORDINGS, Recording, one_by_one, reading
 
 LIMITS = Limits(max_frame_bytes=1 << 20, handshake_timeout_s=10.0, idle_timeout_s=5.0, held_frames=4, held_bytes=1000)
 

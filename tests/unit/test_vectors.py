@@ -8,7 +8,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from recordings import BY_NAME, RECORDINGS, Recording, cut_around, one_by_one, reading
 
 from macs_zenoh.errors import BadField, BadJson, BadSizes, UnknownManager, WireError
 from macs_zenoh.protocol import messages
@@ -22,6 +21,7 @@ from macs_zenoh.protocol.wire import (
     parse_frame,
     split_message,
 )
+from tests.support.recordings import BY_NAME, RECORDINGS, Recording, cut_around, one_by_one, reading
 
 KINDS: dict[str, type[Management]] = {
     "AgentConfigurer": messages.Welcome,

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import cut_around, one_by_one
 
 from macs_zenoh.errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations
 from macs_zenoh.protocol.limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, SAMPLE_BYTES
@@ -31,6 +30,7 @@ from macs_zenoh.protocol.wire import (
     parse_frames,
     split_message,
 )
+from tests.support.recordings import cut_around, one_by_one
 
 
 class Vector(NamedTuple):

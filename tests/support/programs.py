@@ -1,0 +1,62 @@
+"""``macs VERB ...``, as a process that serves or to its end."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from tests.support.processes import ROOT, START_S, Process
+
+READY = "ready: "
+
+
+def free_port() -> int:
+    """A port of 127.0.0.1 that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class Program(Process):
+    """A verb that serves."""
+
+    def __init__(self, *argv: str, env: Mapping[str, str] | None = None, within: Sequence[str] = ()) -> None:
+        super().__init__(sys.executable, "-m", "bridge", *argv, env=env, within=within)
+        self.argv = argv
+        self.ready = ""
+        """What it said when it was ready, e.g. ``gateway on 127.0.0.1:7000``."""
+
+    def __str__(self) -> str:
+        return f"macs {' '.join(self.argv)}"
+
+    @property
+    def port(self) -> int:
+        """The port in what it said when it was ready."""
+        return int(self.ready.rpartition(":")[2])
+
+    def _heard(self, line: str, *, is_log: bool) -> bool:
+        is_ready = super()._heard(line, is_log=is_log)
+        if is_ready:
+            self.ready = line.removeprefix(READY)
+        return is_ready
+
+
+async def ended(*argv: str) -> tuple[int | None, str, str]:
+    """Run ``macs ...`` to its end: exit code, stdout, stderr."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "bridge", *argv, cwd=ROOT, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
+    )
+    out, errors = await asyncio.wait_for(process.communicate(), START_S)
+    return process.returncode, out.decode(), errors.decode()
+
+
+async def macs(*argv: str) -> Any:
+    """Run ``macs ...`` to its end and return its stdout as JSON. Fails unless it exits with 0."""
+    code, out, errors = await ended(*argv)
+    assert code == 0, errors
+    return json.loads(out)
