@@ -34,6 +34,11 @@ class Backpressure:
         self._held: set[Sender] = set()
         self._timer: asyncio.TimerHandle | None = None
 
+    @property
+    def holds(self) -> bool:
+        """Whether senders wait, or have just been told to."""
+        return self._timer is not None
+
     def hold(self, sender: Sender, moved: object, most_s: float = HOLD_S) -> bool:
         """Hold a sender back until `release`, but not longer than ``most_s``, and not again before the bottleneck has
         moved, which ``moved`` tells: it is another one then. Returns whether it is held."""

@@ -52,6 +52,10 @@ VERDICTS = 1024
 USUAL_DEPTH = (10, False)
 """What waits of a topic whose registration is not known any more."""
 
+IN_FLIGHT = 4
+"""While senders are held, so many times the outbox's limit may wait beyond it: what is on its way from those behind
+other gateways."""
+
 READ_S = 0.02
 """How long what waits in a socket has before the agent's time is looked at again."""
 
@@ -63,6 +67,22 @@ one socket many times before it looks at the next."""
 MOST_READ_BYTES = FrameDecoder.SPACE_BYTES
 FIRST_READ_BYTES = 64 << 10
 LEAST_READ_BYTES = 1024
+
+
+Subject = tuple[object, ...]
+"""Metadata without its request id."""
+
+
+def subject(metadata: Metadata) -> Subject:
+    """What a verdict depends on."""
+    return (
+        metadata.sender_agent_id,
+        metadata.node_name,
+        metadata.message_manager,
+        metadata.node_type,
+        metadata.data_exchange_type,
+        metadata.sender_agent_type,
+    )
 
 
 class Owner(Protocol):
@@ -123,8 +143,7 @@ class Connection(asyncio.BufferedProtocol):
         """How many interface nodes the agent has, by type and name."""
         self._last_types: dict[str, int] = {}
         """An existing headset keeps its nodes by name: of two types under one name it has the last."""
-        self._verdicts: dict[tuple[object, ...], Verdict] = {}
-        """By metadata without its request id."""
+        self._verdicts: dict[Subject, Verdict] = {}
         self.existing = True
         """Whether the agent is an existing program, which gets only what those are known to survive."""
         self.asked = Asked()
@@ -246,6 +265,7 @@ class Connection(asyncio.BufferedProtocol):
             return
         if self.greeted:
             self.peer.lost()
+        self.congested = False
         self.backpressure.release()
         self.robot_backpressure.release()
         self._memory.unfinished.note(self, self.host, 0)
@@ -296,13 +316,14 @@ class Connection(asyncio.BufferedProtocol):
         self.gather_calls([message])
         self._writer.flush()
 
-    def gather_calls(self, messages: Sequence[Chunk]) -> bool:
-        """The same for several, with the next `flush`. Whether the caller has to see to that: what is gathered begins
-        with these."""
+    def gather_calls(self, messages: Sequence[Chunk], size: int | None = None) -> bool:
+        """The same for several, of ``size`` together, with the next `flush`. Whether the caller has to see to that:
+        what is gathered begins with these."""
         if not self._writer.full:
-            return self._gather(messages)
+            return self._gather(messages, size)
+        beyond_bytes = IN_FLIGHT * self._outbox.limit_bytes if self.backpressure.holds else 0
         for message in messages:
-            if self._has_room(len(message)) and not self._outbox.put_call(message):
+            if self._has_room(len(message)) and not self._outbox.put_call(message, beyond_bytes):
                 self._warn_once("outbox_full", f"it reads too slowly: {self._outbox.bytes} bytes are waiting")
             self._account()
         self.congested = self._outbox.bytes > self._outbox.limit_bytes // 4
@@ -355,8 +376,8 @@ class Connection(asyncio.BufferedProtocol):
         if not self._writer.write_now(message):
             self._loop.call_soon_threadsafe(self.flush)
 
-    def _gather(self, messages: Sequence[Chunk]) -> bool:
-        size = sum(map(len, messages))
+    def _gather(self, messages: Sequence[Chunk], size: int | None = None) -> bool:
+        size = sum(map(len, messages)) if size is None else size
         if size > BUFFER_BYTES and not self._has_room(size):
             return False
         return self._writer.gather(messages, size)
@@ -391,16 +412,10 @@ class Connection(asyncio.BufferedProtocol):
             self._nodes.pop(node_name, None)
         self._verdicts.clear()
 
-    def verdict(self, metadata: Metadata) -> Verdict:
-        """Whether a message with this metadata may be sent, and what its data must be."""
-        about = (
-            metadata.sender_agent_id,
-            metadata.node_name,
-            metadata.message_manager,
-            metadata.node_type,
-            metadata.data_exchange_type,
-            metadata.sender_agent_type,
-        )
+    def verdict(self, metadata: Metadata, about: Subject | None = None) -> Verdict:
+        """Whether a message with this metadata may be sent, and what its data must be. ``about`` is its `subject`, for
+        who asks several."""
+        about = about or subject(metadata)
         verdict = self._verdicts.get(about)
         if verdict is None:
             verdict = self._judge(metadata)

@@ -24,9 +24,10 @@ from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.routing import takes_group_copy
 from macs_zenoh.protocol.wire import Buffer, Frame, Layout, is_probe, parse_frame, parse_frames
 
+from .afar import Afar
 from .agents import Agents
 from .backpressure import ROBOT_HOLD_S
-from .connection import Connection
+from .connection import Connection, subject
 from .judged import JudgedFrames, Read
 from .stead import Stead
 
@@ -41,6 +42,9 @@ KNOWN = 4096
 SENDERS, KNOWN_EACH = 512, 32
 """Of how many senders metadata is remembered as already judged, and how many of each."""
 
+KNOWN_CIRCLES = 256
+"""Of how many keys for several it is remembered whom they reach: that can be everybody here."""
+
 KNOWN_BYTES = 4096
 """Longer ones are read each time: what others choose must not decide how much is kept here."""
 
@@ -50,6 +54,9 @@ SEEN = 512
 SUBSCRIBER = int(NodeType.SUBSCRIBER)
 
 NOBODY: frozenset[AgentKey] = frozenset()
+
+Circle = tuple[AgentKey, list[Connection]]
+"""Who sends, and all of ours that hear it."""
 
 
 class Stream(NamedTuple):
@@ -85,16 +92,21 @@ class Delivery:
     """
 
     def __init__(
-        self, agents: Agents, directory: Directory, layout: Layout, stead: Stead, judged: JudgedFrames
+        self, agents: Agents, directory: Directory, layout: Layout, stead: Stead, judged: JudgedFrames, afar: Afar
     ) -> None:
         self.drops: Counter[str] = Counter()
         self._agents = agents
         self._directory = directory
         self._stead = stead
+        self._afar = afar
         self._layout = layout
         self.streams: dict[str, Stream] = {}
         """By their keys."""
         self._targets: dict[str, tuple[Connection, AgentKey]] = {}
+        self._circles: dict[str, Circle] = {}
+        """By keys of groups and of everybody."""
+        self._group_takers: dict[tuple[str, bytes], list[Connection]] = {}
+        """By key and destination: who of a group has not the copy for its id."""
         self._judged = judged
         self._judges: dict[AgentKey, Judge] = {}
         self._registrants: dict[bytes, list[AgentKey]] = {}
@@ -122,30 +134,24 @@ class Delivery:
     def group(self, batch: Iterator[Sample]) -> None:
         """Frames sent to groups that one of ours is in."""
         for key, payload in batch:
-            fields = GROUP.parse(key)
-            if fields is None:
+            circle = self._circles.get(key) or self._members(key)
+            if circle is None:
                 continue
-            sender = _sender(fields)
-            members = self._agents.members(int(fields["type"]), int(fields["group"]))
+            sender, members = circle
             for frame, metadata in self._read(key, payload, sender):
-                header = frame.header
-                for connection in members:
-                    if takes_group_copy(header, connection.agent_id, sender, connection.peer.agent_type):
-                        self._send(connection, frame, metadata)
+                self._send_each(self._takers(key, frame, circle), frame, metadata)
             self._hold_sender(sender, members)
         self._flush()
 
     def broadcast(self, batch: Iterator[Sample]) -> None:
         """Frames sent to everybody."""
         for key, payload in batch:
-            fields = BROADCAST.parse(key)
-            if fields is None:
+            circle = self._circles.get(key) or self._others(key)
+            if circle is None:
                 continue
-            sender = _sender(fields)
-            others = [connection for connection in self._agents.online() if connection.key != sender]
+            sender, others = circle
             for frame, metadata in self._read(key, payload, sender):
-                for connection in others:
-                    self._send(connection, frame, metadata)
+                self._send_each(others, frame, metadata)
             self._hold_sender(sender, others)
         self._flush()
 
@@ -242,6 +248,21 @@ class Delivery:
     def forget(self) -> None:
         """Agents came or went: look keys up anew."""
         self._targets.clear()
+        self._circles.clear()
+        self._group_takers.clear()
+
+    def _send_each(self, connections: list[Connection], frame: Frame, metadata: Metadata) -> None:
+        """The same frame to several."""
+        messages = frame.messages
+        size = sum(map(len, messages))
+        about = subject(metadata)
+        for connection in connections:
+            verdict = connection.verdict(metadata, about)
+            if verdict is PASS or verdict is PASS_ONCE:
+                if connection.gather_calls(messages, size):
+                    self._gathered.append(connection)
+            else:
+                self._send_judged(connection, frame, metadata, verdict, by_id=False)
 
     def _send(self, connection: Connection, frame: Frame, metadata: Metadata, *, by_id: bool = False) -> None:
         verdict = connection.verdict(metadata)
@@ -338,6 +359,40 @@ class Delivery:
         target = self._targets[key] = (connection, _sender(fields))
         return target
 
+    def _members(self, key: str) -> Circle | None:
+        """Who of ours is in the group of a key, and who sends to it."""
+        fields = GROUP.parse(key)
+        if fields is None:
+            return None
+        return self._remember(key, fields, self._agents.members(int(fields["type"]), int(fields["group"])))
+
+    def _others(self, key: str) -> Circle | None:
+        """All of ours but the one that sends with a key to everybody."""
+        fields = BROADCAST.parse(key)
+        if fields is None:
+            return None
+        sender = _sender(fields)
+        return self._remember(key, fields, [each for each in self._agents.online() if each.key != sender])
+
+    def _remember(self, key: str, fields: dict[str, FieldValue], connections: list[Connection]) -> Circle:
+        if len(self._circles) >= KNOWN_CIRCLES:
+            self._circles.clear()
+        circle = self._circles[key] = _sender(fields), connections
+        return circle
+
+    def _takers(self, key: str, frame: Frame, circle: Circle) -> list[Connection]:
+        """Those members of a group who keep this copy of a frame."""
+        to = key, frame.destination
+        takers = self._group_takers.get(to)
+        if takers is None:
+            header, (sender, members) = frame.header, circle
+            if len(self._group_takers) >= KNOWN_CIRCLES:
+                self._group_takers.clear()
+            takers = self._group_takers[to] = [
+                each for each in members if takes_group_copy(header, each.agent_id, sender, each.peer.agent_type)
+            ]
+        return takers
+
     def _late_answer(self, key: str, payload: bytes | bytearray) -> None:
         """An answer to a service call that an agent made under the id it had then. Anything else that is sent to
         that id is for whoever has it now."""
@@ -351,10 +406,14 @@ class Delivery:
                     self._send(connection, frame, metadata)
 
     def _hold_sender(self, sender: AgentKey, receivers: list[Connection]) -> None:
-        """Slow down a sender on this gateway. Those elsewhere are slowed by nobody: the outbox's limit decides."""
+        """Slow down a sender while a receiver is full. Behind no gateway nobody does: the outbox's limit decides."""
         for receiver in receivers:
-            if receiver.congested and (connection := self._agents.find(*sender)) is not None:
+            if not receiver.congested:
+                continue
+            if (connection := self._agents.find(*sender)) is not None:
                 receiver.backpressure.hold(connection, receiver.moved)
+            else:
+                self._afar.hold(sender, receiver)
 
     def _all_are_full(self, robot: Connection) -> bool:
         """Whether nobody who registered on a robot program of this gateway could take more, so that it may be held: a

@@ -18,6 +18,8 @@ from macs_zenoh.protocol.rate_limit import Passing
 from macs_zenoh.protocol.routing import stream_key
 from macs_zenoh.protocol.tcp_agent import Sent, Streamed
 
+from .afar import Afar
+from .agents import Agents
 from .backpressure import Backpressure
 from .connection import Connection
 from .judged import JudgedFrames, Read
@@ -46,11 +48,13 @@ class Run:
 class Forwarding:
     """For all connections of a gateway; within one read of a socket, for that connection."""
 
-    def __init__(self, mesh: Mesh, directory: Directory, judged: JudgedFrames) -> None:
+    def __init__(self, mesh: Mesh, agents: Agents, directory: Directory, judged: JudgedFrames) -> None:
         self._mesh = mesh
         self._directory = directory
         self._judged = judged
         self._routes: dict[Connection, Routes] = {}
+        self.afar = Afar(mesh, agents, directory, lambda connection, agent: self._routes[connection].reach(agent))
+        self._slowed = self.afar.slowed
         self._runs: dict[str, Run] = {}
         """By where they go, in the order in which they began."""
         self._apart = True
@@ -68,6 +72,7 @@ class Forwarding:
     def leave(self, connection: Connection) -> None:
         """It has ended."""
         self._routes.pop(connection, None)
+        self.afar.leave(connection)
 
     def close(self) -> None:
         """Nothing is forwarded any more."""
@@ -122,6 +127,8 @@ class Forwarding:
             waited, self._waited = self._waited, {}
             for route, newest in waited.values():
                 self._put(route.keys, newest.frame.data, COMMAND)
+        if self._slowed and connection in self._slowed:
+            self.afar.has_read(connection)
         if self._mesh.backlogged:
             self._backpressure.hold(connection, self._mesh.backlog_sent)
 

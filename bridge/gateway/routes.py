@@ -6,6 +6,7 @@ from collections.abc import Callable, Container
 from typing import NamedTuple
 
 from macs_zenoh.protocol.credit import Credit
+from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.messages import BROADCAST as EVERYBODY
 from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.registrations import AgentKey
@@ -45,6 +46,8 @@ class Routes:
         self._is_limited = is_limited
         self._known: dict[bytes, Route] = {}
         self._groups: set[tuple[int, int]] = set()
+        self._agents: set[AgentKey] = set()
+        self._everybody = False
         self._strangers = Credit(STRANGERS_PER_S, now)
 
     def find(self, destination: bytes) -> Route | None:
@@ -57,6 +60,8 @@ class Routes:
         keys = keys_of(header, *sender)
         # type 0 goes to everybody, whatever ids it names
         agents = [(header.agent_type, agent_id) for agent_id in header.ids] if header.agent_type else []
+        self._agents.update(agents)
+        self._everybody = self._everybody or header.agent_type == EVERYBODY
         limited = any(self._is_limited(key) for key in keys)
         to_robots = header.agent_type in (ROS, EVERYBODY)
         apart = len(keys) == 1 and len(agents) > 0
@@ -64,8 +69,13 @@ class Routes:
         if not left_out:
             if len(self._known) >= KNOWN_ROUTES:
                 self._known.clear()
+                self._agents = set(agents)
             self._known[frame.destination] = route
         return route
+
+    def reach(self, agent: AgentInfo) -> bool:
+        """Whether frames of the connection go, or went, to an agent, by its id, its group or with everybody."""
+        return self._everybody or agent.key in self._agents or (agent.type, agent.group) in self._groups
 
     def forget(self) -> None:
         """The connection has another id: everything it sends has other keys."""

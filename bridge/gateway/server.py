@@ -133,8 +133,8 @@ class Gateway:
         self._robot_ids = RobotIds(settings.robots)
         stead = Stead(mesh, self._layout)
         judged = JudgedFrames()
-        self._delivery = Delivery(self.agents, self.directory, self._layout, stead, judged)
-        self._forwarding = forwarding = Forwarding(mesh, self.directory, judged)
+        self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged)
+        self._delivery = Delivery(self.agents, self.directory, self._layout, stead, judged, forwarding.afar)
         # what agents sent goes straight there: it is called for every message
         self.forward, self.received = forwarding.forward, forwarding.finish
         self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
@@ -183,6 +183,7 @@ class Gateway:
         await self._leases.take()
         self._subscribe(BROADCAST.every(), self._delivery.broadcast)
         self._subscriptions["ping"] = self.mesh.answer_pings()
+        self._subscriptions["slow"] = self._forwarding.afar.listen()
         sockets = bound(self.settings.host, self.settings.port, shared=self.settings.reuse_port)
         self.port = sockets[0].getsockname()[1]
         room = (descriptors() - OTHER_DESCRIPTORS - BACKLOG) // 2

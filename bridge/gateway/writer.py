@@ -135,7 +135,7 @@ class Writer:
         """Write all that waits, then FIN."""
         with self._lock:
             self.flush()
-            self.write(self._outbox.take(self._outbox.limit_bytes))
+            self.write(self._outbox.take(self._outbox.bytes))
             self._transport.close()
 
 

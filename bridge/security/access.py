@@ -32,6 +32,7 @@ from macs_zenoh.protocol.keyexpr import (
     NAMED_ALL,
     PING,
     PRESENCE,
+    SLOW,
     STREAM,
     UNICAST,
     WANTED,
@@ -253,6 +254,8 @@ class _Outbound:
             yield from _every(GROUP, self._groups, sender)
             if self._broadcasts:
                 yield BROADCAST.every(**sender)
+            if isinstance(self._client, Gateway):
+                yield SLOW.every(**sender)
         if isinstance(self._client, Operator):
             yield PING.every()
         if self._name is not None:
@@ -290,6 +293,8 @@ class _Outbound:
         yield from _every(GROUP, self._groups)
         if self._broadcasts:
             yield BROADCAST.every()
+        if isinstance(self._client, Gateway):
+            yield SLOW.every()
         if isinstance(self._client, Operator):
             yield PING.every()
         yield from (NAMED.every(name=name) for name in self._friends)
@@ -356,6 +361,8 @@ class _Inbound:
             yield GROUP.every(**self._group)
         yield BROADCAST.every()  # what agents subscribe to; of what goes there, they get what is allowed below
         yield from with_recovery(_every(STREAM, self._streams))
+        if isinstance(self._client, Gateway):
+            yield SLOW.every()
         if isinstance(self._client, Operator):
             yield PING.every()
         if self._name is not None:
@@ -372,6 +379,7 @@ class _Inbound:
             for sender in senders(self._client):
                 yield GROUP.every(type=UNITY, **sender)
                 yield BROADCAST.every(**sender)
+            yield SLOW.every()
         if isinstance(self._client, Operator):
             yield PING.every()
         if self._name is not None:

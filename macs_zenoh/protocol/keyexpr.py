@@ -400,6 +400,13 @@ PING = Key(
     payload="any bytes; the reply is one message: facts in JSON, and the bytes back",
 )
 
+SLOW = Key(
+    "macs/slow/{zid}/{from_type}/{from_id}",
+    publisher="the gateway of an agent that takes less than others send to it",
+    subscriber="a gateway, for its own session: it reads less from the one that sends",
+    payload="type and id of who sends, and whether to slow it down",
+)
+
 KEYS: dict[str, Key] = {
     "unicast": UNICAST,
     "group": GROUP,
@@ -414,6 +421,7 @@ KEYS: dict[str, Key] = {
     "named all": NAMED_ALL,
     "last value": LAST,
     "ping": PING,
+    "slow": SLOW,
 }
 """Every key space by its name."""
 

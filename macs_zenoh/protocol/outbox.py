@@ -36,11 +36,12 @@ class Outbox:
     def __bool__(self) -> bool:
         return bool(self._calls or self._streams)
 
-    def put_call(self, message: Chunk) -> bool:
+    def put_call(self, message: Chunk, beyond_bytes: int = 0) -> bool:
         """Keep a message in order. False when the limit is reached even without any topic data: this message is
-        dropped and counted, and those that wait stay."""
+        dropped and counted, and those that wait stay. So many bytes ``beyond`` the limit may wait as well: of senders
+        that are slowing down."""
         self._make_room(len(message))
-        if self._over(len(message)):
+        if self._over(len(message) - beyond_bytes):
             self.drops["outbox_full"] += 1
             return False
         self._calls.append(message)

@@ -28,6 +28,21 @@ max_requests_per_s = 0
 
 
 @pytest.fixture
+async def two_ports(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[tuple[int, int]]:
+    """The ports of two gateways on one router."""
+    endpoint, near, far = f"tcp/127.0.0.1:{free_port()}", free_port(), free_port()
+    settings = tmp_path_factory.mktemp("gateways") / "settings.toml"
+    settings.write_text(SETTINGS)
+    options = ("-e", endpoint, "--settings", str(settings))
+    async with (
+        Program("router", "-l", endpoint),
+        Program("gateway", "--port", str(near), *options),
+        Program("gateway", "--port", str(far), *options),
+    ):
+        yield near, far
+
+
+@pytest.fixture
 async def port(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[int]:
     """The port of a gateway that is a program of its own."""
     endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
@@ -140,6 +155,44 @@ async def test_a_receiver_that_is_slower_than_its_sender(port: int) -> None:
     reading.start()
     await ended(send(sender, load), reading)
     assert [n for _, n in reading.numbers] == list(range(count))
+
+
+@pytest.mark.parametrize("size", [1 << 10, 64 << 10, 1 << 20])
+async def test_a_slower_receiver_behind_another_gateway(two_ports: tuple[int, int], size: int) -> None:
+    """The same between two gateways: the receiver's says that it is full, and the sender's reads less."""
+    sender, receiver = Headset.join(two_ports[0], 0), Headset.join(two_ports[1], 0)
+    await asyncio.sleep(1)
+    count = 60_000_000 // size
+    load = pieces(sequence.messages(sender.id, size, count, [{"ids": [receiver.id], "groups": []}]))
+    reading = Receiver(receiver, count, 15e6)
+    reading.start()
+    await ended(send(sender, load), reading)
+    assert [n for _, n in reading.numbers] == list(range(count))
+
+
+async def test_slower_receivers_in_a_group_behind_another_gateway(two_ports: tuple[int, int]) -> None:
+    """Of five in a group each gets everything, though they read at different rates, from two senders."""
+    receivers = [Headset.join(two_ports[1], 7) for _ in range(5)]
+    senders = [Headset.join(two_ports[0], 0) for _ in range(2)]
+    await asyncio.sleep(1)
+    count = 20_000_000 // (64 << 10)
+    way = [{"ids": [], "groups": [7]}]
+    loads = [pieces(sequence.messages(sender.id, 64 << 10, count, way)) for sender in senders]
+    reading = [Receiver(receiver, 2 * count, 12e6 + 4e6 * i) for i, receiver in enumerate(receivers)]
+    for thread in reading:
+        thread.start()
+    await ended(*map(send, senders, loads), *reading)
+    for thread in reading:
+        for sender in senders:
+            assert [n for who, n in thread.numbers if who == sender.id] == list(range(count))
+
+
+async def test_a_receiver_elsewhere_that_has_stopped_stops_nobody(two_ports: tuple[int, int]) -> None:
+    """Whose receiver behind another gateway reads nothing at all is soon read from as before."""
+    sender, stalled = Headset.join(two_ports[0], 0), Headset.join(two_ports[1], 0)
+    await asyncio.sleep(1)
+    load = pieces(sequence.messages(sender.id, 64 << 10, 1500, [{"ids": [stalled.id], "groups": []}]))
+    await ended(send(sender, load))  # of more than all that may wait anywhere
 
 
 async def test_a_robot_program_that_streams_unpaced(port: int) -> None:

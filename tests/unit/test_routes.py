@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bridge.gateway.routes import KNOWN_ROUTES, STRANGERS_PER_S, Routes
+from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.messages import Metadata
 from macs_zenoh.protocol.routing import keys_of
 from macs_zenoh.protocol.wire import Frame, encode_frame, encode_message, parse_frame
@@ -82,3 +83,14 @@ def test_a_broadcast_names_nobody() -> None:
     """Type 0 goes to everybody, whatever it names."""
     route = routes().work_out(frame(0, [5000, 5001], [9]), ME, 0.0)
     assert (route.keys, route.agents, route.left_out) == (["macs/all/unity/7"], [], 0)
+
+
+def test_whom_a_connection_reaches() -> None:
+    """By id, by group, with everybody: only those may ask it to slow down."""
+    here, member, other = (AgentInfo(2, number, group, "a") for number, group in ((1, 0), (2, 9), (3, 0)))
+    known = routes()
+    assert not any(map(known.reach, (here, member, other)))
+    known.work_out(frame(2, [1], [9]), ME, 0.0)
+    assert [known.reach(agent) for agent in (here, member, other)] == [True, True, False]
+    known.work_out(frame(0, [], []), ME, 0.0)
+    assert known.reach(other)
