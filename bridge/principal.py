@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from macs_zenoh.config import Settings
+from bridge.settings import Settings
 from macs_zenoh.errors import UsageError
 from macs_zenoh.protocol.keyexpr import BLOCK_SIZE, type_number
 from macs_zenoh.protocol.messages import NOBODY, UNITY

@@ -21,7 +21,8 @@ import msgspec
 
 import macs_zenoh
 from bridge import cli
-from macs_zenoh import config, errors
+from bridge.settings import Settings
+from macs_zenoh import errors
 from macs_zenoh.errors import WireError
 
 if sys.version_info >= (3, 11):
@@ -40,7 +41,7 @@ COPIED = {
 """Pages that live beside docs/, and what they are called in docs/generated/."""
 MADE_FROM = {
     "bridge/cli/__init__.py": "cli.md",
-    "macs_zenoh/config.py": "settings.md",
+    "bridge/settings/__init__.py": "settings.md",
     "macs_zenoh/__init__.py": "api.md",
 }
 """Sources that pages link to for what is made from them here: such links also work where the repository is read."""
@@ -152,7 +153,7 @@ def settings() -> str:
 def sections() -> list[type[msgspec.Struct]]:
     """The structs of a settings file, in its order; those of lists after the section that has them."""
     found: list[type[msgspec.Struct]] = []
-    for field in msgspec.structs.fields(config.Settings):
+    for field in msgspec.structs.fields(Settings):
         for struct in _structs(field.type):
             found.append(struct)
             found += [inner for of in msgspec.structs.fields(struct) for inner in _structs(of.type)]
@@ -203,6 +204,8 @@ def _in_words(kind: Any) -> str:
             )
             high = f" to {kind.le:,}" if kind.le is not None else ""
             return re.sub(r"(?<=\d),(?=\d)", " ", f"{word}{low}{high}").removesuffix(",")
+        case msgspec.inspect.Metadata():
+            return _in_words(kind.type)
         case msgspec.inspect.StrType():
             return "text"
         case msgspec.inspect.LiteralType():

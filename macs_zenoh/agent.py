@@ -19,7 +19,7 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any, NamedTuple, overload
 
-from .config import MeshSettings, TrafficRule, changed
+from .config import MeshSettings, TrafficRule
 from .errors import CallTimeout, Closed, OutOfRange, Unreachable, UsageError, WireError
 from .handles import Callbacks, Handle
 from .identity import Identity
@@ -35,6 +35,7 @@ from .protocol.messages import Metadata, NodeType
 from .protocol.reading import Message, Reader
 from .protocol.routing import call, inbox, keys_of
 from .protocol.wire import Layout, encode_frame, encode_message, parse_frame
+from .sections import changed
 from .topics import DEPTH, Chosen, TopicPublisher, TopicSubscription, Value
 
 log = logging.getLogger("macs.agent")

@@ -20,8 +20,8 @@ from typing import Any
 from bridge.awareness.link import MeshLink
 from bridge.awareness.node import NODE_NAME, SUCCESS, GatewayNode, Parameters
 from bridge.ros.session import RosSession
+from bridge.settings import Settings
 from macs_zenoh.awareness import Received
-from macs_zenoh.config import Settings
 from macs_zenoh.errors import ConfigError, MacsError
 from macs_zenoh.protocol.named import Copies, Outcome
 

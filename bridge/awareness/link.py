@@ -13,8 +13,8 @@ from collections.abc import Callable
 from contextlib import AsyncExitStack, suppress
 
 import macs_zenoh
+from bridge.settings import Settings
 from macs_zenoh.awareness import Awareness, Received, Registration
-from macs_zenoh.config import Settings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.messages import ROS

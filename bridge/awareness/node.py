@@ -23,7 +23,7 @@ from std_msgs.msg import String
 
 from bridge.awareness import cdr
 from bridge.ros.intake import Intake
-from macs_zenoh.config import AwarenessSettings
+from bridge.settings import AwarenessSettings
 from macs_zenoh.errors import ConfigError, UsageError
 from macs_zenoh.protocol.named import check_word
 

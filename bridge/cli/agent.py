@@ -18,7 +18,8 @@ import argparse
 
 from bridge import memory
 from bridge.cli import options, running
-from macs_zenoh.config import Settings, changed
+from bridge.settings import Settings
+from macs_zenoh.sections import changed
 
 SUMMARY = "a robot: this machine's ROS 2 graph"
 

@@ -18,7 +18,8 @@ from __future__ import annotations
 import argparse
 
 from bridge.cli import options, running
-from macs_zenoh.config import Settings, changed
+from bridge.settings import Settings
+from macs_zenoh.sections import changed
 
 SUMMARY = "a robot among robots: typed messages by name"
 

@@ -25,9 +25,10 @@ from bridge import memory
 from bridge.cli import options, running
 from bridge.cli.supervisor import Child, stop_in_order
 from bridge.listening import bound
-from macs_zenoh.config import GatewaySettings, Settings, changed
+from bridge.settings import GatewaySettings, Settings
 from macs_zenoh.errors import UsageError
 from macs_zenoh.protocol.addresses import is_local, joined
+from macs_zenoh.sections import changed
 
 log = logging.getLogger("macs.gateway")
 

@@ -24,7 +24,8 @@ from typing import NamedTuple
 
 from bridge import shipped
 from bridge.cli import output
-from macs_zenoh.config import MeshSettings, RobotSettings
+from bridge.settings import RobotSettings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import UsageError
 
 SUMMARY = "write settings and units to start from"

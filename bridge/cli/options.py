@@ -13,10 +13,11 @@ import os
 
 from bridge.logs import log_to_stderr
 from bridge.principal import GRAMMAR, Principal
-from macs_zenoh import config
-from macs_zenoh.config import MeshSettings, Settings
+from bridge.settings import Settings, load
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import UsageError
 from macs_zenoh.protocol import endpoints
+from macs_zenoh.sections import changed
 
 
 def add_log_options(parser: argparse.ArgumentParser, verbose: str = "log more") -> None:
@@ -81,7 +82,7 @@ def add_mesh_options(
 
 def settings_file(args: argparse.Namespace) -> Settings:
     """What the settings files say, all defaults without one. Raises `ConfigError`."""
-    return config.load(*args.settings or ())
+    return load(*args.settings or ())
 
 
 def settings(args: argparse.Namespace) -> Settings:
@@ -89,7 +90,7 @@ def settings(args: argparse.Namespace) -> Settings:
     base = settings_file(args)
     config_file = args.config or base.mesh.config_file or os.environ.get("ZENOH_CONFIG")
     unnamed = args.dials and not base.mesh.connect and not config_file
-    mesh = config.changed(
+    mesh = changed(
         base.mesh,
         mode=getattr(args, "mode", None),
         connect=args.connect or (_routers_of_environment() if unnamed else None),
@@ -98,12 +99,12 @@ def settings(args: argparse.Namespace) -> Settings:
         overrides=[*base.mesh.overrides, *args.cfg] if args.cfg else None,
         namespace=args.namespace,
     )
-    return config.changed(base, mesh=mesh)
+    return changed(base, mesh=mesh)
 
 
 def defaults() -> Settings:
     """The settings of who was told nothing."""
-    return config.changed(Settings(), mesh=config.changed(MeshSettings(), connect=_routers_of_environment()))
+    return changed(Settings(), mesh=changed(MeshSettings(), connect=_routers_of_environment()))
 
 
 def _routers_of_environment() -> list[str] | None:

@@ -18,7 +18,8 @@ import msgspec
 from msgspec import Struct
 
 from bridge.principal import Principal
-from macs_zenoh.config import MeshSettings, OperatorSettings
+from bridge.settings import OperatorSettings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError, Refused, TooLong, Unreachable
 from macs_zenoh.protocol import keyexpr, ping
 from macs_zenoh.protocol.agent_id import AgentId

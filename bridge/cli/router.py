@@ -23,7 +23,8 @@ import msgspec
 
 from bridge import memory
 from bridge.cli import options, running
-from macs_zenoh.config import EVERY_INTERFACE, MeshSettings, changed
+from macs_zenoh.config import EVERY_INTERFACE, MeshSettings
+from macs_zenoh.sections import changed
 
 log = logging.getLogger("macs.router")
 

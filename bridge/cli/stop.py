@@ -29,7 +29,7 @@ from dataclasses import asdict, dataclass, replace
 
 from bridge.cli import options, output, robots, running
 from bridge.cli.robots import Operator, Status
-from macs_zenoh.config import Settings
+from bridge.settings import Settings
 from macs_zenoh.errors import CallTimeout, MacsError, NotServed, Refused, Unreachable, UsageError
 from macs_zenoh.plain import plain
 from macs_zenoh.protocol.messages import ROS

@@ -34,10 +34,11 @@ from bridge.cli.apart import Apart
 from bridge.cli.supervisor import Child, stop_in_order
 from bridge.listening import bound, for_others
 from bridge.logs import prefix_logs
-from macs_zenoh.config import GatewaySettings, RobotSettings, Settings, changed
+from bridge.settings import GatewaySettings, RobotSettings, Settings
 from macs_zenoh.errors import MacsError, Unreachable, UsageError
 from macs_zenoh.protocol import endpoints
 from macs_zenoh.protocol.addresses import EVERYWHERE, joined, reachable
+from macs_zenoh.sections import changed
 from macs_zenoh.timeouts import within
 
 log = logging.getLogger("macs.up")

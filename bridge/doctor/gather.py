@@ -18,7 +18,7 @@ import msgspec
 from msgspec import structs
 
 from bridge.principal import Principal
-from macs_zenoh.config import Settings
+from bridge.settings import Settings
 from macs_zenoh.errors import ConfigError, Unreachable
 from macs_zenoh.mesh import Mesh, configuration
 from macs_zenoh.protocol import endpoints, keyexpr

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from functools import partial
 
-from macs_zenoh.config import RobotSettings
+from bridge.settings import RobotSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import Mesh, Traffic
 from macs_zenoh.protocol.directory import Directory

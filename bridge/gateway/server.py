@@ -16,7 +16,7 @@ from contextlib import suppress
 from msgspec import structs
 
 from bridge.listening import bound, for_others
-from macs_zenoh.config import GatewaySettings
+from bridge.settings import GatewaySettings
 from macs_zenoh.errors import Refused, Unreachable, UsageError
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Subscription

@@ -26,9 +26,9 @@ from bridge.ros.rules import Rules
 from bridge.ros.safety import EmergencyStop
 from bridge.ros.session import RosSession
 from bridge.ros.stop_line import StopLine
+from bridge.settings import RobotSettings, Settings
 from macs_zenoh import managers
 from macs_zenoh.agent import Agent, Call
-from macs_zenoh.config import RobotSettings, Settings
 from macs_zenoh.errors import MacsError, Refused, WireError
 from macs_zenoh.locked_out import locked_out
 from macs_zenoh.managers import Asker, Managers

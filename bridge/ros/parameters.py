@@ -12,10 +12,11 @@ from typing import Any
 from rclpy.exceptions import InvalidParameterTypeException, ParameterUninitializedException
 from rclpy.parameter import Parameter
 
-from macs_zenoh.config import Settings, changed
+from bridge.settings import Settings
 from macs_zenoh.errors import ConfigError
 from macs_zenoh.protocol import endpoints
 from macs_zenoh.protocol.addresses import bare
+from macs_zenoh.sections import changed
 
 ADDRESS, PORT = "127.0.0.1", 7447
 TYPES = {

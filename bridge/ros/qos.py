@@ -12,7 +12,7 @@ from typing import Any
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
-from macs_zenoh.config import TopicRule
+from bridge.settings import TopicRule
 
 DEFAULT_DEPTH = 10
 MAX_DEPTH = 1000

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from bridge.ros.interface import Registrant
 from bridge.ros.rules import names_agent
-from macs_zenoh.config import RobotSettings
+from bridge.settings import RobotSettings
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.keyexpr import type_name, type_number
 

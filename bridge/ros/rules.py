@@ -12,7 +12,7 @@ from functools import lru_cache
 
 from msgspec import structs
 
-from macs_zenoh.config import RobotSettings, TopicRule
+from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.keyexpr import block_of, type_name
 from macs_zenoh.protocol.messages import UNITY

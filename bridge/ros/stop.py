@@ -22,7 +22,7 @@ from bridge.ros.shared_stop import A_NODE, SharedStop, StopState
 from bridge.ros.stream import cdr_problem
 from bridge.ros.topics import check_topic_type
 from bridge.ros.types import resolve
-from macs_zenoh.config import WHO_STOPPED
+from bridge.settings import WHO_STOPPED
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.protocol.messages import ROS, AddNode, NodeType, node_name

@@ -13,9 +13,10 @@ import logging
 import uuid
 from collections.abc import Callable
 
-from macs_zenoh.config import MeshSettings, changed
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import Mesh
+from macs_zenoh.sections import changed
 
 log = logging.getLogger("macs.ros")
 

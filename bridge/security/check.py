@@ -22,10 +22,11 @@ from bridge.security import access, certificates
 from bridge.security.attempts import Result
 from bridge.security.policy import Policy
 from bridge.security.router_path import Progress, RouterPath, settings_of
-from macs_zenoh.config import MeshSettings, changed
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, Unreachable
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol import endpoints
+from macs_zenoh.sections import changed
 from macs_zenoh.timeouts import within
 
 RETRY_S = 0.1

@@ -11,11 +11,12 @@ import msgspec
 from bridge.security import access
 from bridge.security.access import Rule
 from bridge.security.policy import Client, Gateway, Operator, Policy, Robot, Router
-from macs_zenoh.config import MeshSettings, TrafficRule, changed
+from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.protocol import keyexpr
 from macs_zenoh.protocol.endpoints import protocol_of
 from macs_zenoh.protocol.keyexpr import STREAM, type_name
 from macs_zenoh.protocol.messages import ROS, UNITY
+from macs_zenoh.sections import changed
 
 WIDTH = 119
 

@@ -28,9 +28,11 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
-from macs_zenoh.config import AgentId, AgentName, GatewaySettings, GroupId, MeshSettings, TrafficRule, read_text
+from bridge.settings import GatewaySettings
+from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.errors import ConfigError, MissingExtra
 from macs_zenoh.protocol import endpoints
+from macs_zenoh.sections import AgentId, AgentName, GroupId, read, read_text
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=63)]
 """Also the name in the certificate and of a directory, so: letters, digits, dot, dash and underscore."""
@@ -248,12 +250,9 @@ def parse(text: str, source: str = "policy") -> Policy:
     document = _yaml(text, source)
     if not isinstance(document, dict):
         raise ConfigError(source, "a policy has routers, robots, gateways, operators and permissions")
+    policy = read(document, Policy, source)
     try:
-        policy = msgspec.convert(document, Policy)
         _check(policy)
-    except msgspec.ValidationError as error:
-        where, problem = _plain(str(error))
-        raise ConfigError(f"{source}: {where}" if where else source, problem + _hint(where, problem)) from None
     except ConfigError as error:
         raise ConfigError(f"{source}: {error.path}", error.problem) from None
     return policy
@@ -412,30 +411,3 @@ def _is_ip(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _plain(text: str) -> tuple[str, str]:
-    """Split msgspec's ``Expected `int` <= 9 - at `$.robots[0].id``` into a path and a sentence."""
-    problem, _, where = text.partition(" - at `$")
-    problem = problem.replace("Object contains unknown field", "unknown name").replace("array", "list")
-    return where.rstrip("`").lstrip("."), problem[:1].lower() + problem[1:]
-
-
-def _hint(where: str, problem: str) -> str:
-    """``, did you mean `group`?`` after an unknown name that is nearly a known one."""
-    unknown = re.fullmatch(r"unknown name `(.+)`", problem)
-    if unknown is None:
-        return ""
-    entries = {
-        "routers": Router,
-        "robots": Robot,
-        "gateways": Gateway,
-        "operators": Operator,
-        "permissions": Permission,
-        "traffic": TrafficRule,
-        "certificates": Certificates,
-        "mesh": MeshSettings,
-    }
-    owner: Any = entries.get(where.partition("[")[0], Policy)
-    near = difflib.get_close_matches(unknown[1], [field.name for field in msgspec.structs.fields(owner)], n=1)
-    return f", did you mean `{near[0]}`?" if near else ""

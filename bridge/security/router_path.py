@@ -17,7 +17,7 @@ from bridge.security.attempts import MARK, Attempt, Attempts, Question, Result, 
 from bridge.security.expected import Expected, agent_of, inbox_of, presence_of, sender_of
 from bridge.security.files import client_overrides
 from bridge.security.policy import Client, Gateway, Operator, Policy, Robot
-from macs_zenoh.config import MeshSettings, changed
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Refused, Unreachable
 from macs_zenoh.mesh import Mesh, Sample, Subscription
 from macs_zenoh.protocol import keyexpr
@@ -38,6 +38,7 @@ from macs_zenoh.protocol.keyexpr import (
 )
 from macs_zenoh.protocol.messages import ROS, UNITY
 from macs_zenoh.protocol.wire import PROBE
+from macs_zenoh.sections import changed
 
 BARRIER_S = 5.0
 """How long what everybody may send to itself may take."""

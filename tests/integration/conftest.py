@@ -9,8 +9,10 @@ import pytest
 
 from bridge.gateway import Gateway
 from bridge.headset.client import Headset
-from macs_zenoh.config import GatewaySettings, MeshSettings, TrafficRule, changed
+from bridge.settings import GatewaySettings
+from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.mesh import Mesh
+from macs_zenoh.sections import changed
 from tests.support.given import Connect, StartGateway
 from tests.support.programs import free_port
 from tests.support.waiting import until  # noqa: F401 - until all that is under way takes it from there

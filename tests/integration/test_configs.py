@@ -28,9 +28,11 @@ from bridge.cli import build_parser
 from bridge.headset.client import Headset
 from bridge.security import policy
 from bridge.security.generate import generate
+from bridge.settings import Settings
 from macs_zenoh import config
-from macs_zenoh.config import MeshSettings, Settings, changed
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
+from macs_zenoh.sections import changed
 from tests.support.programs import ROOT, Program, free_port
 from tests.support.routers import Router
 from tests.support.tools import zenohd

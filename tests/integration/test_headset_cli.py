@@ -17,7 +17,8 @@ import pytest
 
 import macs_zenoh
 from bridge.gateway import Gateway
-from macs_zenoh.config import GatewaySettings, MeshSettings
+from bridge.settings import GatewaySettings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.messages import (
     AddNode,

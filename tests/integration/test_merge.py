@@ -20,8 +20,9 @@ from bridge.gateway import Gateway, renumbering
 from bridge.gateway.leases import Leases
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Incoming, Subscription
+from bridge.settings import GatewaySettings
 from macs_zenoh.agent import Agent
-from macs_zenoh.config import GatewaySettings, MeshSettings, TrafficRule, changed
+from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.existing import CDR
@@ -43,6 +44,7 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.registrations import AgentKey, Task
 from macs_zenoh.protocol.wire import Layout, MessageDecoder, encode_frame, encode_message, split_message
 from macs_zenoh.registration_calls import RobotCalls
+from macs_zenoh.sections import changed
 from macs_zenoh.streams import Streams
 from tests.support.links import Link, counted
 from tests.support.programs import Program, macs

@@ -9,7 +9,8 @@ import pytest
 import macs_zenoh
 from bridge.gateway.server import Gateway
 from bridge.headset.client import Headset
-from macs_zenoh.config import GatewaySettings, MeshSettings
+from bridge.settings import GatewaySettings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.mesh.outgoing import Outgoing
 from macs_zenoh.protocol.keyexpr import PING

@@ -20,7 +20,8 @@ from msgspec import Struct
 import macs_zenoh
 import macs_zenoh.managers
 from bridge.gateway import Gateway
-from macs_zenoh.config import GatewaySettings, MeshSettings
+from bridge.settings import GatewaySettings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Refused
 from macs_zenoh.managers import Asker, Manager
 from macs_zenoh.mesh import Mesh

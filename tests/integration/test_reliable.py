@@ -18,9 +18,10 @@ import zenoh
 import macs_zenoh
 from bridge.gateway import Gateway
 from bridge.headset.client import Headset
+from bridge.settings import GatewaySettings
 from macs_zenoh import awareness
 from macs_zenoh.agent import Agent, Call
-from macs_zenoh.config import GatewaySettings, MeshSettings, TrafficRule
+from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.mesh import Mesh, Sample, Traffic
 from macs_zenoh.mesh import reliable as recovered
 from macs_zenoh.mesh.arrivals import Arrivals

@@ -21,7 +21,8 @@ import pytest
 from msgspec.structs import asdict
 
 from bridge.security.policy import load
-from macs_zenoh.config import MeshSettings, changed
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.sections import changed
 from tests.network.hosts import Host, Network
 from tests.network.inside import Inside, lost, median_ms, quantile
 from tests.support.programs import ROOT, Program

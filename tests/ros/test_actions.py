@@ -20,7 +20,7 @@ from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
-from macs_zenoh.config import RobotSettings, TopicRule
+from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.protocol.messages import ActionVerb, Metadata, NodeType
 from macs_zenoh.protocol.reading import Message

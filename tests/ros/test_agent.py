@@ -18,8 +18,9 @@ import macs_zenoh
 from bridge.ros.agent import RobotAgent, open_robot
 from bridge.ros.graph import Offered, TopicQos
 from bridge.ros.requests import STATUS
+from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
-from macs_zenoh.config import MeshSettings, RobotSettings, Settings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Refused
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.protocol.keyexpr import PRESENCE, STREAM

@@ -21,8 +21,9 @@ from bridge.headset import frames
 from bridge.headset.frames import NodeSpec
 from bridge.ros.agent import RobotAgent, open_robot
 from bridge.ros.interface import InterfaceNode
+from bridge.settings import RobotSettings, Settings, TopicRule
 from macs_zenoh.agent import Agent
-from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.protocol.keyexpr import UNICAST
 from macs_zenoh.protocol.messages import NodeType

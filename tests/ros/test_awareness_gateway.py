@@ -23,8 +23,9 @@ import macs_zenoh
 from bridge.awareness.client import GatewayClient
 from bridge.awareness.gateway import Gateway, open_gateway
 from bridge.awareness.node import LATCHED
+from bridge.settings import AwarenessSettings, Settings
 from macs_zenoh import awareness
-from macs_zenoh.config import AwarenessSettings, MeshSettings, Settings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, UsageError
 from macs_zenoh.mesh import Mesh
 from tests.support.programs import ROOT, Program, free_port, macs

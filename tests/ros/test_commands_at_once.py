@@ -18,8 +18,9 @@ from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from bridge.ros.topics import PublisherNode
+from bridge.settings import RobotSettings, Settings, TopicRule
 from macs_zenoh import join
-from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, encode_data, node_name
 from macs_zenoh.protocol.reading import Message
 from tests.support.ros_peer import Peer, adding, command, drive

@@ -19,7 +19,7 @@ from bridge.ros.latched import Newcomers, Told
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
-from macs_zenoh.config import RobotSettings, TopicRule
+from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.protocol.messages import Metadata, StreamData, decode_management
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import parse_frame

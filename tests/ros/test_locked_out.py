@@ -10,9 +10,10 @@ from contextlib import asynccontextmanager
 import pytest
 
 from bridge.ros import agent
+from bridge.settings import RobotSettings, Settings
 from macs_zenoh import join, locked_out
 from macs_zenoh.agent import Agent
-from macs_zenoh.config import MeshSettings, RobotSettings, Settings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
 from tests.support.links import Link, counted
 from tests.support.routers import Router

@@ -14,9 +14,10 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from bridge.ros.agent import RobotAgent, open_robot
+from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
 from macs_zenoh.agent import join as join_mesh
-from macs_zenoh.config import MeshSettings, RobotSettings, Settings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import UNICAST

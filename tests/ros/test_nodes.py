@@ -17,7 +17,7 @@ from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
-from macs_zenoh.config import RobotSettings
+from bridge.settings import RobotSettings
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import DataRefused, Metadata, NodeType, StreamData, decode_data, decode_management
 from macs_zenoh.protocol.wire import parse_frame

@@ -13,7 +13,8 @@ from bridge.cli import main
 from bridge.ros import parameters
 from bridge.ros.agent import open_robot
 from bridge.ros.session import RosSession
-from macs_zenoh.config import MeshSettings, RobotSettings, Settings
+from bridge.settings import RobotSettings, Settings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError
 from tests.support.programs import Program, free_port
 

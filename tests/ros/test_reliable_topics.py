@@ -19,7 +19,8 @@ from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
-from macs_zenoh.config import GatewaySettings, MeshSettings, RobotSettings, Settings, TopicRule
+from bridge.settings import GatewaySettings, RobotSettings, Settings, TopicRule
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.messages import NodeType
 from tests.support.programs import free_port

@@ -23,7 +23,8 @@ from bridge.ros.rules import Rules
 from bridge.ros.services import servers_elsewhere
 from bridge.ros.session import RosSession
 from bridge.ros.topics import PublisherNode
-from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule
+from bridge.settings import RobotSettings, Settings, TopicRule
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Refused
 from macs_zenoh.mesh import Mesh, Sample, Token, Traffic
 from macs_zenoh.protocol.directory import AgentInfo

@@ -10,7 +10,8 @@ import pytest
 
 import macs_zenoh
 from bridge.ros.agent import open_robot
-from macs_zenoh.config import MeshSettings, RobotSettings, Settings
+from bridge.settings import RobotSettings, Settings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.messages import Metadata
 from tests.support.programs import free_port

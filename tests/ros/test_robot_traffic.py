@@ -14,8 +14,9 @@ from zenoh import Priority
 
 import macs_zenoh
 from bridge.ros.agent import open_robot
+from bridge.settings import RobotSettings, Settings, TopicRule
 from macs_zenoh.agent import Agent
-from macs_zenoh.config import MeshSettings, RobotSettings, Settings, TopicRule, TrafficRule
+from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.messages import encode_data

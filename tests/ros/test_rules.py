@@ -10,7 +10,7 @@ from std_srvs.srv import SetBool
 
 from bridge.ros import fields
 from bridge.ros.rules import Rules, matches, names_agent
-from macs_zenoh.config import RobotSettings, TopicRule
+from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
 
 

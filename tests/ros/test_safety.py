@@ -18,7 +18,7 @@ from bridge.ros.requests import ControlRequest, control
 from bridge.ros.rules import Rules
 from bridge.ros.safety import Control, DeadMan, EmergencyStop
 from bridge.ros.session import RosSession
-from macs_zenoh.config import RobotSettings, TopicRule
+from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import NodeType
 from tests.support.ros_peer import Peer, adding, command, drive

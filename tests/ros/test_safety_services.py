@@ -17,7 +17,7 @@ from bridge.ros.interface import Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
-from macs_zenoh.config import RobotSettings, TopicRule
+from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, node_name
 from macs_zenoh.protocol.reading import Message
 from tests.support.ros_peer import Peer, adding, drive

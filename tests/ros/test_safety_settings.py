@@ -11,7 +11,7 @@ from geometry_msgs.msg import Twist
 from bridge.ros.checked import CheckedSettings
 from bridge.ros.interface import Drops
 from bridge.ros.rules import Rules
-from macs_zenoh.config import RobotSettings, TopicRule
+from bridge.settings import RobotSettings, TopicRule
 from tests.support.programs import ended
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until

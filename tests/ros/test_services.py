@@ -20,7 +20,7 @@ from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.services import ClientNode, ServiceNode
 from bridge.ros.session import RosSession
-from macs_zenoh.config import RobotSettings, TopicRule
+from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, encode_data, node_name
 from macs_zenoh.protocol.reading import Message

@@ -10,8 +10,9 @@ import pytest
 
 from bridge.ros.agent import open_robot
 from bridge.ros.stop_line import apart
+from bridge.settings import RobotSettings, Settings
 from macs_zenoh import join
-from macs_zenoh.config import MeshSettings, RobotSettings, Settings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.guard import Guard
 from macs_zenoh.protocol.messages import Metadata

@@ -15,7 +15,7 @@ from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from bridge.ros.topics import RateLimit
-from macs_zenoh.config import RobotSettings, TopicRule
+from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.protocol.messages import NodeType
 from macs_zenoh.protocol.wire import parse_frame
 from tests.support.ros_peer import Peer, adding, command

@@ -11,7 +11,8 @@ from geometry_msgs.msg import Twist
 from std_msgs.msg import String
 
 from bridge.cli import build_parser
-from macs_zenoh.config import GatewaySettings, MeshSettings
+from bridge.settings import GatewaySettings
+from macs_zenoh.config import MeshSettings
 from tests.support.programs import ROOT, Program, free_port, macs
 from tests.support.ros_peer import Peer
 from tests.support.waiting import get

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from macs_zenoh.config import GatewaySettings, MeshSettings
+from bridge.settings import GatewaySettings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError
 from macs_zenoh.protocol import addresses
 from macs_zenoh.protocol.addresses import Address

@@ -20,7 +20,8 @@ from bridge.doctor.analyze import found
 from bridge.doctor.checks import Severity
 from bridge.doctor.facts import Facts, Own
 from bridge.headset.verbs import script_parser
-from macs_zenoh.config import MeshSettings, OperatorSettings, Settings
+from bridge.settings import OperatorSettings, Settings
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, UsageError
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.keyexpr import KEYS

@@ -9,16 +9,17 @@ from typing import Any
 import pytest
 import zenoh
 
-from macs_zenoh import config
-from macs_zenoh.config import GatewaySettings, MeshSettings, RobotSettings, Settings, TopicRule, TrafficRule
+from bridge.settings import GatewaySettings, RobotSettings, Settings, TopicRule, load, parse
+from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.errors import ConfigError
+from macs_zenoh.sections import changed
 
 SHIPPED = sorted((Path(__file__).parents[2] / "config").glob("*.toml"))
 
 
 def test_an_empty_file_is_all_defaults() -> None:
     """A settings file may be empty."""
-    assert config.parse("") == Settings()
+    assert parse("") == Settings()
 
 
 def test_a_file_sets_its_fields(tmp_path: Path) -> None:
@@ -29,7 +30,7 @@ def test_a_file_sets_its_fields(tmp_path: Path) -> None:
         "[gateway]\nport = 7001\n"
         "[robot]\nid = 7\ngroup = 3\n"
     )
-    settings = config.load(file)
+    settings = load(file)
     assert settings.mesh == MeshSettings(connect=["tcp/10.0.0.1:7447"], lease_ms=3000)
     assert settings.gateway == GatewaySettings(port=7001)
     assert settings.robot == RobotSettings(id=7, group=3)
@@ -95,14 +96,14 @@ def test_a_file_sets_its_fields(tmp_path: Path) -> None:
 def test_an_error_names_file_and_field(text: str, path: str, problem: str) -> None:
     """Whatever is wrong in a file, the error says where and what."""
     with pytest.raises(ConfigError) as caught:
-        config.parse(text, "f.toml")
+        parse(text, "f.toml")
     assert caught.value.path == path
     assert problem in caught.value.problem
 
 
 def test_a_file_has_rules_for_traffic_and_topics() -> None:
     """Rules keep their order, and what a rule does not say is unset."""
-    settings = config.parse(
+    settings = parse(
         "[[traffic]]\nmatch = 'macs/from/**'\nmax_hz = 5\npriority = 'data_low'\n"
         "[[traffic]]\nmatch = '**'\nmax_bytes = 1000\nmax_bytes_per_s = 2000\ncache = 10\n"
         "[[robot.rules]]\nmatch = '/a'\npriority = 'data_high'\n"
@@ -127,25 +128,25 @@ def test_a_later_file_wins_setting_by_setting(tmp_path: Path) -> None:
     first, second = tmp_path / "first.toml", tmp_path / "second.toml"
     first.write_text('[mesh]\nlease_ms = 3000\n[robot]\nid = 1\ngroup = 3\n[[robot.rules]]\nmatch = "/a"\n')
     second.write_text('[mesh]\nconnect = ["tls/a:1"]\n[robot]\nid = 7\n')
-    settings = config.load(first, second)
+    settings = load(first, second)
     assert settings.mesh == MeshSettings(connect=["tls/a:1"], lease_ms=3000)
     assert settings.robot == RobotSettings(id=7, group=3, rules=[TopicRule(match="/a")])
     second.write_text("[robot]\nidd = 7\n")
     with pytest.raises(ConfigError, match=r"second\.toml: robot: unknown name `idd`"):
-        config.load(first, second)
+        load(first, second)
 
 
 def test_a_missing_file_is_a_config_error(tmp_path: Path) -> None:
     """A file that cannot be read is named, with the reason."""
     with pytest.raises(ConfigError, match=r"none\.toml: No such file"):
-        config.load(tmp_path / "none.toml")
+        load(tmp_path / "none.toml")
 
 
 def test_a_file_that_is_not_text_is_a_config_error(tmp_path: Path) -> None:
     """Bytes that are not UTF-8 are refused with their place."""
     (tmp_path / "x.toml").write_bytes(b"[mesh]\n\xff")
     with pytest.raises(ConfigError, match="not UTF-8 at byte 7"):
-        config.load(tmp_path / "x.toml")
+        load(tmp_path / "x.toml")
 
 
 @pytest.mark.parametrize(
@@ -153,7 +154,7 @@ def test_a_file_that_is_not_text_is_a_config_error(tmp_path: Path) -> None:
     [
         (lambda: MeshSettings(tx_queue_batches=17), "mesh.tx_queue_batches"),
         (lambda: MeshSettings(connect="tcp/127.0.0.1:7447"), "mesh.connect"),  # type: ignore[arg-type]
-        (lambda: config.changed(GatewaySettings(), port=-1), "gateway.port"),
+        (lambda: changed(GatewaySettings(), port=-1), "gateway.port"),
     ],
 )
 def test_ranges_hold_in_python_too(make: Any, path: str) -> None:
@@ -166,7 +167,7 @@ def test_ranges_hold_in_python_too(make: Any, path: str) -> None:
 def test_an_option_that_was_not_given_changes_nothing() -> None:
     """`changed` leaves fields whose new value is None."""
     settings = RobotSettings(id=7)
-    assert config.changed(settings, id=None, group=3) == RobotSettings(id=7, group=3)
+    assert changed(settings, id=None, group=3) == RobotSettings(id=7, group=3)
 
 
 def test_zenoh_accepts_every_entry() -> None:
@@ -227,9 +228,9 @@ def test_every_kind_of_link_may_be_an_endpoint(endpoint: str) -> None:
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
 def test_shipped_files_load(path: Path) -> None:
     """Every file in config/ is valid, also with all its comments taken for settings."""
-    config.load(path)
+    load(path)
     uncommented = "\n".join(
         line.removeprefix("#") if line.startswith("#") and " = " in line else line
         for line in path.read_text().splitlines()
     )
-    config.parse(uncommented, path.name)
+    parse(uncommented, path.name)

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from bridge.cli import VERBS
-from macs_zenoh import config
-from macs_zenoh.config import Settings, TrafficRule
+from bridge.settings import Settings, parse
+from macs_zenoh.config import TrafficRule
 from macs_zenoh.protocol.messages import MANAGERS, NodeType
 from macs_zenoh.protocol.policing import REASONS
 
@@ -61,7 +61,7 @@ def test_settings_on_a_page_are_settings(name: str) -> None:
     examples = re.findall(r"^```toml\n(.*?)^```", page(name), re.MULTILINE | re.DOTALL)
     assert examples
     for example in examples:
-        config.parse(example)
+        parse(example)
 
 
 def test_the_traffic_page_has_every_setting() -> None:
@@ -74,7 +74,7 @@ def test_the_traffic_page_has_every_setting() -> None:
 def test_the_settings_file_explains_every_setting() -> None:
     """config/macs.toml has every field of every section, commented out, with its default if there is one."""
     text = page("config/macs.toml")
-    shown = config.parse(re.sub(r"^#(?=\w+ = )", "", text, flags=re.MULTILINE))
+    shown = parse(re.sub(r"^#(?=\w+ = )", "", text, flags=re.MULTILINE))
     for section in ("mesh", "gateway", "robot", "awareness"):
         part = text.partition(f"\n[{section}]")[2].partition("\n[")[0]
         defaults = getattr(Settings(), section)

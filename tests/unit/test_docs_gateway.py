@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from macs_zenoh.config import GatewaySettings, RobotSettings
+from bridge.settings import GatewaySettings, RobotSettings
 from macs_zenoh.protocol.messages import (
     AddNode,
     CallFailure,

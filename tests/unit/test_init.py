@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bridge.cli import main
-from macs_zenoh import config
+from bridge.settings import load
 
 
 def written(tmp_path: Path, *argv: str) -> Path:
@@ -21,7 +21,7 @@ def test_a_robot(tmp_path: Path) -> None:
     folder = written(
         tmp_path, "robot", "--id", "7", "--group", "3", "-e", "tcp/10.0.0.1:7447", "-e", "tcp/10.0.0.2:7447"
     )
-    settings = config.load(folder / "robot.toml")
+    settings = load(folder / "robot.toml")
     assert (settings.robot.id, settings.robot.group) == (7, 3)
     assert settings.mesh.connect == ["tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447"]
     assert settings.robot.rules[0].deadman_s == 0.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from bridge.principal import Principal
-from macs_zenoh.config import GatewaySettings, OperatorSettings, RobotSettings, Settings
+from bridge.settings import GatewaySettings, OperatorSettings, RobotSettings, Settings
 from macs_zenoh.errors import UsageError
 
 

@@ -19,7 +19,7 @@ from bridge.security import access, files, policy
 from bridge.security.generate import generate
 from bridge.security.policy import Policy
 from bridge.security.router_path import settings_of
-from macs_zenoh import config
+from bridge.settings import parse
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, UsageError
 
@@ -193,7 +193,7 @@ def test_the_shipped_plans_make_files_that_load(path: Path, tmp_path: Path) -> N
     for router in shipped.routers:
         assert json.loads(loaded(shipped, router.name, tmp_path).get_json("access_control/enabled")) is True
     for client in shipped.clients:
-        assert config.parse(files.settings_toml(shipped, client, "/etc/macs")).mesh.connect
+        assert parse(files.settings_toml(shipped, client, "/etc/macs")).mesh.connect
 
 
 def test_the_rules_in_the_file_are_the_rules(site: Policy, tmp_path: Path) -> None:
@@ -267,7 +267,7 @@ def test_a_router_leaves_the_priorities_of_topics_to_robots(tmp_path: Path) -> N
 def test_settings_say_who_somebody_is() -> None:
     """A client's settings have routers in order, its certificate, and what it is on the mesh."""
     found = policy.parse(TEXT + TRAFFIC + "namespace: site1\n")
-    made = {client.name: config.parse(files.settings_toml(found, client, "/etc/macs")) for client in found.clients}
+    made = {client.name: parse(files.settings_toml(found, client, "/etc/macs")) for client in found.clients}
     robot = made["robot-7"]
     assert robot.mesh.connect == ["tls/site.example.org:7447", "tls/cloud.example.org:7447"]
     assert 'transport/link/tls/connect_private_key:"/etc/macs/key.pem"' in robot.mesh.overrides
@@ -281,7 +281,7 @@ def test_settings_say_who_somebody_is() -> None:
     assert made["anna"].operator.id is None
     numbered = policy.parse((TEXT + TRAFFIC).replace("{name: anna}", "{name: anna, id: 5}"))
     anna = next(client for client in numbered.clients if client.name == "anna")
-    assert config.parse(files.settings_toml(numbered, anna, "/etc/macs")).operator.id == 5
+    assert parse(files.settings_toml(numbered, anna, "/etc/macs")).operator.id == 5
 
 
 def test_groups_are_believed_of_those_who_are_answered_for() -> None:
@@ -289,7 +289,7 @@ def test_groups_are_believed_of_those_who_are_answered_for() -> None:
     robots are in the group that their certificate is for."""
     text = TEXT.replace("blocks: [1]", "blocks: [1], groups: {'9': [10.0.3.0/24]}")
     found = policy.parse(text)
-    made = {client.name: config.parse(files.settings_toml(found, client, "/x")) for client in found.clients}
+    made = {client.name: parse(files.settings_toml(found, client, "/x")) for client in found.clients}
     assert made["hall-1"].gateway.groups == {"9": ["10.0.3.0/24"]}
     assert made["hall-2"].gateway.groups == {}
     assert made["robot-7"].robot.groups["9"] == ["block/1"]
@@ -302,7 +302,7 @@ def test_a_robot_knows_who_may_command_it() -> None:
     text = TEXT.replace("{name: anna}", "{name: anna, id: 5}\n  - {name: berta}").replace(", blocks: [1]", "")
     text = text.replace(", blocks: [2]", "").partition("permissions:")[0]
     found = policy.parse(text + "permissions: [{who: [gateways, robot-8, operators], may: command, whom: robot-7}]")
-    first, second = (config.parse(files.settings_toml(found, robot, "/x")).robot for robot in found.robots)
+    first, second = (parse(files.settings_toml(found, robot, "/x")).robot for robot in found.robots)
     assert sorted(first.register_allow) == ["operator/0", "operator/5", "ros/300", "unity"]
     assert second.register_allow == []
 
@@ -310,7 +310,7 @@ def test_a_robot_knows_who_may_command_it() -> None:
 def test_names_with_quotes_and_spaces_survive() -> None:
     """Whatever a robot is called and wherever its files are, its settings say so."""
     found = policy.parse(TEXT.replace('"drone 7"', """'d"r\\o''né 7'"""))
-    made = config.parse(files.settings_toml(found, found.robots[0], "/etc/it's macs/ß"))
+    made = parse(files.settings_toml(found, found.robots[0], "/etc/it's macs/ß"))
     assert made.awareness.name == "d\"r\\o'né 7"
     assert made.mesh.overrides[0] == 'transport/link/tls/root_ca_certificate:"/etc/it\'s macs/\\u00df/ca.pem"'
 

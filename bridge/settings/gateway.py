@@ -1,0 +1,85 @@
+"""What a settings file may say of `macs gateway`. Pure."""
+
+from __future__ import annotations
+
+import ipaddress
+from typing import Annotated, ClassVar, Literal
+
+import msgspec
+from msgspec import Meta
+
+from macs_zenoh.protocol import addresses
+from macs_zenoh.sections import AgentId, Bytes, GroupId, Port, Seconds, Section
+
+from .agents import names_agents
+
+
+class GatewaySettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The TCP gateway: where headsets connect, and what one of them may cost."""
+
+    section: ClassVar[str] = "gateway"
+
+    host: str = "127.0.0.1"
+    """Address to listen on. The protocol has no authentication, so the network is opened on purpose: 0.0.0.0, or ::
+    for IPv6 as well. With or without brackets."""
+    port: Port = 7000
+    """TCP port to listen on. 0: any free one."""
+    allow: list[str] = []
+    """Networks whose addresses may connect, as in 192.168.1.0/24. Empty: everybody who reaches the port."""
+    max_connections: Annotated[int, Meta(ge=1, le=65_535)] = 4096
+    """Connections at one time, of all addresses together."""
+    max_connections_per_address: Annotated[int, Meta(ge=1, le=65_535)] = 3072
+    """One address never takes all. Lower it where headsets have addresses of their own; behind NAT they share one."""
+    max_frame_bytes: Bytes = 32 * 1024 * 1024
+    """A larger declared frame closes its connection before a byte of it is stored."""
+    max_frames_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0
+    """Frames of every kind from one connection; the rest is dropped and counted. 0: no limit."""
+    max_commands_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
+    """Of these, commands to robots; as a robot's own limit, before they fill the way to it. Stops are not counted."""
+    max_requests_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
+    """And all else that goes to robots."""
+    handshake_timeout_s: Seconds = 10.0
+    """A connection that has not configured itself by then is closed."""
+    idle_timeout_s: Seconds = 60.0
+    """A connection silent for so long is closed. Agents send a heartbeat after 5 s without other output; but a headset
+    that is taken off for a moment sends none, and existing ones never connect again. Hosts that died are noticed by
+    TCP, within 20 s."""
+    outbox_bytes: Annotated[int, Meta(ge=64 * 1024, le=4 * 1024**3)] = 8 * 1024 * 1024
+    """Waiting for one connection, at most. One message may always wait, however large."""
+    write_timeout_s: Seconds = 30.0
+    """A connection that takes nothing for so long while something waits is closed."""
+    block: GroupId | None = None
+    """The block of 256 agent ids this gateway gives out first, 0 being 1..255; unset: lease the first free one."""
+    blocks: list[GroupId] = []
+    """The only blocks it may lease: where routers hold its certificate to them (docs/security.md). Empty: any."""
+    managers: list[str] = []
+    """Own management messages, as my_package.world_class_manager:WorldClassManager (docs/managers.md)."""
+    tell_refusals: bool = True
+    """Tell a headset when a robot refused its registration, by a management message that existing programs ignore."""
+    groups: dict[str, list[str]] = {}
+    """Groups that not everybody here may choose, and the networks whose agents may: ``{9 = ["10.0.3.0/24"]}``. Who may
+    not is in no group. For robots that give rights to a group (`RobotSettings.groups`). Other groups are free."""
+    robots: list[AgentId] | Literal["any"] = []
+    """Ids that agents who are no headsets may have here: existing robot programs. They get one of these, headsets do
+    not. Without it none may come, because whoever reaches the port could be a robot that is away just now. ``any``:
+    whatever id is free, as with the old router; for meshes on which no robot has a session of its own."""
+    robot_packages: list[str] = []
+    """Packages of ROS types that existing robot programs here have, besides the common ones and those of the topics
+    and services that they name. A type of another package ends such a program's thread, so it is refused."""
+    reuse_port: bool = False
+    """Share the port with other gateway processes (SO_REUSEPORT); set by ``--workers``."""
+
+    def _check(self) -> None:
+        try:
+            msgspec.structs.force_setattr(self, "host", addresses.bare(self.host))
+        except ValueError as error:
+            raise self._wrong("host", str(error)) from None
+        for group in self.groups:
+            if not names_agents(f"group/{group}"):
+                raise self._wrong(f"groups.{group}", "is no group: 1 to 255")
+        for where, networks in [("allow", self.allow), *((f"groups.{g}", of) for g, of in self.groups.items())]:
+            for network in networks:
+                try:
+                    ipaddress.ip_network(network, strict=False)
+                except ValueError as error:
+                    raise self._wrong(where, f"{network!r} is not a network, as in 192.168.1.0/24: {error}") from None
