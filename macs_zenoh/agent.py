@@ -301,9 +301,8 @@ class Agent:
                 raise UsageError(f"{key} is not a call")
             frame = parse_frame(payload, self._layout)
             metadata = Metadata.decode(frame.metadata) if frame.metadata else Metadata()
-            kind, agent_id = int(fields["from_type"]), int(fields["from_id"])
-            metadata = metadata.sent_by(kind, agent_id)
-            return Call(verb, type_name(kind), agent_id, metadata, bytes(frame.body))
+            metadata = metadata.sent_by(*fields.sender)
+            return Call(verb, type_name(fields.from_type), fields.from_id, metadata, bytes(frame.body))
 
         async def answer(key: str, payload: bytes) -> bytes:
             return await handler(read(key, payload))

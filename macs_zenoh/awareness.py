@@ -294,20 +294,20 @@ class Awareness:
         for key, payload in batch:
             fields = NAMED.parse(key)
             if fields is not None:
-                self._take(str(fields["from_name"]), str(fields["message_type"]), bytes(payload), to_all=False)
+                self._take(fields.from_name, fields.message_type, bytes(payload), to_all=False)
 
     def _receive_all(self, batch: Iterator[Sample]) -> None:
         for key, payload in batch:
             fields = NAMED_ALL.parse(key)
-            if fields is not None and fields["from_name"] != self.name:
-                self._take(str(fields["from_name"]), str(fields["message_type"]), bytes(payload), to_all=True)
+            if fields is not None and fields.from_name != self.name:
+                self._take(fields.from_name, fields.message_type, bytes(payload), to_all=True)
 
     async def _confirm(self, key: str, payload: bytes) -> bytes:
         fields = NAMED.parse(key)
         if fields is None:
             raise Refused(f"{key} names no sender")
-        if not self._take(str(fields["from_name"]), str(fields["message_type"]), payload, to_all=False):
-            raise Refused(f"nobody at {self.name} has registered {fields['message_type']}")
+        if not self._take(fields.from_name, fields.message_type, payload, to_all=False):
+            raise Refused(f"nobody at {self.name} has registered {fields.message_type}")
         return b""
 
     def _take(self, sender: str, message_type: str, payload: bytes, *, to_all: bool, last: bool = False) -> bool:
@@ -372,7 +372,7 @@ class Awareness:
 
     async def _tell_last(self, key: str, _payload: bytes) -> bytes:
         fields = LAST.parse(key)
-        value = self._last.get(str(fields["message_type"])) if fields is not None else None
+        value = self._last.get(fields.message_type) if fields is not None else None
         if value is None:
             raise Refused("no such message was sent to all")
         return value

@@ -122,7 +122,7 @@ class Identity:
             held: set[int] = set()
             if type_name(self._type) != "ros":
                 leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every())]
-                held = {int(lease["block"]) for lease in leases if lease}
+                held = {lease.block for lease in leases if lease}
             agent_id = blocks.free_id(taken, held)
             if agent_id is None:
                 raise Unreachable("a free id", f"all ids of type {type_name(self._type)} are taken")

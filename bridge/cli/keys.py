@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from bridge.cli import output, terminal
 from bridge.cli.terminal import HEADING, Block, Columns
 from macs_zenoh.protocol import keyexpr
+from macs_zenoh.protocol.key_fields import Fields
 from macs_zenoh.protocol.keyexpr import Key
 
 SUMMARY = "the key map, or what one key means"
@@ -38,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _row(name: str, space: Key) -> dict[str, str]:
+def _row(name: str, space: Key[Fields]) -> dict[str, str]:
     return {
         "space": name,
         "key": space.template,
@@ -65,11 +66,11 @@ def _explain(key: str, *, as_json: bool) -> int:
     name, fields = known
     space = keyexpr.KEYS[name]
     if as_json:
-        output.say(json.dumps({**_row(name, space), "fields": fields}))
+        output.say(json.dumps({**_row(name, space), "fields": fields._asdict()}))
         return 0
     terminal.show(
         (f"{name}: {space.template}", HEADING),
-        Columns([(field, _shown(field, value)) for field, value in fields.items()], indent=2, gap=1),
+        Columns([(field, _shown(field, value)) for field, value in fields._asdict().items()], indent=2, gap=1),
         f"from {space.publisher}",
         f"to {space.subscriber}",
         f"payload: {space.payload}",

@@ -154,7 +154,7 @@ class Operator:
     async def gateways(self) -> set[str]:
         """The sessions of gateways: who is behind one answers no calls."""
         leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every(), timeout_s=self._timeout_s)]
-        return {str(lease["zid"]) for lease in leases if lease is not None}
+        return {lease.zid for lease in leases if lease is not None}
 
     async def pongs(self, gateways: Collection[str], *, timeout_s: float) -> dict[str, Pong | None]:
         """What each of these gateways says of itself, None for one that does not answer."""

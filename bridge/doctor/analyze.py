@@ -321,7 +321,7 @@ def _blocks_twice(facts: Facts) -> Iterator[Finding]:
     holders: dict[int, set[str]] = defaultdict(set)
     for key in _keys(facts, "leases"):
         if fields := LEASE.parse(key):
-            holders[int(fields["block"])].add(str(fields["zid"]))
+            holders[fields.block].add(fields.zid)
     for block, zids in sorted(holders.items()):
         if len(zids) > 1:
             yield found("block_twice", f"block {block}", count=len(zids), who=_zids(zids))
@@ -341,7 +341,7 @@ def _names_twice(facts: Facts) -> Iterator[Finding]:
     holders: dict[str, set[str]] = defaultdict(set)
     for key in _keys(facts, "names"):
         if fields := NAME.parse(key):
-            holders[str(fields["name"])].add(str(fields["zid"]))
+            holders[fields.name].add(fields.zid)
     for name, zids in sorted(holders.items()):
         if len(zids) > 1:
             yield found("name_twice", name, count=len(zids), who=_zids(zids))

@@ -272,7 +272,7 @@ def _programs(endpoints: list[Endpoint]) -> list[Program]:
             of(agent.zid).agents.append(f"{agent.type_name}/{agent.id}")
     for key in dict.fromkeys(key for endpoint in endpoints for key in endpoint.leases):
         if fields := LEASE.parse(key):
-            of(str(fields["zid"])).blocks.append(int(fields["block"]))
+            of(fields.zid).blocks.append(fields.block)
     return list(found.values())
 
 

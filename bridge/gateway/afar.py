@@ -113,7 +113,7 @@ class Afar:
             connection = self._agents.find(note.agent_type, note.agent_id) if note is not None else None
             if fields is None or note is None or connection is None:
                 continue
-            receiver = int(fields["from_type"]), int(fields["from_id"])
+            receiver = fields.sender
             if note.slow:
                 info = self._directory.get(*receiver)
                 if info is not None and self._sends_to(connection, info):

@@ -70,7 +70,7 @@ class AgentDeclarations:
         fields = CALL.parse(key)
         if fields is None or self._agents.find(*robot.key) is not robot:
             raise Refused("the robot is not connected")
-        verb, caller = str(fields["verb"]), (int(fields["from_type"]), int(fields["from_id"]))
+        verb, caller = fields.verb, fields.sender
         kind = REGISTRATIONS.get(verb)
         if kind is None:
             return self._stead.call(robot, verb)

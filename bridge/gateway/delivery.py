@@ -17,7 +17,7 @@ from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.existing import CDR, PASS, PASS_ONCE, Data, Verdict, fitting, least_bytes, refuses, topic_data
 from macs_zenoh.protocol.judging import Judge
-from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST, FieldValue
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST
 from macs_zenoh.protocol.least_bytes import TEXT_TYPE, is_whole
 from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, decode_management
 from macs_zenoh.protocol.registrations import AgentKey
@@ -349,14 +349,14 @@ class Delivery:
         fields = UNICAST.parse(key)
         if fields is None:
             return None
-        connection = self._agents.find(fields["type"], fields["id"])
+        connection = self._agents.find(fields.type, fields.id)
         if connection is None:
-            if (fields["type"], fields["id"]) not in self._directory:  # else it is in our block, but somebody else's
+            if (fields.type, fields.id) not in self._directory:  # else it is in our block, but somebody else's
                 self.drops["nobody_with_this_id"] += 1
             return None
         if len(self._targets) >= KNOWN:
             self._targets.clear()
-        target = self._targets[key] = (connection, _sender(fields))
+        target = self._targets[key] = (connection, fields.sender)
         return target
 
     def _members(self, key: str) -> Circle | None:
@@ -364,20 +364,20 @@ class Delivery:
         fields = GROUP.parse(key)
         if fields is None:
             return None
-        return self._remember(key, fields, self._agents.members(int(fields["type"]), int(fields["group"])))
+        return self._remember(key, fields.sender, self._agents.members(fields.type, fields.group))
 
     def _others(self, key: str) -> Circle | None:
         """All of ours but the one that sends with a key to everybody."""
         fields = BROADCAST.parse(key)
         if fields is None:
             return None
-        sender = _sender(fields)
-        return self._remember(key, fields, [each for each in self._agents.online() if each.key != sender])
+        others = [each for each in self._agents.online() if each.key != fields.sender]
+        return self._remember(key, fields.sender, others)
 
-    def _remember(self, key: str, fields: dict[str, FieldValue], connections: list[Connection]) -> Circle:
+    def _remember(self, key: str, sender: AgentKey, connections: list[Connection]) -> Circle:
         if len(self._circles) >= KNOWN_CIRCLES:
             self._circles.clear()
-        circle = self._circles[key] = _sender(fields), connections
+        circle = self._circles[key] = sender, connections
         return circle
 
     def _takers(self, key: str, frame: Frame, circle: Circle) -> list[Connection]:
@@ -397,11 +397,11 @@ class Delivery:
         """An answer to a service call that an agent made under the id it had then. Anything else that is sent to
         that id is for whoever has it now."""
         fields = UNICAST.parse(key)
-        if fields is None or fields["from_type"] != ROS:
+        if fields is None or fields.from_type != ROS:
             return
-        connection = self._agents.former.get((int(fields["type"]), int(fields["id"])))
+        connection = self._agents.former.get((fields.type, fields.id))
         if connection is not None:
-            for frame, metadata in self._read(key, payload, _sender(fields)):
+            for frame, metadata in self._read(key, payload, fields.sender):
                 if metadata.node_type in ANSWERS and connection.has(metadata):
                     self._send(connection, frame, metadata)
 
@@ -486,7 +486,3 @@ class Delivery:
 
 def _who(metadata: Metadata) -> str:
     return str(AgentId(metadata.sender_agent_type or 0, metadata.sender_agent_id or 0))
-
-
-def _sender(fields: dict[str, FieldValue]) -> AgentKey:
-    return int(fields["from_type"]), int(fields["from_id"])

@@ -149,8 +149,8 @@ class Leases:
 
     def _token(self, key: str, alive: bool) -> None:
         if (lease := LEASE.parse(key)) is not None:
-            holders = self._holders.setdefault(int(lease["block"]), set())
-            (holders.add if alive else holders.discard)(str(lease["zid"]))
+            holders = self._holders.setdefault(lease.block, set())
+            (holders.add if alive else holders.discard)(lease.zid)
             self._look()
 
     def _look(self) -> None:
@@ -220,5 +220,5 @@ def _by_block(keys: Iterable[str]) -> dict[int, set[str]]:
     holders: dict[int, set[str]] = {}
     for lease in map(LEASE.parse, keys):
         if lease is not None:
-            holders.setdefault(int(lease["block"]), set()).add(str(lease["zid"]))
+            holders.setdefault(lease.block, set()).add(lease.zid)
     return holders

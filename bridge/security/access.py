@@ -15,7 +15,7 @@ Every key is made by `macs_zenoh.protocol.keyexpr`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from bridge.security.policy import Client, Gateway, Operator, Policy, Robot, Router, kind_of
 from macs_zenoh.protocol.keyexpr import (
@@ -449,7 +449,7 @@ def _tokens_seen(policy: Policy, client: Client) -> Iterator[str]:
 # -- keys --------------------------------------------------------------------------------------------------------
 
 
-def _every(key: Key, targets: Iterable[Fields], sender: Fields | None = None) -> Iterator[str]:
+def _every(key: Key[Any], targets: Iterable[Fields], sender: Fields | None = None) -> Iterator[str]:
     return (key.every(**target, **(sender or {})) for target in targets)
 
 

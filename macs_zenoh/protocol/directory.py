@@ -44,10 +44,10 @@ class AgentInfo(NamedTuple):
         fields = PRESENCE.parse(key)
         if fields is None:
             return None
-        zid, _, epoch = str(fields["zid"]).partition(EPOCH)
+        zid, _, epoch = fields.zid.partition(EPOCH)
         if epoch and not (epoch.isascii() and epoch.isdigit() and len(epoch) < 20):
             return None
-        return cls(int(fields["type"]), int(fields["id"]), int(fields["group"]), zid, int(epoch or 0))
+        return cls(fields.type, fields.id, fields.group, zid, int(epoch or 0))
 
     @property
     def presence(self) -> str:

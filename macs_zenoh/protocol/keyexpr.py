@@ -7,12 +7,30 @@ together. Agent types are names in keys (``ros``, ``unity``, otherwise the numbe
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any, Generic, TypeVar
 from urllib.parse import quote, unquote
 
 from ..errors import UsageError
+from .key_fields import (
+    BroadcastFields,
+    CallFields,
+    Fields,
+    GroupFields,
+    LastFields,
+    LeaseFields,
+    NamedAllFields,
+    NamedFields,
+    NameFields,
+    PingFields,
+    PresenceFields,
+    SlowFields,
+    StreamFields,
+    UnicastFields,
+    WantedFields,
+)
 from .limits import CHUNK_BYTES, KEY_BYTES
 from .messages import OPERATOR, ROS, UNITY
 
@@ -58,11 +76,16 @@ def block_of(agent_id: int) -> int:
     return agent_id // BLOCK_SIZE
 
 
+_F = TypeVar("_F", bound=tuple[Any, ...], covariant=True)
+
+
 @dataclass(frozen=True)
-class Key:
-    """One key space: a template whose ``{fields}`` are single chunks, and who puts what there."""
+class Key(Generic[_F]):
+    """One key space: a template whose ``{fields}`` are single chunks, and who puts what there. What its keys say is
+    ``read`` as a named tuple with these fields in their order."""
 
     template: str
+    read: Callable[..., _F]
     publisher: str
     subscriber: str
     payload: str
@@ -71,7 +94,7 @@ class Key:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fields", tuple(re.findall(r"\{(\w+)\}", self.template)))
-        pattern = re.sub(r"\{(\w+)\}", r"(?P<\1>[^/*$?#]+)", self.template)
+        pattern = re.sub(r"\{(\w+)\}", r"([^/*$?#]+)", self.template)
         object.__setattr__(self, "_pattern", re.compile(pattern))
 
     @property
@@ -103,13 +126,13 @@ class Key:
                 template = template.replace("{" + name + "}", "*")
         return self._fill(values, template)
 
-    def parse(self, key: str) -> dict[str, FieldValue] | None:
+    def parse(self, key: str) -> _F | None:
         """The fields of a concrete key (types and ids as numbers), or None when the key is not of this space."""
         match = self._pattern.fullmatch(key) if len(key) <= KEY_BYTES else None
         if match is None:
             return None
         try:
-            return {name: _read(name, text) for name, text in match.groupdict().items()}
+            return self.read(*map(_read, self.fields, match.groups()))
         except (UsageError, ValueError):
             return None
 
@@ -173,12 +196,12 @@ def inside(namespace: str | None, key: str) -> str:
     return key if namespace is None or key.startswith("@") else f"{namespace}/{key}"
 
 
-def everywhere(space: Key) -> str:
+def everywhere(space: Key[Fields]) -> str:
     """All keys of a space in every namespace, and without one."""
     return "**/" + space.every()
 
 
-def namespace_of(space: Key, key: str) -> str | None:
+def namespace_of(space: Key[Fields], key: str) -> str | None:
     """The namespace before a key of a space, empty for none; None for a key of no such space."""
     namespace, found, _ = key.rpartition(space.prefix)
     return namespace.rstrip("/") if found else None
@@ -322,42 +345,49 @@ FRAME = "one frame, or several that one sender sent the same way at once, back t
 
 UNICAST = Key(
     "macs/to/{type}/{block}/{id}/{from_type}/{from_id}",
+    UnicastFields,
     publisher="the sender",
     subscriber="an agent: its own `{type}/{block}/{id}`; a gateway: its block of headsets, each of its TCP robots",
     payload=FRAME,
 )
 GROUP = Key(
     "macs/group/{group}/{type}/{from_type}/{from_id}",
+    GroupFields,
     publisher="the sender",
     subscriber="an agent in the group; a gateway once, however many of its agents are in the group",
     payload=FRAME,
 )
 BROADCAST = Key(
     "macs/all/{from_type}/{from_id}",
+    BroadcastFields,
     publisher="the sender",
     subscriber="every agent and gateway",
     payload=FRAME,
 )
 STREAM = Key(
     "macs/from/{type}/{id}/{node}",
+    StreamFields,
     publisher="a robot, once per topic message",
     subscriber="every gateway with a registrant on that node",
     payload="one frame whose management data lists the registrants",
 )
 PRESENCE = Key(
     "macs/live/{type}/{id}/{group}/{zid}",
+    PresenceFields,
     publisher="an agent, or the gateway it is behind (liveliness token)",
     subscriber="every agent and gateway",
     payload="none",
 )
 LEASE = Key(
     "macs/block/{block}/{zid}",
+    LeaseFields,
     publisher="the gateway that hands out the ids of this block (liveliness token)",
     subscriber="gateways and agents that choose an id",
     payload="none",
 )
 CALL = Key(
     "macs/call/{type}/{id}/{verb}/{from_type}/{from_id}",
+    CallFields,
     publisher="the caller (query)",
     subscriber="the agent that is called (queryable)",
     payload="one frame; the reply is one message",
@@ -365,36 +395,42 @@ CALL = Key(
 
 NAME = Key(
     "macs/name/{name}/{type}/{id}/{zid}",
+    NameFields,
     publisher="an agent that other agents send to by name (liveliness token); id 0: a name without an agent",
     subscriber="agents that send by name, `macs ls`",
     payload="none",
 )
 WANTED = Key(
     "macs/ca/wanted/{name}/{message_type}/{zid}",
+    WantedFields,
     publisher="a named agent, for each message type that somebody there has registered (liveliness token)",
     subscriber="agents that send by name",
     payload="none",
 )
 NAMED = Key(
     "macs/ca/to/{name}/{message_type}/by/{from_name}",
+    NamedFields,
     publisher="the sender; a query where it wants to know that the message has arrived",
     subscriber="the named agent (also queryable)",
     payload="one message: envelope and data",
 )
 NAMED_ALL = Key(
     "macs/ca/all/{message_type}/by/{from_name}",
+    NamedAllFields,
     publisher="the sender",
     subscriber="every named agent that has this message type registered",
     payload="one message: envelope and data",
 )
 LAST = Key(
     "macs/ca/last/{name}/{message_type}/by/{from_name}",
+    LastFields,
     publisher="who wants the named agent's last message of a type to all (query)",
     subscriber="the named agent (queryable)",
     payload="none; the reply is one message: envelope and data",
 )
 PING = Key(
     "macs/ping/{zid}",
+    PingFields,
     publisher="`macs doctor` (query; a put to itself, for the router's timestamp)",
     subscriber="every agent and gateway (queryable); the doctor's own second session",
     payload="any bytes; the reply is one message: facts in JSON, and the bytes back",
@@ -402,12 +438,13 @@ PING = Key(
 
 SLOW = Key(
     "macs/slow/{zid}/{from_type}/{from_id}",
+    SlowFields,
     publisher="the gateway of an agent that takes less than others send to it",
     subscriber="a gateway, for its own session: it reads less from the one that sends",
     payload="type and id of who sends, and whether to slow it down",
 )
 
-KEYS: dict[str, Key] = {
+KEYS: dict[str, Key[Fields]] = {
     "unicast": UNICAST,
     "group": GROUP,
     "broadcast": BROADCAST,
@@ -426,7 +463,7 @@ KEYS: dict[str, Key] = {
 """Every key space by its name."""
 
 
-def parse(key: str) -> tuple[str, dict[str, FieldValue]] | None:
+def parse(key: str) -> tuple[str, Fields] | None:
     """Which key space a concrete key belongs to, and its fields; None for a key that is not ours."""
     for name, space in KEYS.items():
         if (fields := space.parse(key)) is not None:

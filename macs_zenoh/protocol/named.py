@@ -133,13 +133,10 @@ class Names:
 
     def token(self, key: str, alive: bool) -> str | None:
         """A token appeared or ended: the name about which something has changed, or None."""
-        fields = NAME.parse(key)
-        if fields is not None:
-            agent = Named(str(fields["name"]), int(fields["type"]), int(fields["id"]), str(fields["zid"]))
-            return self._claim(agent, alive)
-        fields = WANTED.parse(key)
-        if fields is not None:
-            return self._want(str(fields["name"]), str(fields["message_type"]), str(fields["zid"]), alive)
+        if (claim := NAME.parse(key)) is not None:
+            return self._claim(Named(*claim), alive)
+        if (wanted := WANTED.parse(key)) is not None:
+            return self._want(*wanted, alive)
         return None
 
     def claims(self) -> list[Named]:

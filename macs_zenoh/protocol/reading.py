@@ -10,8 +10,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from ..errors import WireError
-from . import keyexpr
-from .keyexpr import type_name
+from .keyexpr import BROADCAST, GROUP, UNICAST, type_name
 from .messages import Metadata
 from .routing import takes_group_copy
 from .wire import Layout, parse_frame, parse_frames
@@ -116,14 +115,13 @@ class Reader:
         return seen
 
     def _read_sender(self, key: str) -> _Sender | None:
-        parsed = keyexpr.parse(key)
-        if parsed is None:
+        broadcast = BROADCAST.parse(key)
+        fields = broadcast or UNICAST.parse(key) or GROUP.parse(key)
+        if fields is None:
             return None
-        space, fields = parsed
-        kind = int(fields["from_type"])
         if len(self._senders) >= self.KNOWN:
             self._senders.clear()
-        sender = self._senders[key] = _Sender(kind, int(fields["from_id"]), type_name(kind), space == "broadcast")
+        sender = self._senders[key] = _Sender(*fields.sender, type_name(fields.from_type), fields is broadcast)
         return sender
 
     def _read_metadata(self, sender: _Sender, raw: bytes) -> Metadata:

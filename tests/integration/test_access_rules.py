@@ -186,7 +186,7 @@ async def test_an_observer_sees_who_is_online(as_user: Callable[[str], MeshSetti
         await Mesh.open(as_user("observer")) as mesh,
     ):
         keys = await mesh.tokens(PRESENCE.every(), timeout_s=20)
-    assert [fields["id"] for key in keys if (fields := PRESENCE.parse(key))] == [7]
+    assert [fields.id for key in keys if (fields := PRESENCE.parse(key))] == [7]
 
 
 async def test_an_observer_asks_robots_and_stops_none(as_user: Callable[[str], MeshSettings]) -> None:

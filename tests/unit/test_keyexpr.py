@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import typing
 
 import pytest
 import zenoh
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from macs_zenoh.errors import UsageError
 from macs_zenoh.protocol import keyexpr
+from macs_zenoh.protocol.key_fields import StreamFields
 from macs_zenoh.protocol.keyexpr import (
     CALL,
     GROUP,
@@ -95,8 +97,19 @@ def test_a_key_is_parsed_into_what_it_was_built_of(space_name: str, data: st.Dat
     """`parse` of `of` is the identity in every key space, and no other space takes the key for its own."""
     fields = data.draw(fields_of(KEYS[space_name]))
     key = KEYS[space_name].of(**fields)
-    assert KEYS[space_name].parse(key) == fields
-    assert keyexpr.parse(key) == (space_name, fields)
+    parsed = KEYS[space_name].parse(key)
+    assert parsed is not None
+    assert parsed._asdict() == fields
+    assert keyexpr.parse(key) == (space_name, parsed)
+
+
+@by_space
+def test_what_a_key_says_has_the_fields_of_its_template(space_name: str) -> None:
+    """Each key space has a type of its own for its fields: these, in this order, numbers where they are numbers."""
+    space = KEYS[space_name]
+    assert space.read._fields == space.fields
+    kinds = typing.get_type_hints(space.read)
+    assert kinds == {name: int if name in NUMBERS else str for name in space.fields}
 
 
 @by_space
@@ -155,7 +168,7 @@ def test_forbidden_characters_never_reach_a_key(character: str, place: str) -> N
     key = STREAM.of(type=1, id=7, node=node)
     chunk = key.removeprefix("macs/from/ros/7/")
     assert not set(chunk) & set("/*$?#\0\n\x7fé")
-    assert STREAM.parse(key) == {"type": 1, "id": 7, "node": node}
+    assert STREAM.parse(key) == StreamFields(type=1, id=7, node=node)
     assert STREAM.every(type=1, node=node) == f"macs/from/ros/*/{chunk}"
 
 
@@ -263,7 +276,7 @@ def test_a_key_that_we_would_write_otherwise_is_none(key: str) -> None:
 def test_any_text_is_a_key_or_none(text: str) -> None:
     """Parsing any text gives fields of a space or None, never an error."""
     parsed = keyexpr.parse(text)
-    assert parsed is None or set(parsed[1]) == set(KEYS[parsed[0]].fields)
+    assert parsed is None or parsed[1]._fields == KEYS[parsed[0]].fields
 
 
 # -- types and blocks ------------------------------------------------------------------------------------------------

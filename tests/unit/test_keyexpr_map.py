@@ -76,7 +76,7 @@ def test_an_example_is_a_key_of_its_space(row: dict[str, str]) -> None:
     assert parsed is not None
     space, fields = parsed
     assert space == row["key space"]
-    assert KEYS[space].of(**fields) == code(row["key"])
+    assert KEYS[space].of(**fields._asdict()) == code(row["key"])
 
 
 @pytest.mark.parametrize("row", SUBSCRIPTIONS, ids=lambda row: code(row["key expression"]))

@@ -60,10 +60,10 @@ def subscriptions(site: Site) -> list[tuple[frozenset[AgentKey], str]]:
 
 def takes(agent: AgentKey, key: str, header: Header, sender: AgentKey) -> bool:
     """Whether an agent keeps a copy that came to its session on a key."""
-    plane, fields = parse(key) or ("", {})
-    assert (fields["from_type"], fields["from_id"]) == sender
+    plane, fields = parse(key) or ("", None)
+    assert fields.sender == sender
     if plane == "unicast":
-        return (fields["type"], fields["id"]) == agent
+        return (fields.type, fields.id) == agent
     if plane == "group":
         return takes_group_copy(header, agent[1], sender, agent[0])
     return plane == "broadcast" and agent != sender
@@ -103,9 +103,9 @@ def test_no_key_is_used_twice(header: Header, from_type: int, from_id: int) -> N
     keys = keys_of(header, from_type, from_id)
     assert len(keys) == len(set(keys))
     for key in keys:
-        plane, fields = parse(key) or ("", {})
+        plane, fields = parse(key) or ("", None)
         assert plane in KEYS
-        assert (fields["from_type"], fields["from_id"]) == (from_type, from_id)
+        assert fields.sender == (from_type, from_id)
 
 
 @given(st.lists(IDS, max_size=10), st.lists(GROUPS, max_size=10))
