@@ -107,14 +107,8 @@ class Outgoing:
         """Send what is queued, for at most so long."""
         self._sender.close(timeout_s)
 
-    def put(self, key: str, payload: Payload, traffic: Traffic = Traffic.CALL) -> None:
-        """Publish. From any thread; never waits for more than a full link's ``block_limit_ms``.
-
-        Kept traffic that is large, or that follows a large one, is sent by a thread of its own, so that 20 MiB over
-        a slow link do not hold up the loop; between two agents of this program it is not copied at all.
-
-        What is more than a traffic rule allows is dropped and counted; where `limited`, put each message by itself.
-        """
+    def put(self, key: str, payload: Payload, traffic: Traffic) -> None:
+        """`Mesh.put`."""
         publisher, shape, kept = self._outlets[traffic].get(key) or self._declare(key, traffic)
         if shape is not None and not self._passes(shape, len(payload)):
             return
@@ -129,18 +123,17 @@ class Outgoing:
             self._put_apart(self._apart.get(key) or self._declare_apart(key, len(payload)), payload)
 
     def put_unasked(self, key: str, payload: Payload) -> None:
-        """Put without having heard that anybody listens, past all traffic rules: it goes to the router in any case,
-        as from a program that asks nobody. For who tries what a router lets through."""
+        """`Mesh.put_unasked`."""
         priority, congestion, express = Traffic.CALL.value
         self._session.put(key, payload, priority=priority, congestion_control=congestion, express=express)
 
     def limited(self, key: str) -> bool:
-        """Whether a traffic rule may drop some of what is put with this key, so that messages count one by one."""
+        """`Mesh.limited`."""
         shape = self.policer.of(key)
         return shape is not None and shape.limited
 
     def prioritise(self, key: str, priority: Priority | None) -> None:
-        """Put with this key at a priority of its own, whatever rules say; None: no more. From any thread."""
+        """`Mesh.prioritise`."""
         with self._outlets_lock:
             if self._priorities.get(key) == priority:
                 return
@@ -154,12 +147,7 @@ class Outgoing:
             self._apart.pop(key, None)
 
     def keep(self, key: str, samples: int | None) -> bool:
-        """Keep so many samples of a key for receivers that miss some, whatever rules say; None: as rules say. Returns
-        whether any are kept.
-
-        For topic data, and for messages between named agents to all: nothing else is asked for again. From any thread.
-        Receivers must subscribe with ``reliable``.
-        """
+        """`Mesh.keep`."""
         with self._outlets_lock:
             if self._kept.get(key) != samples:
                 self._kept.pop(key, None)
@@ -189,7 +177,7 @@ class Outgoing:
         return self._sender.sent
 
     def on_room(self, callback: Callable[[], None]) -> Handle:
-        """Call ``callback`` whenever a backlog has gone."""
+        """`Mesh.on_room`."""
         return self._on_room.add(callback)
 
     def when_sent(self, callback: Callable[[], None]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import re
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -15,31 +14,22 @@ from types import TracebackType
 import msgspec
 import zenoh
 
-from macs_zenoh.config import MeshSettings, TrafficRule
-from macs_zenoh.errors import (
-    CallTimeout,
-    ConfigError,
-    HeldByAnother,
-    MacsError,
-    NotServed,
-    OutOfRange,
-    Refused,
-    Unreachable,
-)
+from macs_zenoh.config import MeshSettings, Priority, TrafficRule
+from macs_zenoh.errors import ConfigError, Unreachable
 from macs_zenoh.handles import Callbacks, Handle
 from macs_zenoh.protocol import ping
 from macs_zenoh.protocol.directory import published
 from macs_zenoh.protocol.guard import Gate
 from macs_zenoh.protocol.keyexpr import PING
-from macs_zenoh.protocol.limits import REASON_CHARACTERS, REQUEST_BYTES
 from macs_zenoh.protocol.policing import Policer
 from macs_zenoh.versions import installed
 
-from .arrivals import Arrivals, now_s
+from .arrivals import Arrivals
+from .calls import Calls
 from .declared import AtOnce, Handler, OnAged, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
 from .loopback import Loopback
 from .outgoing import Outgoing
-from .panics import call, end_if_panic, end_on_panics, last_words, watched
+from .panics import call, end_on_panics, last_words, watched
 from .reliable import Recovered
 from .threads import keep_attached, shared_threads
 from .zenoh_config import check_files, first_line, insert, zenoh_config
@@ -51,9 +41,6 @@ BEAT_S = 5.0
 
 LOGGED = "error,zenoh_transport::unicast::establishment=off"
 """What Zenoh logs by itself. Not each attempt to open a session that fails: who waits says so, and why."""
-
-HOLDER = re.compile(r"([0-9]{1,3})/([0-9]{1,5})")
-"""Who has what was refused: agent type and id."""
 
 
 class Mesh:
@@ -94,7 +81,7 @@ class Mesh:
         self._needs_router = settings.mode == "client"
         self.linked = not self._needs_router
         """Whether a router is connected now; always true for a router."""
-        self._outgoing = outgoing = Outgoing(
+        self._outgoing = Outgoing(
             session,
             self._loopback,
             self.policer,
@@ -103,11 +90,7 @@ class Mesh:
             backlog_bytes=backlog_bytes,
             from_thread=self._from_thread,
         )
-        # what is put goes straight there: a gateway does it for every message
-        self.put, self.put_unasked = outgoing.put, outgoing.put_unasked
-        self.limited, self.prioritise, self.keep = outgoing.limited, outgoing.prioritise, outgoing.keep
-        self.on_room = outgoing.on_room
-        self.make_room = self._arrivals.make_room
+        self._calls = Calls(session, self._arrivals, self._outgoing, self._from_thread)
         self.tells: Callable[[], dict[str, int]] = dict
         """What this program tells `macs doctor` of itself, by name: what is so now and should not be."""
         self.address = ""
@@ -117,7 +100,6 @@ class Mesh:
         self._linked_with: set[str] = set()
         self._on_link: Callbacks[Callable[[bool], None]] = Callbacks()
         self._on_router: Callbacks[Callable[[str], None]] = Callbacks()
-        self._tasks: set[asyncio.Task[None]] = set()
         # links, not transports, and directly: Zenoh tells of a lost link before it tells that everybody behind it
         # left, and of the lost transport only after that
         on_link = zenoh.handlers.Callback(self._link_changed, indirect=False)
@@ -209,8 +191,7 @@ class Mesh:
     async def close(self) -> None:
         """Leave the mesh: what was put is sent first, tokens end. A process must not exit without it."""
         self._beating.cancel()
-        for task in self._tasks:
-            task.cancel()
+        self._calls.close()
         closing = asyncio.ensure_future(asyncio.to_thread(self._close))
         cancelled = False
         while not closing.done():
@@ -280,6 +261,47 @@ class Mesh:
 
     # -- publish and subscribe -----------------------------------------------------------------------------------
 
+    def put(self, key: str, payload: Payload, traffic: Traffic = Traffic.CALL) -> None:
+        """Publish. From any thread; never waits for more than a full link's ``block_limit_ms``.
+
+        Kept traffic that is large, or that follows a large one, is sent by a thread of its own, so that 20 MiB over
+        a slow link do not hold up the loop; between two agents of this program it is not copied at all.
+
+        What is more than a traffic rule allows is dropped and counted; where `limited`, put each message by itself.
+        """
+        self._outgoing.put(key, payload, traffic)
+
+    def put_unasked(self, key: str, payload: Payload) -> None:
+        """Put without having heard that anybody listens, past all traffic rules: it goes to the router in any case,
+        as from a program that asks nobody. For who tries what a router lets through."""
+        self._outgoing.put_unasked(key, payload)
+
+    def limited(self, key: str) -> bool:
+        """Whether a traffic rule may drop some of what is put with this key, so that messages count one by one."""
+        return self._outgoing.limited(key)
+
+    def prioritise(self, key: str, priority: Priority | None) -> None:
+        """Put with this key at a priority of its own, whatever rules say; None: no more. From any thread."""
+        self._outgoing.prioritise(key, priority)
+
+    def keep(self, key: str, samples: int | None) -> bool:
+        """Keep so many samples of a key for receivers that miss some, whatever rules say; None: as rules say. Returns
+        whether any are kept.
+
+        For topic data, and for messages between named agents to all: nothing else is asked for again. From any thread.
+        Receivers must subscribe with ``reliable``.
+        """
+        return self._outgoing.keep(key, samples)
+
+    def on_room(self, callback: Callable[[], None]) -> Handle:
+        """Call ``callback`` whenever a backlog has gone."""
+        return self._outgoing.on_room(callback)
+
+    def make_room(self) -> None:
+        """Hand over what waits, if much of it was put by the loop's own thread, which handles it as well: whoever puts
+        there for others calls this after each put, and goes on when there is room. Nothing within a handler."""
+        self._arrivals.make_room()
+
     def subscribe(
         self,
         key: str,
@@ -348,68 +370,12 @@ class Mesh:
         Raises Refused when the answer is a refusal, NotServed, Unreachable, CallTimeout; OutOfRange when
         it is larger than a traffic rule allows: of what a rule limits, only the size holds for queries.
         """
-        shape = self.policer.of(key)
-        if shape is not None and (overrun := shape.too_large(len(payload))) is not None:
-            raise OutOfRange(f"size of {key}", len(payload), 0, int(overrun.limit))
-        done: asyncio.Future[bytes] = self._loop.create_future()
-
-        def settle(answer: bytes | None, error: MacsError | None) -> None:
-            if done.done():
-                return
-            if error is not None:
-                done.set_exception(error)
-            elif answer is not None:
-                done.set_result(answer)
-
-        answered = False
-
-        def on_reply(reply: zenoh.Reply) -> None:
-            nonlocal answered
-            keep_attached()
-            answered = True
-            if (ok := reply.ok) is not None:
-                self._from_thread(settle, ok.payload.to_bytes(), None)
-            elif reply.err is not None:
-                problem = _problem(key, reply.err.payload.to_bytes(), timeout_s)
-                self._from_thread(settle, None, problem)
-
-        def on_end() -> None:
-            if not answered:
-                self._from_thread(settle, None, NotServed(key))
-
-        priority, congestion, express = self._outgoing.way(key, traffic)
-        self._session.get(
-            key,
-            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
-            payload=payload,
-            timeout=timeout_s,
-            priority=priority,
-            congestion_control=congestion,
-            express=express,
-        )
-        return await done
+        return await self._calls.query(key, payload, timeout_s=timeout_s, traffic=traffic)
 
     async def ask_all(self, key: str, *, timeout_s: float) -> list[tuple[str, bytes]]:
         """Ask everybody who serves a key, as the routers' admin space (``@/*/router``), and return every answer with
         its own key. Refusals are left out, and who is not allowed to ask gets none: Zenoh does not say."""
-        answers: list[tuple[str, bytes]] = []
-        ended = asyncio.Event()
-
-        def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                answers.append((str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
-
-        def on_end() -> None:
-            self._from_thread(ended.set)
-
-        self._session.get(
-            key,
-            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
-            target=zenoh.QueryTarget.ALL,
-            timeout=timeout_s,
-        )
-        await ended.wait()
-        return answers
+        return await self._calls.ask_all(key, timeout_s=timeout_s)
 
     def serve(
         self,
@@ -426,51 +392,7 @@ class Mesh:
         query, in a thread of Zenoh's; unless it raises Refused, the answer is the handler's, on the loop. What the
         ``gate`` does not admit has no answer.
         """
-
-        async def answer(query: zenoh.Query, problem: Refused | None) -> None:
-            self._arrivals.asked.popleft()
-            with query:
-                name = str(query.key_expr)
-                payload = query.payload.to_bytes() if query.payload is not None else b""
-                try:
-                    if problem is not None:
-                        raise problem
-                    reply = await handler(name, payload)
-                    if reply is not None:
-                        query.reply(query.key_expr, reply)
-                except HeldByAnother as refusal:
-                    holder = "{}/{}".format(*refusal.holder)
-                    query.reply_err(msgspec.json.encode({"refused": refusal.reason, "holder": holder}))
-                except Refused as refusal:
-                    query.reply_err(msgspec.json.encode({"refused": refusal.reason}))
-                except MacsError as error:
-                    query.reply_err(msgspec.json.encode({"refused": str(error)}))
-                except Exception:
-                    log.exception("call %s failed", name)
-                    query.reply_err(msgspec.json.encode({"failed": "internal error, see the log there"}))
-                except BaseException as error:
-                    end_if_panic(error)
-                    raise
-
-        def spawn(query: zenoh.Query, problem: Refused | None) -> None:
-            task = self._loop.create_task(answer(query, problem))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
-
-        def on_query(query: zenoh.Query) -> None:
-            keep_attached()
-            problem = _tried(first, query) if first is not None else None
-            if gate is not None:
-                size = len(query.payload) if query.payload is not None else 0
-                if not gate.admits(str(query.key_expr), size, False, now_s()):
-                    query.drop()  # type: ignore[no-untyped-call]
-                    return
-            self._arrivals.asked.append(query)
-            self._from_thread(spawn, query, problem)
-
-        answering = zenoh.handlers.Callback(on_query, indirect=False)
-        # Zenoh asks one that is complete if there is any, else all
-        return Subscription(self._session.declare_queryable(key, answering, complete=not stand_in))
+        return self._calls.serve(key, handler, stand_in=stand_in, first=first, gate=gate)
 
     def answer_pings(self) -> Subscription:
         """Let `macs doctor` measure the way to this program, and learn its clock and version."""
@@ -536,36 +458,6 @@ class Mesh:
             self._loop.call_soon_threadsafe(callback, *args)
         except RuntimeError:  # the loop is closed: the program is ending and nobody waits for this
             log.debug("the event loop has ended")
-
-
-def _tried(first: Callable[[str, bytes], None], query: zenoh.Query) -> Refused | None:
-    """Why what had to be done at once was not."""
-    try:
-        first(str(query.key_expr), query.payload.to_bytes() if query.payload is not None else b"")
-    except Refused as refusal:
-        return refusal
-    except MacsError as error:
-        return Refused(str(error))
-    except Exception:
-        log.exception("call %s failed", query.key_expr)
-        return Refused("internal error, see the log there")
-    return None
-
-
-def _problem(key: str, payload: bytes, timeout_s: float) -> MacsError:
-    """What an error reply means: ours is JSON, Zenoh's own is the word ``Timeout``."""
-    if payload == b"Timeout":
-        return CallTimeout(key, timeout_s)
-    try:
-        answer = msgspec.json.decode(payload[:REQUEST_BYTES], type=dict[str, str])
-    except (msgspec.DecodeError, UnicodeDecodeError):
-        return Unreachable(key, payload[:200].decode(errors="replace"))
-    if "refused" in answer:
-        holder = HOLDER.fullmatch(answer.get("holder", ""))
-        if holder is None:
-            return Refused(answer["refused"][:REASON_CHARACTERS])
-        return HeldByAnother(answer["refused"][:REASON_CHARACTERS], (int(holder[1]), int(holder[2])))
-    return Unreachable(key, answer.get("failed", "unknown failure")[:REASON_CHARACTERS])
 
 
 async def _open(config: zenoh.Config) -> zenoh.Session:

@@ -1,0 +1,199 @@
+"""Calls: Zenoh queries that somebody answers, or refuses with a reason."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+from collections.abc import Callable
+
+import msgspec
+import zenoh
+
+from macs_zenoh.errors import CallTimeout, HeldByAnother, MacsError, NotServed, OutOfRange, Refused, Unreachable
+from macs_zenoh.protocol.guard import Gate
+from macs_zenoh.protocol.limits import REASON_CHARACTERS, REQUEST_BYTES
+
+from .arrivals import Arrivals, now_s
+from .declared import Handler, Payload, Subscription, Traffic
+from .outgoing import Outgoing
+from .panics import end_if_panic
+from .threads import keep_attached
+
+log = logging.getLogger("macs.mesh")
+
+HOLDER = re.compile(r"([0-9]{1,3})/([0-9]{1,5})")
+"""Who has what was refused: agent type and id."""
+
+
+class Calls:
+    """Those of one session: what it asks, and what it serves."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        arrivals: Arrivals,
+        outgoing: Outgoing,
+        from_thread: Callable[..., None],
+    ) -> None:
+        self._session = session
+        self._loop = asyncio.get_running_loop()
+        self._arrivals = arrivals
+        self._outgoing = outgoing
+        self._from_thread = from_thread
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def close(self) -> None:
+        """Answer nothing any more."""
+        for task in self._tasks:
+            task.cancel()
+
+    async def query(self, key: str, payload: Payload, *, timeout_s: float, traffic: Traffic) -> bytes:
+        """`Mesh.query`."""
+        shape = self._outgoing.policer.of(key)
+        if shape is not None and (overrun := shape.too_large(len(payload))) is not None:
+            raise OutOfRange(f"size of {key}", len(payload), 0, int(overrun.limit))
+        done: asyncio.Future[bytes] = self._loop.create_future()
+
+        def settle(answer: bytes | None, error: MacsError | None) -> None:
+            if done.done():
+                return
+            if error is not None:
+                done.set_exception(error)
+            elif answer is not None:
+                done.set_result(answer)
+
+        answered = False
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            nonlocal answered
+            keep_attached()
+            answered = True
+            if (ok := reply.ok) is not None:
+                self._from_thread(settle, ok.payload.to_bytes(), None)
+            elif reply.err is not None:
+                problem = _problem(key, reply.err.payload.to_bytes(), timeout_s)
+                self._from_thread(settle, None, problem)
+
+        def on_end() -> None:
+            if not answered:
+                self._from_thread(settle, None, NotServed(key))
+
+        priority, congestion, express = self._outgoing.way(key, traffic)
+        self._session.get(
+            key,
+            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
+            payload=payload,
+            timeout=timeout_s,
+            priority=priority,
+            congestion_control=congestion,
+            express=express,
+        )
+        return await done
+
+    async def ask_all(self, key: str, *, timeout_s: float) -> list[tuple[str, bytes]]:
+        """`Mesh.ask_all`."""
+        answers: list[tuple[str, bytes]] = []
+        ended = asyncio.Event()
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                answers.append((str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+
+        def on_end() -> None:
+            self._from_thread(ended.set)
+
+        self._session.get(
+            key,
+            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
+            target=zenoh.QueryTarget.ALL,
+            timeout=timeout_s,
+        )
+        await ended.wait()
+        return answers
+
+    def serve(
+        self,
+        key: str,
+        handler: Handler,
+        *,
+        stand_in: bool,
+        first: Callable[[str, bytes], None] | None,
+        gate: Gate | None,
+    ) -> Subscription:
+        """`Mesh.serve`."""
+
+        async def answer(query: zenoh.Query, problem: Refused | None) -> None:
+            self._arrivals.asked.popleft()
+            with query:
+                name = str(query.key_expr)
+                payload = query.payload.to_bytes() if query.payload is not None else b""
+                try:
+                    if problem is not None:
+                        raise problem
+                    reply = await handler(name, payload)
+                    if reply is not None:
+                        query.reply(query.key_expr, reply)
+                except HeldByAnother as refusal:
+                    holder = "{}/{}".format(*refusal.holder)
+                    query.reply_err(msgspec.json.encode({"refused": refusal.reason, "holder": holder}))
+                except Refused as refusal:
+                    query.reply_err(msgspec.json.encode({"refused": refusal.reason}))
+                except MacsError as error:
+                    query.reply_err(msgspec.json.encode({"refused": str(error)}))
+                except Exception:
+                    log.exception("call %s failed", name)
+                    query.reply_err(msgspec.json.encode({"failed": "internal error, see the log there"}))
+                except BaseException as error:
+                    end_if_panic(error)
+                    raise
+
+        def spawn(query: zenoh.Query, problem: Refused | None) -> None:
+            task = self._loop.create_task(answer(query, problem))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+        def on_query(query: zenoh.Query) -> None:
+            keep_attached()
+            problem = _tried(first, query) if first is not None else None
+            if gate is not None:
+                size = len(query.payload) if query.payload is not None else 0
+                if not gate.admits(str(query.key_expr), size, False, now_s()):
+                    query.drop()  # type: ignore[no-untyped-call]
+                    return
+            self._arrivals.asked.append(query)
+            self._from_thread(spawn, query, problem)
+
+        answering = zenoh.handlers.Callback(on_query, indirect=False)
+        # Zenoh asks one that is complete if there is any, else all
+        return Subscription(self._session.declare_queryable(key, answering, complete=not stand_in))
+
+
+def _tried(first: Callable[[str, bytes], None], query: zenoh.Query) -> Refused | None:
+    """Why what had to be done at once was not."""
+    try:
+        first(str(query.key_expr), query.payload.to_bytes() if query.payload is not None else b"")
+    except Refused as refusal:
+        return refusal
+    except MacsError as error:
+        return Refused(str(error))
+    except Exception:
+        log.exception("call %s failed", query.key_expr)
+        return Refused("internal error, see the log there")
+    return None
+
+
+def _problem(key: str, payload: bytes, timeout_s: float) -> MacsError:
+    """What an error reply means: ours is JSON, Zenoh's own is the word ``Timeout``."""
+    if payload == b"Timeout":
+        return CallTimeout(key, timeout_s)
+    try:
+        answer = msgspec.json.decode(payload[:REQUEST_BYTES], type=dict[str, str])
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return Unreachable(key, payload[:200].decode(errors="replace"))
+    if "refused" in answer:
+        holder = HOLDER.fullmatch(answer.get("holder", ""))
+        if holder is None:
+            return Refused(answer["refused"][:REASON_CHARACTERS])
+        return HeldByAnother(answer["refused"][:REASON_CHARACTERS], (int(holder[1]), int(holder[2])))
+    return Unreachable(key, answer.get("failed", "unknown failure")[:REASON_CHARACTERS])
