@@ -18,6 +18,7 @@ from contextlib import suppress
 from typing import Any
 
 from bridge.headset import frames
+from macs_zenoh.protocol.decoders import FrameDecoder, MessageDecoder
 from macs_zenoh.protocol.messages import (
     ROS,
     Configuration,
@@ -28,7 +29,7 @@ from macs_zenoh.protocol.messages import (
     encode_data,
     encode_management,
 )
-from macs_zenoh.protocol.wire import MACS, FrameDecoder, MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, split_message
 
 from . import sequence
 from .worker import serve

@@ -18,8 +18,9 @@ from typing import Any
 
 from bridge.headset import frames
 from bridge.headset.frames import NodeSpec
+from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.messages import NodeType
-from macs_zenoh.protocol.wire import MessageDecoder, split_message
+from macs_zenoh.protocol.wire import split_message
 
 from .headset import RECEIVE_BYTES, Headset
 from .worker import serve

@@ -17,6 +17,7 @@ from typing import Protocol, cast
 
 from macs_zenoh.protocol.addresses import joined, of_peer
 from macs_zenoh.protocol.budget import Toll
+from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.existing import Asked, Verdict, to_headset, to_newer, to_robot
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.protocol.limits import REQUESTS_PER_S, UNFINISHED_FREE_BYTES
@@ -25,7 +26,7 @@ from macs_zenoh.protocol.outbox import Chunk, Outbox
 from macs_zenoh.protocol.rate_limit import Pace
 from macs_zenoh.protocol.robot_nodes import RobotNodes
 from macs_zenoh.protocol.tcp_agent import Event, Joined, Left, Rejected, Sent, State, TcpAgent
-from macs_zenoh.protocol.wire import FrameDecoder, Header, encode_message
+from macs_zenoh.protocol.wire import Header, encode_message
 
 from .backpressure import Backpressure
 from .memory import Memory

@@ -22,7 +22,7 @@ from macs_zenoh.protocol.least_bytes import TEXT_TYPE, is_whole
 from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, decode_management
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.routing import takes_group_copy
-from macs_zenoh.protocol.wire import Buffer, Frame, Layout, is_probe, parse_frame, parse_frames
+from macs_zenoh.protocol.wire import Buffer, Frame, Frames, Layout, is_probe, parse_frame, parse_runs
 
 from .afar import Afar
 from .agents import Agents
@@ -165,7 +165,7 @@ class Delivery:
             may_hold: bool | None = None
             for frame, metadata in self._read(key, payload, stream.robot):
                 registered = stream.registrants if stream.carries(metadata) else NOBODY
-                fits = frame.carries(CDR, least_bytes(metadata)) and is_whole(frame.body, metadata.data_exchange_type)
+                fits = isinstance(frame, Frame) and _fits(frame, metadata)  # a run lists no registrants
                 messages = frame.messages
                 for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
                     connection = self._agents.find(*registrant)
@@ -251,7 +251,7 @@ class Delivery:
         self._circles.clear()
         self._group_takers.clear()
 
-    def _send_each(self, connections: list[Connection], frame: Frame, metadata: Metadata) -> None:
+    def _send_each(self, connections: list[Connection], frame: Frames, metadata: Metadata) -> None:
         """The same frame to several."""
         messages = frame.messages
         size = sum(map(len, messages))
@@ -264,7 +264,7 @@ class Delivery:
             else:
                 self._send_judged(connection, frame, metadata, verdict, by_id=False)
 
-    def _send(self, connection: Connection, frame: Frame, metadata: Metadata, *, by_id: bool = False) -> None:
+    def _send(self, connection: Connection, frame: Frames, metadata: Metadata, *, by_id: bool = False) -> None:
         verdict = connection.verdict(metadata)
         if verdict is PASS or verdict is PASS_ONCE:
             self._gather_calls(connection, frame.messages)
@@ -287,21 +287,22 @@ class Delivery:
             self._gather_calls(connection, messages)
 
     def _send_judged(
-        self, connection: Connection, frame: Frame, metadata: Metadata, verdict: Verdict, *, by_id: bool
+        self, connection: Connection, frame: Frames, metadata: Metadata, verdict: Verdict, *, by_id: bool
     ) -> None:
         """What does not simply pass."""
         if verdict.name:
             self._refuse(connection, frame, metadata, verdict, by_id=by_id)
         elif verdict.answers:
             connection.asked.answered(metadata)
-            if connection.existing and not metadata.request_id and refuses(frame):
+            first = frame.each()[0]
+            if connection.existing and not metadata.request_id and refuses(first):
                 return  # what is not meant as a question has number 0 as well, and then the next question may have it
-            self._send_fitting(connection, next(iter(frame.each())), metadata, verdict.data)
+            self._send_fitting(connection, first, metadata, verdict.data)
         else:
             self._send_fitting(connection, frame, metadata, verdict.data)
 
     def _refuse(
-        self, connection: Connection, frame: Frame, metadata: Metadata, verdict: Verdict, *, by_id: bool
+        self, connection: Connection, frame: Frames, metadata: Metadata, verdict: Verdict, *, by_id: bool
     ) -> None:
         if connection.existing and connection.peer.agent_type == ROS:
             singles = frame.each() if metadata.message_manager else ()  # each question of a run is answered
@@ -313,7 +314,7 @@ class Delivery:
     def _send_fitting(
         self,
         connection: Connection,
-        frame: Frame,
+        frame: Frames,
         metadata: Metadata,
         data: Data,
         stream: str | None = None,
@@ -332,7 +333,7 @@ class Delivery:
         else:
             self._gather_stream(connection, stream, messages, keep=keep)
 
-    def _unregistered(self, connection: Connection, frame: Frame, metadata: Metadata) -> None:
+    def _unregistered(self, connection: Connection, frame: Frames, metadata: Metadata) -> None:
         """Topic data for who did not register it there: a forged list; or it is older than the agent, which has
         another's id."""
         verdict = connection.verdict(metadata)
@@ -380,7 +381,7 @@ class Delivery:
         circle = self._circles[key] = sender, connections
         return circle
 
-    def _takers(self, key: str, frame: Frame, circle: Circle) -> list[Connection]:
+    def _takers(self, key: str, frame: Frames, circle: Circle) -> list[Connection]:
         """Those members of a group who keep this copy of a frame."""
         to = key, frame.destination
         takers = self._group_takers.get(to)
@@ -424,7 +425,7 @@ class Delivery:
                 return False
         return True
 
-    def _read_registrants(self, key: str, frame: Frame) -> list[AgentKey]:
+    def _read_registrants(self, key: str, frame: Frames) -> list[AgentKey]:
         """Each registrant, once. The list changes only with registrations, so each is read once."""
         try:
             management = decode_management(frame.management)
@@ -444,7 +445,7 @@ class Delivery:
         if (known := self._judged.take(payload)) is not None:
             return known
         try:
-            frames = parse_frames(payload, self._layout, runs=True)
+            frames = parse_runs(payload, self._layout)
         except WireError as error:
             self._bad(key, error)
             return []
@@ -455,7 +456,7 @@ class Delivery:
             judging = self._judges[sender] = Judge(*sender, limit=KNOWN_EACH)
         return [judged for frame in frames if (judged := self._judge(key, frame, judging)) is not None]
 
-    def _judge(self, key: str, frame: Frame, judging: Judge) -> tuple[Frame, Metadata] | None:
+    def _judge(self, key: str, frame: Frames, judging: Judge) -> tuple[Frames, Metadata] | None:
         """A frame with its true sender, and its metadata."""
         raw = frame.metadata
         try:
@@ -482,6 +483,10 @@ class Delivery:
         self.drops["bad_frame"] += 1
         if self.drops["bad_frame"] == 1:
             log.warning("a frame on %s cannot be used: %s (logged once, counted as bad_frame)", key, error)
+
+
+def _fits(frame: Frame, metadata: Metadata) -> bool:
+    return frame.carries(CDR, least_bytes(metadata)) and is_whole(frame.body, metadata.data_exchange_type)
 
 
 def _who(metadata: Metadata) -> str:

@@ -195,7 +195,7 @@ class Forwarding:
         if passing is Passing.FLOODED:
             connection.complain("flooded", "it sends robots more than one agent may", count)
             return False
-        *_, newest = sent.frame.each()
+        newest = sent.frame.each()[-1]
         held = (sent.frame.destination, metadata.node_name)
         older = count - 1 + (self._waited.pop(held, None) is not None)
         self._waited[held] = (route, Sent(newest, metadata))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from macs_zenoh.mesh import Payload
 from macs_zenoh.protocol.messages import Metadata
-from macs_zenoh.protocol.wire import Frame
+from macs_zenoh.protocol.wire import Frames
 
-Read = list[tuple[Frame, Metadata]]
+Read = list[tuple[Frames, Metadata]]
 """The frames of a sample, each with its metadata."""
 
 

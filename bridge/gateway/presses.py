@@ -20,7 +20,7 @@ from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.guard import presses
 from macs_zenoh.protocol.messages import BROADCAST, ROS, Metadata, node_name
 from macs_zenoh.protocol.routing import call
-from macs_zenoh.protocol.wire import Frame, Header, Layout
+from macs_zenoh.protocol.wire import Frames, Header, Layout
 
 STOP_NAME = node_name(RobotSettings().stop_topic)
 ANSWER_S = 2.0
@@ -40,7 +40,7 @@ class Presses:
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
         self._open: dict[tuple[Agent, int], asyncio.Task[None]] = {}
 
-    def look(self, sender: Agent, frame: Frame, metadata: Metadata) -> None:
+    def look(self, sender: Agent, frame: Frames, metadata: Metadata) -> None:
         """A command that may be a stop is on its way to robots."""
         if metadata.node_name != STOP_NAME or not any(presses(bytes(single.body[:5])) for single in frame.each()):
             return

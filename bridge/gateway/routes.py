@@ -11,7 +11,7 @@ from macs_zenoh.protocol.messages import BROADCAST as EVERYBODY
 from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.routing import keys_of
-from macs_zenoh.protocol.wire import Frame, Header
+from macs_zenoh.protocol.wire import Frames, Header
 
 KNOWN_ROUTES = 4096
 
@@ -54,7 +54,7 @@ class Routes:
         """The route of frames with this `Frame.destination`, if it was worked out before."""
         return self._known.get(destination)
 
-    def work_out(self, frame: Frame, sender: AgentKey, now: float) -> Route:
+    def work_out(self, frame: Frames, sender: AgentKey, now: float) -> Route:
         """The route of a frame."""
         header, left_out = self._without_strangers(frame.header, now)
         keys = keys_of(header, *sender)

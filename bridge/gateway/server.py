@@ -24,6 +24,7 @@ from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.addresses import joined
 from macs_zenoh.protocol.budget import Budget
 from macs_zenoh.protocol.credit import Credits
+from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.directory import Change
 from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM, UNICAST
 from macs_zenoh.protocol.limits import (
@@ -59,7 +60,7 @@ from macs_zenoh.protocol.tcp_agent import (
     Streamed,
     TcpAgent,
 )
-from macs_zenoh.protocol.wire import FrameDecoder, Layout, encode_message
+from macs_zenoh.protocol.wire import Layout, encode_message
 from macs_zenoh.registration_calls import RobotCalls, StreamChanges
 from macs_zenoh.timeouts import within
 

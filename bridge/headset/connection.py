@@ -11,7 +11,7 @@ from collections import deque
 from macs_zenoh.errors import Unreachable
 from macs_zenoh.protocol import greetings
 from macs_zenoh.protocol.addresses import joined
-from macs_zenoh.protocol.wire import MessageDecoder
+from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.timeouts import within
 
 log = logging.getLogger("macs.headset")

@@ -7,8 +7,8 @@ Zenoh calls back in its own threads, instead of through a queue and a thread of 
 switch less is what a single message feels, and one queue of ours keeps the order between subscriptions.
 
 `session` is the mesh; `outgoing` what is put, `arrivals` what comes, `calls` what is asked and served, `reliable` what
-is asked for again; `declared` the words that all of them use, `zenoh_config` Zenoh's configuration, `threads` how Zenoh
-and Python share a processor.
+is asked for again; `declared` the words that all of them use, `zenoh_config` Zenoh's configuration, `threads` how
+Zenoh and Python share a processor.
 """
 
 from .arrivals import now_s

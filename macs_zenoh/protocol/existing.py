@@ -41,7 +41,7 @@ from .messages import (
     Welcome,
     is_json_object,
 )
-from .wire import Buffer, Frame, Header, encode_message
+from .wire import Buffer, Frame, Frames, Header, encode_message
 
 CDR = b"\x00\x01\x00\x00"
 """How ROS 2 data begins. A message without fields is this and nothing more as Unity writes it, and longer by a byte as
@@ -317,7 +317,7 @@ def least_bytes(metadata: Metadata) -> int:
     return ANSWERS.get(metadata.data_exchange_type, 0) if answers else 0
 
 
-def fitting(frame: Frame, data: Data, metadata: Metadata) -> tuple[Sequence[Buffer], int]:
+def fitting(frame: Frames, data: Data, metadata: Metadata) -> tuple[Sequence[Buffer], int]:
     """The messages of a frame, or of a run, whose data is as it must be; and how many are not."""
     good: list[Buffer] = []
     for single in frame.each():

@@ -23,6 +23,7 @@ from msgspec import Struct, structs
 from ..errors import BadField, BadJson, NotAllowed, TooFast, UnknownManager, WireError
 from . import greetings
 from .credit import Credit
+from .decoders import FrameDecoder
 from .judging import Judge
 from .limits import (
     CONFIGURATION_BYTES,
@@ -55,7 +56,7 @@ from .messages import (
     decode_management,
     encode_data,
 )
-from .wire import MACS, MAX_FRAME_BYTES, Frame, FrameDecoder, Layout, encode_message
+from .wire import MACS, MAX_FRAME_BYTES, Frame, Frames, Layout, encode_message
 
 
 class State(Enum):
@@ -96,12 +97,12 @@ class Joined(NamedTuple):
 
 
 class Sent:
-    """A frame for other agents, or a run of them. Its sizes add up and its sender is true. ``readable``: existing
-    programs find in its metadata what we find."""
+    """A frame for other agents, or a run of them. Its sender is true. ``readable``: existing programs find in its
+    metadata what we find."""
 
     __slots__ = ("frame", "metadata", "readable")
 
-    def __init__(self, frame: Frame, metadata: Metadata, readable: bool = False) -> None:
+    def __init__(self, frame: Frames, metadata: Metadata, readable: bool = False) -> None:
         self.frame = frame
         self.metadata = metadata
         self.readable = readable
@@ -110,7 +111,7 @@ class Sent:
 class Streamed(NamedTuple):
     """Topic data of a robot, for the registrants in ``targets``: (type, id) each."""
 
-    frame: Frame
+    frame: Frames
     metadata: Metadata
     readable: bool
     targets: list[tuple[int, int]]
@@ -203,7 +204,7 @@ class TcpAgent:
         self.credit = credit or Credit(limits.frames_per_s, now)
         self._layout = layout
         self._decoder = FrameDecoder(limits.max_frame_bytes, layout, scratch)
-        self._held: deque[Frame] = deque()
+        self._held: deque[Frames] = deque()
         self._held_bytes = 0
         self._connected_at = now
         self._heard_at = now
@@ -249,8 +250,10 @@ class TcpAgent:
         events: list[Event] = []
         decoder, limited = self._decoder, self._limits.frames_per_s
         for frame in decoder.advance(size):
+            if isinstance(frame, WireError):
+                self._reject(frame, 1, events)
+                continue
             try:
-                frame.check()
                 if limited and not self._covered(frame, now):
                     self._too_fast(frame, events)
                 elif self.state is ONLINE and not frame.has_management:
@@ -262,10 +265,6 @@ class TcpAgent:
                 self._reject(error, frame.count, events)
             if self._gone():
                 return events
-        if decoder.refused:
-            for refused in decoder.refused:
-                self._reject(refused, 1, events)
-            decoder.refused.clear()
         begun, self.partial_bytes = decoder.begun, decoder.partial_bytes
         if not begun:
             self._partial_since = None
@@ -335,13 +334,13 @@ class TcpAgent:
         error.__traceback__ = error.__cause__ = error.__context__ = None
         events.append(Rejected(error))
 
-    def _covered(self, frame: Frame, now: float) -> bool:
+    def _covered(self, frame: Frames, now: float) -> bool:
         """Whether the rate limit lets a frame pass: every one counts but the one that configures the agent."""
         if self.state is GREETED and frame.has_management and isinstance(self._management(frame), Configuration):
             return True
         return self.credit.take(frame.count, now)
 
-    def _too_fast(self, frame: Frame, events: list[Event]) -> None:
+    def _too_fast(self, frame: Frames, events: list[Event]) -> None:
         """A frame beyond the rate limit is dropped, but who leaves may say so. A registration is answered, which a
         topic's data cannot be."""
         error = TooFast(self._limits.frames_per_s)
@@ -355,7 +354,7 @@ class TcpAgent:
                     events.append(_refusal(management, error))
         raise error
 
-    def _management(self, frame: Frame) -> Management | Custom:
+    def _management(self, frame: Frames) -> Management | Custom:
         raw = frame.management
         topic = self._topics.get(raw)
         if topic is not None:
@@ -377,8 +376,8 @@ class TcpAgent:
                 events.append(_refusal(None, error))
             raise
 
-    def _frame(self, frame: Frame, events: list[Event]) -> None:
-        if frame.has_management:
+    def _frame(self, frame: Frames, events: list[Event]) -> None:
+        if isinstance(frame, Frame) and frame.has_management:
             management = self._read_management(frame, events)
             if isinstance(management, Configuration):
                 self._configure(management, events)
@@ -401,7 +400,7 @@ class TcpAgent:
             return
         self._hold(frame)
 
-    def _hold(self, frame: Frame) -> None:
+    def _hold(self, frame: Frames) -> None:
         if len(self._held) >= self._limits.held_frames or self._held_bytes + len(frame.data) > self._limits.held_bytes:
             self.drops["before_configuration"] += frame.count
             return
@@ -478,7 +477,7 @@ class TcpAgent:
         sent = self._sent(frame)
         return Streamed(sent.frame, sent.metadata, sent.readable, stream.targets())
 
-    def _sent(self, frame: Frame) -> Sent:
+    def _sent(self, frame: Frames) -> Sent:
         raw = frame.metadata
         if not raw:
             raise BadField("metadata", "a message for other agents needs metadata")

@@ -18,12 +18,12 @@ with T = 8 + S + D. All integers are unsigned, little-endian, unaligned.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ..errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations
-from .limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, RUN_BYTES, SAMPLE_BYTES
+from ..errors import BadSizes, OutOfRange, TooLong, TooManyDestinations
+from .limits import MANAGEMENT_BYTES, METADATA_BYTES, SAMPLE_BYTES
 
 MAX_FRAME_BYTES = 32 << 20
 """Default limit of a whole frame; camera frames of 20 MiB pass."""
@@ -37,9 +37,9 @@ EMPTY_MESSAGE = bytes(MESSAGE_OVERHEAD)
 COPY_BYTES = 4096
 """Below this, copying a part of a frame costs less than making a view of it."""
 
-_U32 = struct.Struct("<I")
-_SIZES = struct.Struct("<II")
-_U32_MAX = 0xFFFFFFFF
+U32 = struct.Struct("<I")
+SIZES = struct.Struct("<II")
+U32_MAX = 0xFFFFFFFF
 
 Buffer = bytes | bytearray | memoryview
 
@@ -72,7 +72,7 @@ class Layout:
         packed = struct.Struct(f"<B{self.id_slots}H{self.group_slots}BII")
         object.__setattr__(self, "_struct", packed)
         object.__setattr__(self, "header_bytes", packed.size)
-        object.__setattr__(self, "destination_bytes", packed.size - _SIZES.size)
+        object.__setattr__(self, "destination_bytes", packed.size - SIZES.size)
 
     def pack(
         self,
@@ -89,8 +89,8 @@ class Layout:
         """
         self._check(agent_type, ids, groups)
         for name, size in (("management_bytes", management_bytes), ("message_bytes", message_bytes)):
-            if not 0 <= size <= _U32_MAX:
-                raise OutOfRange(name, size, 0, _U32_MAX)
+            if not 0 <= size <= U32_MAX:
+                raise OutOfRange(name, size, 0, U32_MAX)
         id_padding = (0,) * (self.id_slots - len(ids))
         group_padding = (0,) * (self.group_slots - len(groups))
         return self._struct.pack(
@@ -135,29 +135,18 @@ PROBE = b"macs_check"
 and whoever gets it passes it to nobody."""
 
 
-class Frame:
-    """One whole frame, decoded only as far as asked; or a *run* of frames that have everything but their data in
-    common, which is how a burst of one topic's messages looks, and which costs little more than one frame.
+class _Alike:
+    """What is the same in all frames of a run, and what a single frame says of it: all before the data."""
 
-    ``data`` is the bytes as they came; nothing here copies them except `management`, `metadata`, `destination` and
-    small messages. What concerns the message is valid after `check`.
-    """
+    __slots__ = ("_body_at", "_message_at", "data", "layout")
 
-    __slots__ = ("_body_at", "_message_at", "_size", "data", "layout")
-
-    def __init__(self, data: bytes | bytearray, layout: Layout, message_at: int, size: int) -> None:
-        """``message_at`` is where the message starts: header and management data end there. ``size`` is that of one
-        frame; ``data`` is as long, or a multiple of it for a run."""
+    def __init__(self, data: bytes | bytearray, layout: Layout, message_at: int, body_at: int) -> None:
+        """``message_at`` and ``body_at`` are where message and data begin in a (or the first) frame. Only who has
+        checked all sizes can know them: `parse_frame`, `parse_frames`, `parse_runs` and `FrameDecoder`."""
         self.data = data
         self.layout = layout
         self._message_at = message_at
-        self._body_at = 0
-        self._size = size
-
-    @property
-    def count(self) -> int:
-        """How many frames this is."""
-        return len(self.data) // self._size
+        self._body_at = body_at
 
     @property
     def header(self) -> Header:
@@ -168,6 +157,24 @@ class Frame:
     def destination(self) -> bytes:
         """The header without its sizes: equal for frames that go the same way, so it can key a table."""
         return bytes(self.data[: self.layout.destination_bytes])
+
+    @property
+    def metadata(self) -> bytes:
+        """The metadata JSON of the message."""
+        return bytes(self.data[self._message_at + 4 : self._body_at - 4])
+
+
+class Frame(_Alike):
+    """One whole frame whose sizes add up, decoded only as far as asked.
+
+    ``data`` is the bytes as they came; nothing here copies them except `management`, `metadata`, `destination` and
+    small messages.
+    """
+
+    __slots__ = ()
+
+    count = 1
+    """How many frames this is, as of a `Run`."""
 
     @property
     def has_management(self) -> bool:
@@ -181,24 +188,16 @@ class Frame:
 
     @property
     def message(self) -> bytes | memoryview:
-        """The message part, of the first frame: what a TCP agent receives. A copy when that is cheaper than a view."""
+        """The message part: what a TCP agent receives. A copy when that is cheaper than a view."""
         data = self.data
-        if self._size <= COPY_BYTES and type(data) is bytes:
-            return data[self._message_at : self._size]
-        return memoryview(data)[self._message_at : self._size]
+        if type(data) is bytes and len(data) <= COPY_BYTES:
+            return data[self._message_at :]
+        return memoryview(data)[self._message_at :]
 
     @property
     def messages(self) -> Sequence[Buffer]:
-        """The message of each frame, in order."""
-        data, size, at = self.data, self._size, self._message_at
-        if len(data) == size:
-            return [self.message]
-        return [data[start + at : start + size] for start in range(0, len(data), size)]
-
-    @property
-    def metadata(self) -> bytes:
-        """The metadata JSON of the message."""
-        return bytes(self.data[self._message_at + 4 : self._body_at - 4])
+        """The message alone, as of a `Run`."""
+        return (self.message,)
 
     @property
     def beginning(self) -> bytes:
@@ -207,57 +206,78 @@ class Frame:
 
     @property
     def message_at(self) -> int:
-        """Where the message begins, in a frame by itself."""
+        """Where the message begins."""
         return self._message_at
 
     @property
     def body(self) -> memoryview:
-        """The data part of the message, of the first frame."""
-        return memoryview(self.data)[self._body_at : self._size]
+        """The data part of the message."""
+        return memoryview(self.data)[self._body_at :]
 
     def carries(self, beginning: bytes, least: int = 0) -> bool:
-        """Whether the data of each frame begins like this and goes on, and is of at least so many bytes."""
-        data, size, at = self.data, self._size, self._body_at
-        if size - at <= len(beginning) or size - at < least:
-            return False
-        if len(data) == size:
-            return data.startswith(beginning, at)
-        return all(data.startswith(beginning, start + at) for start in range(0, len(data), size))
+        """Whether the data begins like this and goes on, and is of at least so many bytes."""
+        size, at = len(self.data), self._body_at
+        return size - at > len(beginning) and size - at >= least and self.data.startswith(beginning, at)
 
-    def check(self) -> None:
-        """Raise BadSizes unless the sizes inside the message add up, TooLong when its metadata is more than any needs.
-        A frame that fails must never be forwarded."""
-        self._body_at = _body_at(self.data, self._message_at, self._size)
-
-    def each(self) -> Iterator[Frame]:
-        """The single frames of a run, checked like it."""
-        if len(self.data) == self._size:
-            yield self
-            return
-        for start in range(0, len(self.data), self._size):
-            yield self.with_data_of(self.data[start : start + self._size])
-
-    def with_data_of(self, data: bytes | bytearray) -> Frame:
-        """A frame that is as long and has the same `beginning`; checked like this one."""
-        frame = Frame(data, self.layout, self._message_at, self._size)
-        frame._body_at = self._body_at
-        return frame
+    def each(self) -> Sequence[Frame]:
+        """The frame itself, as of a `Run`."""
+        return (self,)
 
     def with_metadata(self, metadata: bytes) -> Frame:
-        """The same, checked, with other metadata in each message."""
-        header, management = self.header, self.management
-        data = b"".join(
+        """The same with other metadata. Raises TooLong."""
+        header = self.header
+        return parse_frame(
             encode_frame(
                 header.agent_type,
                 header.ids,
                 header.groups,
-                management=management,
-                message=encode_message(metadata, single.body),
+                management=self.management,
+                message=encode_message(metadata, self.body),
                 layout=self.layout,
-            )
-            for single in self.each()
+            ),
+            self.layout,
         )
-        return parse_frames(data, self.layout, runs=True)[0]
+
+
+class Run(_Alike):
+    """Frames one after the other that have everything but their data in common, which is how a burst of one topic's
+    messages looks, and which cost little more than one frame. They have no management data.
+
+    ``data`` is the bytes of all of them.
+    """
+
+    __slots__ = ("_size", "count")
+
+    has_management = False
+    management = b""
+
+    def __init__(self, data: bytes | bytearray, layout: Layout, message_at: int, body_at: int, size: int) -> None:
+        """``size`` is that of each frame."""
+        super().__init__(data, layout, message_at, body_at)
+        self._size = size
+        self.count = len(data) // size
+        """How many frames there are."""
+
+    @property
+    def messages(self) -> Sequence[Buffer]:
+        """The message of each frame, in order."""
+        data, size, at = self.data, self._size, self._message_at
+        return [data[start + at : start + size] for start in range(0, len(data), size)]
+
+    def each(self) -> Sequence[Frame]:
+        """The frames, in order."""
+        data, size = self.data, self._size
+        layout, message_at, body_at = self.layout, self._message_at, self._body_at
+        return [Frame(data[start : start + size], layout, message_at, body_at) for start in range(0, len(data), size)]
+
+    def with_metadata(self, metadata: bytes) -> Frame | Run:
+        """The same with other metadata in each. Raises TooLong."""
+        (changed,) = parse_runs(b"".join([frame.with_metadata(metadata).data for frame in self.each()]), self.layout)
+        return changed
+
+
+Frames = Frame | Run
+"""One frame, or several that begin alike."""
 
 
 def is_probe(data: Buffer, layout: Layout = MACS) -> bool:
@@ -269,25 +289,32 @@ def parse_frame(data: bytes | bytearray, layout: Layout = MACS) -> Frame:
     """Take ``data`` as exactly one frame, check all of its sizes and return it. Raises BadSizes, TooLong."""
     if len(data) < layout.header_bytes:
         raise BadSizes("header", layout.header_bytes, len(data))
-    management_bytes, message_bytes = _SIZES.unpack_from(data, layout.destination_bytes)
-    declared = layout.header_bytes + management_bytes + message_bytes
+    management_bytes, message_bytes = SIZES.unpack_from(data, layout.destination_bytes)
+    message_at = layout.header_bytes + management_bytes
+    declared = message_at + message_bytes
     if declared != len(data):
         raise BadSizes("frame", declared, len(data))
     if management_bytes > MANAGEMENT_BYTES:
         raise TooLong("management data", management_bytes, MANAGEMENT_BYTES)
-    frame = Frame(data, layout, layout.header_bytes + management_bytes, declared)
-    frame.check()
-    return frame
+    return Frame(data, layout, message_at, data_at(data, message_at, declared))
 
 
-def parse_frames(data: bytes | bytearray, layout: Layout = MACS, *, runs: bool = False) -> list[Frame]:
-    """Take ``data`` as one or more whole frames back to back, check all of their sizes and return them, with ``runs``
-    those that begin alike as one.
+def parse_frames(data: bytes | bytearray, layout: Layout = MACS) -> list[Frame]:
+    """Take ``data`` as one or more whole frames back to back, check all of their sizes and return them.
 
     That is what a sample on the mesh carries: frames that one sender sent the same way at once. A probe (`PROBE`)
     carries none. Raises BadSizes, TooLong.
     """
-    frames: list[Frame] = []
+    return _parse(data, layout, alike=False)
+
+
+def parse_runs(data: bytes | bytearray, layout: Layout = MACS) -> list[Frames]:
+    """The frames of a sample as `parse_frames`, those that begin alike as one run. Raises BadSizes, TooLong."""
+    return _parse(data, layout, alike=True)
+
+
+def _parse(data: bytes | bytearray, layout: Layout, *, alike: bool) -> list[Any]:
+    frames: list[Frames] = []
     start, end = 0, len(data)
     header_bytes, sizes_at = layout.header_bytes, layout.destination_bytes
     while True:
@@ -295,7 +322,7 @@ def parse_frames(data: bytes | bytearray, layout: Layout = MACS, *, runs: bool =
             if start == 0 and is_probe(data, layout):
                 return frames
             raise BadSizes("header", header_bytes, end - start)
-        management_bytes, message_bytes = _SIZES.unpack_from(data, start + sizes_at)
+        management_bytes, message_bytes = SIZES.unpack_from(data, start + sizes_at)
         message_at = header_bytes + management_bytes
         size = message_at + message_bytes
         stop = start + size
@@ -305,30 +332,30 @@ def parse_frames(data: bytes | bytearray, layout: Layout = MACS, *, runs: bool =
             raise TooLong("management data", management_bytes, MANAGEMENT_BYTES)
         if stop != end > SAMPLE_BYTES:
             raise TooLong("a sample of several frames", end, SAMPLE_BYTES)
-        if runs and stop != end and not management_bytes:
-            stop = _run_end(data, start, message_at, size, end)
-        frame = Frame(data[start:stop] if start or stop != end else data, layout, message_at, size)
-        frame.check()
-        frames.append(frame)
+        body_at = data_at(data, start + message_at, stop)
+        if alike and stop != end and not management_bytes:
+            stop = run_end(data, start, body_at, size, end)
+        piece = data[start:stop] if start or stop != end else data
+        frames.append(frames_of(piece, layout, message_at, body_at - start, size))
         if stop == end:
             return frames
         start = stop
 
 
-def _run_end(data: bytes | bytearray, start: int, message_at: int, size: int, end: int) -> int:
-    """Where the frames end that have header, metadata and all sizes of the frame at ``start`` in common."""
-    head_bytes = message_at + MESSAGE_OVERHEAD
-    if size < head_bytes:
-        return start + size
-    metadata_bytes = _U32.unpack_from(data, start + message_at)[0]
-    head_bytes += metadata_bytes
-    if head_bytes > size or metadata_bytes > METADATA_BYTES:
-        return start + size  # it will be refused
-    head = data[start : start + head_bytes]
+def run_end(data: bytes | bytearray, start: int, body_at: int, size: int, end: int) -> int:
+    """Where the frames end that begin like the one at ``start``, up to its data at ``body_at``."""
+    beginning = data[start:body_at]
     at = start + size
-    while at + size <= end and data.startswith(head, at):
+    while at + size <= end and data.startswith(beginning, at):
         at += size
     return at
+
+
+def frames_of(data: bytes | bytearray, layout: Layout, message_at: int, body_at: int, size: int) -> Frames:
+    """What is in ``data``, whose frames are of this size each."""
+    if len(data) == size:
+        return Frame(data, layout, message_at, body_at)
+    return Run(data, layout, message_at, body_at, size)
 
 
 def encode_frame(
@@ -347,22 +374,23 @@ def encode_frame(
 
 def encode_message(metadata: bytes, data: Buffer = b"") -> bytes:
     """Build a message from its metadata JSON and its data."""
-    return b"".join((_U32.pack(len(metadata)), metadata, _U32.pack(len(data)), data))
+    return b"".join((U32.pack(len(metadata)), metadata, U32.pack(len(data)), data))
 
 
 def split_message(message: Buffer, max_metadata_bytes: int = METADATA_BYTES) -> tuple[bytes, memoryview]:
     """Take a message apart into metadata JSON and data (a view into ``message``). Raises BadSizes, TooLong."""
-    at = _body_at(message, 0, len(message), max_metadata_bytes)
+    at = data_at(message, 0, len(message), max_metadata_bytes)
     view = memoryview(message)
     return bytes(view[4 : at - 4]), view[at:]
 
 
-def _body_at(buffer: Buffer, at: int, size: int, max_metadata_bytes: int = METADATA_BYTES) -> int:
-    """Where the data starts of the message from ``at`` to ``size``. Raises BadSizes, TooLong."""
+def data_at(buffer: Buffer, at: int, size: int, max_metadata_bytes: int = METADATA_BYTES) -> int:
+    """Where the data starts of the message from ``at`` to ``size``. Raises BadSizes when its sizes do not add up,
+    TooLong when its metadata is more than any needs: such a message must never be forwarded."""
     try:
-        metadata_bytes = _U32.unpack_from(buffer, at)[0]
+        metadata_bytes = U32.unpack_from(buffer, at)[0]
         body_at: int = at + MESSAGE_OVERHEAD + metadata_bytes
-        if body_at + _U32.unpack_from(buffer, body_at - 4)[0] == size:
+        if body_at + U32.unpack_from(buffer, body_at - 4)[0] == size:
             if metadata_bytes <= max_metadata_bytes:
                 return body_at
             raise TooLong("metadata", metadata_bytes, max_metadata_bytes)
@@ -373,242 +401,5 @@ def _body_at(buffer: Buffer, at: int, size: int, max_metadata_bytes: int = METAD
         raise BadSizes("message", MESSAGE_OVERHEAD, available + MESSAGE_OVERHEAD)
     if metadata_bytes > available:
         raise BadSizes("metadata", metadata_bytes, available)
-    data_bytes = _U32.unpack_from(buffer, body_at - 4)[0]
+    data_bytes = U32.unpack_from(buffer, body_at - 4)[0]
     raise BadSizes("data", data_bytes, available - metadata_bytes)
-
-
-class FrameDecoder:
-    """Cuts a byte stream, in whatever pieces it comes, into whole frames.
-
-    Two ways in: `feed` takes bytes; `space` and `advance` let a socket receive straight into the decoder, so a big
-    frame is copied nowhere. Declared sizes are judged before anything is reserved for them, and memory grows with
-    the bytes that really came, never with the bytes that were promised.
-
-    A frame above the limit finishes the decoder, because the next one cannot be found: the frames before it are
-    still returned, `error` is set, and whatever follows is ignored.
-
-    A frame whose management data or metadata alone is more than any needs is left out and not stored: its bytes are
-    skipped as they come. `refused` has why; who reads it empties it.
-    """
-
-    SPACE_BYTES = 256 << 10
-    """The most that is received at once."""
-    PARTIAL_BYTES = 64 << 10
-    """So much is reserved at once for a frame that has begun; then as much again as has come."""
-
-    def __init__(
-        self,
-        max_frame_bytes: int = MAX_FRAME_BYTES,
-        layout: Layout = MACS,
-        scratch: bytearray | None = None,
-        *,
-        runs: bool = False,
-    ) -> None:
-        """``scratch`` is where `space` receives small frames; decoders that are never filled at the same time
-        (connections of one event loop) may share one. ``runs`` gives frames that begin alike as one; it may be
-        changed at any time."""
-        self.max_frame_bytes = max_frame_bytes
-        self.layout = layout
-        self.error: FrameTooLarge | None = None
-        self.refused: list[TooLong] = []
-        self.runs = runs
-        self._received = scratch if scratch is not None else bytearray(self.SPACE_BYTES)
-        self._scratch = memoryview(self._received)
-        self._partial = bytearray()  # a frame that has begun; its length is what is reserved, not what has come
-        self._filled = 0
-        self._message_at = 0
-        self._wanted = 0  # size of the whole partial frame; 0 while its header is incomplete
-        self._judged = True  # whether the size of its metadata was looked at
-        self._skip = 0  # bytes of a refused frame that are still to come
-
-    @property
-    def begun(self) -> int:
-        """How much has come of a frame that has begun and is not whole; 0 when there is none."""
-        return self._filled or len(self._partial)
-
-    @property
-    def begun_header(self) -> bytes:
-        """What has come of a header that is not whole."""
-        return b"" if self._wanted else bytes(self._partial)
-
-    @property
-    def partial_bytes(self) -> int:
-        """How much memory a frame that has begun has."""
-        return len(self._partial)
-
-    def feed(self, data: bytes | bytearray | memoryview) -> list[Frame]:
-        """Take the next bytes of the stream and return the frames that are now whole."""
-        frames: list[Frame] = []
-        view = memoryview(data)
-        while len(view) and not self.error:
-            space = self.space()
-            size = min(len(space), len(view))
-            space[:size] = view[:size]
-            del space  # an exported view would keep the partial frame from growing
-            frames += self.advance(size)
-            view = view[size:]
-        return frames
-
-    def space(self) -> memoryview:
-        """Where the next bytes of the stream belong. Never empty; give it back before calling `advance`.
-
-        Never large either: an event loop may fill it many times before anything else gets its turn.
-        """
-        if not self._wanted:
-            return self._scratch[: self._skip] if self._skip else self._scratch
-        if self._filled == len(self._partial):
-            self._partial.extend(bytes(min(self._wanted, 2 * self._filled) - self._filled))
-        return memoryview(self._partial)[self._filled : self._filled + self.SPACE_BYTES]
-
-    def advance(self, size: int) -> list[Frame]:
-        """``size`` bytes were written to the start of `space`: return the frames that are now whole."""
-        if self.error:
-            return []
-        if self._wanted:
-            self._filled += size
-            if self._filled == self._wanted:
-                return [self._finish()]
-            if not self._judged:
-                self._judge(memoryview(self._partial)[: self._filled])
-            return []
-        if self._skip:
-            self._skip -= size
-            self._filled = self._filled + size if self._skip else 0
-            return []
-        if self._partial:  # of a header
-            begun = self._partial + self._scratch[:size]
-            self._partial = bytearray()
-            return self._cut(begun, len(begun))
-        return self._cut(self._received, size)
-
-    def _cut(self, data: bytearray, end: int) -> list[Frame]:
-        """Cut whole frames off ``data`` up to ``end`` and keep the rest as the beginning of the next one. What is kept
-        is copied, once."""
-        layout = self.layout
-        header_bytes = layout.header_bytes
-        sizes_at = layout.destination_bytes
-        frames: list[Frame] = []
-        view = memoryview(data)
-        start = 0
-        while end - start >= header_bytes:
-            management_bytes, message_bytes = _SIZES.unpack_from(data, start + sizes_at)
-            message_at = header_bytes + management_bytes
-            size = message_at + message_bytes
-            if size > self.max_frame_bytes:
-                self.error = FrameTooLarge(size, self.max_frame_bytes)
-                return frames
-            if management_bytes > CONFIGURATION_BYTES:
-                self._refuse(TooLong("management data", management_bytes, CONFIGURATION_BYTES), size, end - start)
-                start = min(start + size, end)
-                continue
-            stop = start + size
-            if stop > end:
-                self._begin(view[start:end], size, message_at)
-                return frames
-            if self.runs and stop != end and not management_bytes:
-                stop = _run_end(data, start, message_at, size, min(end, start + RUN_BYTES))
-            frames.append(Frame(bytes(view[start:stop]), layout, message_at, size))
-            start = stop
-        if start != end:
-            self._partial = bytearray(view[start:end])
-        return frames
-
-    def _begin(self, data: memoryview, wanted: int, message_at: int) -> None:
-        begun = len(data)
-        self._partial = bytearray(min(wanted, max(2 * begun, self.PARTIAL_BYTES)))
-        self._partial[:begun] = data
-        self._filled = begun
-        self._message_at = message_at
-        self._wanted = wanted
-        self._judged = False
-        self._judge(data)
-
-    def _judge(self, data: memoryview) -> None:
-        """Look at the size of the metadata of the partial frame as soon as it has come."""
-        at = self._message_at
-        if len(data) < at + 4:
-            return
-        self._judged = True
-        metadata_bytes = _U32.unpack_from(data, at)[0]
-        if METADATA_BYTES < metadata_bytes <= self._wanted - at - MESSAGE_OVERHEAD:  # else its sizes do not add up
-            self._refuse(TooLong("metadata", metadata_bytes, METADATA_BYTES), self._wanted, len(data))
-
-    def _refuse(self, error: TooLong, size: int, available: int) -> None:
-        """Let go of a frame of which so much is there."""
-        self.refused.append(error)
-        self._skip = max(0, size - available)
-        self._filled = available if self._skip else 0
-        self._wanted = 0
-        self._partial = bytearray()
-
-    def _finish(self) -> Frame:
-        frame = Frame(self._partial, self.layout, self._message_at, self._wanted)
-        self._partial = bytearray()
-        self._filled = self._wanted = 0
-        return frame
-
-
-class Skipped(NamedTuple):
-    """A message that was too large: its size, and its metadata."""
-
-    size: int
-    metadata: bytes
-
-
-class MessageDecoder:
-    """Cuts the stream that a TCP agent receives into whole messages (they have no header and no outer size).
-
-    With ``skip_large`` a message whose data is too large is let go of unread, for `skipped`; otherwise it is an error.
-    """
-
-    def __init__(self, max_message_bytes: int = MAX_FRAME_BYTES, *, skip_large: bool = False) -> None:
-        self.max_message_bytes = max_message_bytes
-        self.skipped: list[Skipped] = []
-        """Messages that were too large; whoever reads takes them out."""
-        self._skip_large = skip_large
-        self._skip_bytes = 0
-        self._buffer = bytearray()
-
-    def feed(self, data: Buffer) -> list[bytes]:
-        """Take the next bytes and return the messages that are now whole. Raises FrameTooLarge."""
-        if self._skip_bytes:
-            data = memoryview(data)
-            skipped = min(self._skip_bytes, len(data))
-            self._skip_bytes -= skipped
-            data = data[skipped:]
-        self._buffer += data
-        messages = []
-        start = 0
-        while (size := self._message_size(start)) is not None:
-            if size > self.max_message_bytes:
-                self.skipped.append(self._metadata_of(start, size))
-                self._skip_bytes = max(0, size - (len(self._buffer) - start))
-            elif len(self._buffer) - start >= size:
-                messages.append(bytes(memoryview(self._buffer)[start : start + size]))
-            else:
-                break
-            start = min(start + size, len(self._buffer))
-        del self._buffer[:start]
-        return messages
-
-    def _metadata_of(self, at: int, size: int) -> Skipped:
-        metadata_bytes: int = _U32.unpack_from(self._buffer, at)[0]
-        return Skipped(size, bytes(memoryview(self._buffer)[at + 4 : at + 4 + metadata_bytes]))
-
-    def _message_size(self, at: int) -> int | None:
-        """Size of the message at ``at``, None while that is not known yet."""
-        available = len(self._buffer) - at
-        if available < 4:
-            return None
-        metadata_bytes: int = _U32.unpack_from(self._buffer, at)[0]
-        self._judge(MESSAGE_OVERHEAD + metadata_bytes)
-        if available < MESSAGE_OVERHEAD + metadata_bytes:
-            return None
-        data_bytes: int = _U32.unpack_from(self._buffer, at + 4 + metadata_bytes)[0]
-        if not self._skip_large:
-            self._judge(MESSAGE_OVERHEAD + metadata_bytes + data_bytes)
-        return MESSAGE_OVERHEAD + metadata_bytes + data_bytes
-
-    def _judge(self, size: int) -> None:
-        if size > self.max_message_bytes:
-            raise FrameTooLarge(size, self.max_message_bytes)

@@ -18,9 +18,10 @@ from bridge.headset import frames
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol import ping
+from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.keyexpr import LEASE, PING
 from macs_zenoh.protocol.messages import ROS, UNITY, Configuration, Welcome, decode_data, encode_management
-from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, split_message
+from macs_zenoh.protocol.wire import encode_frame, split_message
 from tests.support.given import StartGateway
 from tests.support.programs import Program, free_port
 from tests.support.waiting import until

@@ -11,6 +11,7 @@ import pytest
 
 import macs_zenoh
 from bridge.headset.client import Headset
+from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.messages import (
     AddNode,
     Configuration,
@@ -21,7 +22,7 @@ from macs_zenoh.protocol.messages import (
     encode_data,
     encode_management,
 )
-from macs_zenoh.protocol.wire import MACS, MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, split_message
 from tests.integration.test_limits import answers, memory_bytes, site
 from tests.support.given import Connect, StartGateway
 from tests.support.waiting import until

@@ -19,11 +19,12 @@ from bridge.gateway.memory import Memory
 from bridge.headset import frames
 from bridge.headset.frames import NodeSpec
 from macs_zenoh import Agent, join
+from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.existing import CDR
 from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.protocol.outbox import Chunk, Outbox
 from macs_zenoh.protocol.tcp_agent import TcpAgent
-from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.protocol.wire import encode_frame, encode_message, split_message
 from macs_zenoh.streams import Streams
 from tests.support.given import StartGateway
 from tests.support.waiting import until

@@ -13,6 +13,7 @@ import pytest
 import macs_zenoh
 from bridge.gateway import Gateway
 from macs_zenoh.errors import ConfigError
+from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.messages import (
     AddNode,
     AgentsGone,
@@ -24,7 +25,7 @@ from macs_zenoh.protocol.messages import (
     decode_data,
     encode_management,
 )
-from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.protocol.wire import encode_frame, encode_message, split_message
 from macs_zenoh.streams import Streams
 from tests.support.given import Connect, StartGateway
 from tests.support.waiting import until

@@ -24,6 +24,7 @@ from bridge.settings import GatewaySettings
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.mesh import Mesh
+from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.existing import CDR
 from macs_zenoh.protocol.messages import (
@@ -42,7 +43,7 @@ from macs_zenoh.protocol.messages import (
     encode_management,
 )
 from macs_zenoh.protocol.registrations import AgentKey, Task
-from macs_zenoh.protocol.wire import Layout, MessageDecoder, encode_frame, encode_message, split_message
+from macs_zenoh.protocol.wire import Layout, encode_frame, encode_message, split_message
 from macs_zenoh.registration_calls import RobotCalls
 from macs_zenoh.sections import changed
 from macs_zenoh.streams import Streams

@@ -13,6 +13,7 @@ import macs_zenoh
 from bridge.gateway import Gateway
 from bridge.headset import frames
 from macs_zenoh.errors import HeldByAnother
+from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.limits import NAMED_EACH, NODE_AGENTS, NODES_EACH
 from macs_zenoh.protocol.messages import (
     ROS,
@@ -28,7 +29,7 @@ from macs_zenoh.protocol.messages import (
     decode_data,
     encode_management,
 )
-from macs_zenoh.protocol.wire import MessageDecoder, encode_frame, split_message
+from macs_zenoh.protocol.wire import encode_frame, split_message
 from tests.support.given import Connect, StartGateway
 from tests.support.waiting import until
 

@@ -8,8 +8,9 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
+from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.messages import Metadata
-from macs_zenoh.protocol.wire import Frame, FrameDecoder, encode_message
+from macs_zenoh.protocol.wire import Frame, encode_message
 
 VECTORS = Path(__file__).parents[1] / "vectors" / "headset"
 HEARTBEAT = b'{"messageManager":"HeartbeatHandler"}'

@@ -11,16 +11,9 @@ import pytest
 
 from macs_zenoh.errors import BadField, BadJson, BadSizes, UnknownManager, WireError
 from macs_zenoh.protocol import messages
+from macs_zenoh.protocol.decoders import FrameDecoder, MessageDecoder
 from macs_zenoh.protocol.messages import Management, Metadata, decode_data, decode_management, encode_management
-from macs_zenoh.protocol.wire import (
-    MACS,
-    FrameDecoder,
-    MessageDecoder,
-    encode_frame,
-    encode_message,
-    parse_frame,
-    split_message,
-)
+from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, parse_frame, split_message
 from tests.support.recordings import BY_NAME, RECORDINGS, Recording, cut_around, one_by_one, reading
 
 KINDS: dict[str, type[Management]] = {

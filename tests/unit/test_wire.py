@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from macs_zenoh.errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations
+from macs_zenoh.errors import BadSizes, FrameTooLarge, OutOfRange, TooLong, TooManyDestinations, WireError
+from macs_zenoh.protocol.decoders import FrameDecoder, MessageDecoder
 from macs_zenoh.protocol.limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, SAMPLE_BYTES
 from macs_zenoh.protocol.wire import (
     COPY_BYTES,
@@ -20,14 +21,14 @@ from macs_zenoh.protocol.wire import (
     MACS,
     PROBE,
     Frame,
-    FrameDecoder,
     Header,
     Layout,
-    MessageDecoder,
+    Run,
     encode_frame,
     encode_message,
     parse_frame,
     parse_frames,
+    parse_runs,
     split_message,
 )
 from tests.support.recordings import cut_around, one_by_one
@@ -108,15 +109,22 @@ def by_name(row: object) -> str:
     return str(getattr(row, "name", row))
 
 
-def shares(frame: Frame) -> tuple[Header, bytes, bytes, bytes]:
+def shares(frame: Frame | WireError) -> tuple[Header, bytes, bytes, bytes]:
     """The parts of a frame."""
-    frame.check()
+    assert isinstance(frame, Frame)
     return frame.header, frame.management, frame.metadata, bytes(frame.body)
 
 
 def stream(decoder: FrameDecoder, pieces: list[bytes]) -> list[bytes]:
     """The frames that a decoder cuts from a stream that comes in these pieces."""
-    return [bytes(frame.data) for piece in pieces for frame in decoder.feed(piece)]
+    cut = [frame for piece in pieces for frame in decoder.feed(piece)]
+    assert not [error for error in cut if isinstance(error, WireError)]
+    return [bytes(frame.data) for frame in cut]
+
+
+def bytes_of(one: Frame | WireError) -> bytes | None:
+    """What a decoder found; None for an error: of several that are wrong, pieces may show another first."""
+    return bytes(one.data) if isinstance(one, Frame) else None
 
 
 def peak_bytes(work: Callable[[], object]) -> int:
@@ -192,9 +200,8 @@ def test_a_message_that_lies_about_its_sizes_is_found_out(
             attempt()
         assert (raised.value.what, raised.value.declared, raised.value.available) == (what, declared, available)
     lying, good = FrameDecoder().feed(encode_frame(1, message=message) + encode_frame(2))
-    with pytest.raises(BadSizes):
-        lying.check()
-    good.check()
+    assert isinstance(lying, BadSizes)
+    assert (lying.what, lying.declared, lying.available) == (what, declared, available)
     assert good.header.agent_type == 2
 
 
@@ -266,25 +273,31 @@ def test_messages_may_be_fragmented(data: st.DataObject) -> None:
 
 @given(st.data())
 def test_any_bytes_give_frames_or_the_error(data: st.DataObject) -> None:
-    """Any bytes at all are cut into frames that add up to the stream until a declared size is above the limit; the
-    same frames in one piece and in many."""
+    """Any bytes at all are cut into frames, or errors in the place of those whose sizes do not add up, until a
+    declared size is above the limit; into the same in one piece and in many."""
     limit = data.draw(st.integers(0, 1 << 20))
     sizes = st.builds(struct.pack, st.just("<II"), st.integers(0, 70), st.integers(0, 70) | st.integers(0, 0xFFFFFFFF))
     header = st.builds(bytes.__add__, st.binary(min_size=31, max_size=31), sizes)
     raw = b"".join(data.draw(st.lists(header | st.binary(max_size=150), max_size=8)))
     whole, piecewise = FrameDecoder(limit), FrameDecoder(limit)
-    found = stream(whole, [raw])
-    assert stream(piecewise, data.draw(cuts(raw))) == found
-    assert raw.startswith(b"".join(found))
+    found = list(map(bytes_of, whole.feed(raw)))
+    again = [bytes_of(one) for piece in data.draw(cuts(raw)) for one in piecewise.feed(piece)]
+    assert again == found
     assert (whole.error is None) == (piecewise.error is None)
-    rest = raw[len(b"".join(found)) :]
+    rest = raw
+    for one in found:
+        size = 39 + sum(struct.unpack_from("<II", rest, 31))
+        if one is not None:
+            assert one == rest[:size]
+            shares(parse_frame(one))
+        else:
+            with pytest.raises(WireError):
+                parse_frame(rest[:size])
+        rest = rest[size:]
     if whole.error is None:
         assert len(rest) < 39 or 39 + sum(struct.unpack_from("<II", rest, 31)) > len(rest)
     else:
         assert 39 + sum(struct.unpack_from("<II", rest, 31)) == whole.error.size > limit
-    for one in found:
-        with suppress(BadSizes):
-            shares(parse_frame(one))
 
 
 @given(st.binary(max_size=200))
@@ -412,8 +425,10 @@ def test_what_is_too_long_to_parse_is_skipped_and_not_stored(frame: bytes, what:
     for start in range(0, len(whole), piece):
         found += decoder.feed(memoryview(whole)[start : start + piece])
         most = max(most, decoder.partial_bytes)
-    assert [bytes(one.data) for one in found if one.message_at < 200_000] == [GOOD, GOOD]
-    assert [error.what for error in decoder.refused] == [what]
+    first, error, last = found
+    assert (bytes(first.data), bytes(last.data)) == (GOOD, GOOD)
+    assert isinstance(error, TooLong)
+    assert error.what == what
     assert decoder.error is None
     assert (decoder.begun, decoder.partial_bytes) == (0, 0)
     assert most <= decoder.SPACE_BYTES
@@ -423,14 +438,14 @@ def test_whole_frames_are_judged_like_those_in_pieces() -> None:
     """Metadata of exactly the limit passes, a byte more is refused; in a sample management data as well."""
     for size, passes in ((METADATA_BYTES, True), (METADATA_BYTES + 1, False)):
         frame = encode_frame(2, [3], message=encode_message(b"x" * size, b"data"))
-        for read in (parse_frame, lambda data: parse_frames(data, runs=True)):
+        for read in (parse_frame, parse_frames, parse_runs):
             with nullcontext() if passes else pytest.raises(TooLong):
                 read(frame)
         with nullcontext() if passes else pytest.raises(TooLong):
             split_message(frame[39:])
     for size, passes in ((MANAGEMENT_BYTES, True), (MANAGEMENT_BYTES + 1, False)):
         frame = encode_frame(management=b"x" * size, message=encode_message(b"{}", b"data"))
-        for read in (parse_frame, lambda data: parse_frames(data, runs=True)):
+        for read in (parse_frame, parse_frames, parse_runs):
             with nullcontext() if passes else pytest.raises(TooLong):
                 read(frame)
 
@@ -465,7 +480,6 @@ def test_a_frame_keeps_its_bytes() -> None:
     kept = [frame for body in bodies for frame in decoder.feed(encode_frame(1, message=encode_message(b"", body)))]
     decoder.feed(b"\xff" * 39)
     for frame, body in zip(kept, bodies, strict=True):
-        frame.check()
         assert bytes(frame.body) == body
 
 
@@ -542,12 +556,12 @@ def test_a_run_is_its_frames() -> None:
     longer = encode_frame(2, (5,), message=encode_message(b'{"a":1}', bytes(10)))
     stream = b"".join([*alike, other, longer, *alike[:2]])
     frames = FrameDecoder(runs=True).feed(stream)
-    for frame in frames:
-        frame.check()
     assert [frame.count for frame in frames] == [5, 1, 1, 2]
     assert [bytes(frame.data) for run in frames for frame in run.each()] == [*alike, other, longer, *alike[:2]]
     assert [bytes(message) for message in frames[0].messages] == [frame[39:] for frame in alike]
-    assert [f.count for f in parse_frames(stream, runs=True)] == [5, 1, 1, 2]
+    assert list(map(type, frames)) == [Run, Frame, Frame, Run]
+    assert [f.count for f in parse_runs(stream)] == [5, 1, 1, 2]
+    assert [bytes(f.data) for f in parse_frames(stream)] == [*alike, other, longer, *alike[:2]]
     assert b"".join(bytes(f.data) for f in parse_frames(stream)) == stream
 
 
@@ -557,9 +571,7 @@ def test_a_run_never_swallows_a_bad_frame() -> None:
     at = 39 + 4 + 7
     bad = good[:at] + (8).to_bytes(4, "little") + good[at + 4 :]
     frames = FrameDecoder(runs=True).feed(good + bad + good)
-    assert [frame.count for frame in frames] == [1, 1, 1]
-    with pytest.raises(BadSizes):
-        frames[1].check()
+    assert list(map(type, frames)) == [Frame, BadSizes, Frame]
 
 
 def test_a_probe_carries_no_frame() -> None:
@@ -576,7 +588,7 @@ def test_several_frames_in_a_sample_are_bounded_together() -> None:
     """One frame may be as large as it likes, several only so large that they are handled in a moment."""
     small = encode_frame(2, (1,), message=encode_message(b"{}", bytes(100)))
     count = SAMPLE_BYTES // len(small)
-    assert sum(frame.count for frame in parse_frames(small * count, runs=True)) == count
+    assert sum(frame.count for frame in parse_runs(small * count)) == count
     for data in (small * (count + 1), encode_frame(message=encode_message(b"{}", bytes(SAMPLE_BYTES))) + small):
         with pytest.raises(TooLong):
             parse_frames(data)
