@@ -40,8 +40,8 @@ from macs_zenoh.errors import UsageError
 from macs_zenoh.versions import installed
 
 if TYPE_CHECKING:
-    from bridge.doctor.analyze import Finding
     from bridge.doctor.facts import Facts
+    from bridge.doctor.findings import Finding
 
 SUMMARY = "what is wrong with a mesh, and what to do"
 

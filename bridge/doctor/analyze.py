@@ -1,23 +1,35 @@
-"""What the facts mean: each finding has an id, a severity, where it is, what was seen and what to do. Pure.
-
-The table of all of them is in `checks`.
-"""
+"""What the facts mean. Pure."""
 
 from __future__ import annotations
 
-import re
-import statistics
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import Any
 
 from bridge.principal import Principal
 from macs_zenoh.protocol.directory import AgentInfo, published
 from macs_zenoh.protocol.keyexpr import LEASE, NAME, PRESENCE, UNICAST, block_of, namespace_of, type_name
 from macs_zenoh.protocol.messages import UNITY
 
-from .checks import CHECKS, ERROR, GROUPS, NOTE, OK, WARNING, Severity
+from .checks import ERROR, GROUPS, NOTE, WARNING
 from .facts import Certificate, Clock, Endpoint, Facts, NetworkPath, Program, RouterInfo
+from .findings import Finding, found
+from .words import (
+    bit_rate,
+    byte_size,
+    bytes_per_s,
+    counted,
+    median_ms,
+    name_of,
+    round_trip,
+    seconds,
+    sessions,
+    short_problem,
+    short_version,
+    some,
+    tallied,
+    throughput,
+)
 
 CLOCK_S = 0.1
 """A clock that is further off makes sensor times and latencies misleading."""
@@ -32,33 +44,6 @@ CLOSE_US = 5_000_000
 SLOW_MS = 150.0
 DEFAULT_PORT = 7447
 """Of routers."""
-
-
-class Finding(NamedTuple):
-    """One thing that was found."""
-
-    id: str
-    severity: Severity
-    where: str
-    text: str
-    remedy: str
-
-    @property
-    def group(self) -> str:
-        """The part of the report that it belongs to."""
-        return CHECKS[self.id].group
-
-
-def found(finding: str, where: str = "", *, severity: Severity | None = None, **values: object) -> Finding:
-    """A finding of a kind, filled in."""
-    kind = CHECKS[finding]
-    return Finding(
-        finding,
-        kind.severity if severity is None else severity,
-        where,
-        kind.text.format(**values),
-        kind.remedy.format(**values),
-    )
 
 
 def analyze(facts: Facts) -> list[Finding]:
@@ -83,11 +68,6 @@ def of_endpoints(facts: Facts) -> list[Finding]:
     return [finding for finding in [*_routers(facts), *_tls(facts)] if finding.where and finding.severity > NOTE]
 
 
-def worst(findings: Iterable[Finding]) -> Severity:
-    """The severity of the whole."""
-    return max((finding.severity for finding in findings), default=OK)
-
-
 # -- routers -----------------------------------------------------------------------------------------------------
 
 
@@ -102,13 +82,13 @@ def _routers(facts: Facts) -> Iterator[Finding]:
                 "router_ok",
                 where,
                 version=_version_of(endpoint),
-                round_trip=_round_trip(endpoint.path),
-                throughput=_throughput_words(endpoint.path, crossings=4),
+                round_trip=round_trip(endpoint.path),
+                throughput=throughput(endpoint.path, crossings=4),
             )
             if not endpoint.routers:
                 yield found("admin_hidden", where)
-            if _median_ms(endpoint.path) > SLOW_MS:
-                yield found("slow", where, round_trip=_round_trip(endpoint.path))
+            if median_ms(endpoint.path) > SLOW_MS:
+                yield found("slow", where, round_trip=round_trip(endpoint.path))
             yield from _way(endpoint.path, where)
         elif endpoint.reach not in ("ok", "untried"):
             # programs use the others meanwhile
@@ -119,7 +99,7 @@ def _routers(facts: Facts) -> Iterator[Finding]:
         elif endpoint.speaker == "gateway":
             yield found("is_gateway", where, router=_router_beside(endpoint))
         elif endpoint.tls is None or not endpoint.tls.problem:
-            yield found("session_refused", where, detail=_plain(endpoint.problem))
+            yield found("session_refused", where, detail=short_problem(endpoint.problem))
 
 
 def _router_beside(endpoint: Endpoint) -> str:
@@ -128,19 +108,8 @@ def _router_beside(endpoint: Endpoint) -> str:
 
 
 def _version_of(endpoint: Endpoint) -> str:
-    versions = [_short(info.version) for info in endpoint.routers if info.zid == endpoint.router]
+    versions = [short_version(info.version) for info in endpoint.routers if info.zid == endpoint.router]
     return f"Zenoh {versions[0]}" if versions else "a Zenoh router"
-
-
-def _short(version: str) -> str:
-    """``1.10.2`` out of ``v1.10.2-release built with rustc …``."""
-    match = re.match(r"v?(\d+\.\d+\.\d+)", version)
-    return match[1] if match else version
-
-
-def _plain(problem: str) -> str:
-    """Zenoh's ``Unable to connect to any of [Single(tcp/…)]. Timeout!`` in short."""
-    return problem.rpartition("]. ")[2].rstrip("!.").lower() or "no reason given"
 
 
 def _linked(facts: Facts) -> Iterator[Finding]:
@@ -172,10 +141,10 @@ def _apart(one: Endpoint, other: Endpoint) -> bool:
 def _versions(facts: Facts) -> Iterator[Finding]:
     versions: dict[str, list[str]] = defaultdict(list)
     for info in _all_routers(facts):
-        versions[_short(info.version)].append(f"router {info.zid[:8]}")
+        versions[short_version(info.version)].append(f"router {info.zid[:8]}")
     for program in facts.programs:
         if program.pong is not None and program.pong.zenoh:
-            versions[program.pong.zenoh].append(_name(program))
+            versions[program.pong.zenoh].append(name_of(program))
     if facts.own.zenoh:
         versions[facts.own.zenoh].append("here")
     if len(versions) > 1:
@@ -185,20 +154,20 @@ def _versions(facts: Facts) -> Iterator[Finding]:
 
 
 def _listed_versions(versions: dict[str, list[str]]) -> str:
-    return "; ".join(f"{version} ({_some(who)})" for version, who in sorted(versions.items()))
+    return "; ".join(f"{version} ({some(who)})" for version, who in sorted(versions.items()))
 
 
 def _sessions(facts: Facts) -> Iterator[Finding]:
-    names = {program.zid: _name(program) for program in facts.programs}
+    names = {program.zid: name_of(program) for program in facts.programs}
     for info in _all_routers(facts):
         where = f"router {info.zid[:8]}"
         peers = [_session_name(s.zid, s.address, names) for s in info.sessions if s.whatami == "peer"]
         if len(peers) > 1:
-            yield found("peers", where, count=len(peers), who=_some(peers))
+            yield found("peers", where, count=len(peers), who=some(peers))
         elif peers:
             yield found("peer", where, who=peers[0])
         if shared := [_session_name(s.zid, s.address, names) for s in info.sessions if s.shared_memory]:
-            yield found("session_shared_memory", where, who=_some(shared))
+            yield found("session_shared_memory", where, who=some(shared))
 
 
 def _session_name(zid: str, address: str, names: dict[str, str]) -> str:
@@ -313,7 +282,7 @@ def _mesh(facts: Facts) -> Iterator[Finding]:
     if not count and not gateways:
         yield found("nobody")
     elif not conflicts:
-        yield found("mesh_ok", agents=_count(count, "agent"), gateways=_count(gateways, "gateway"))
+        yield found("mesh_ok", agents=counted(count, "agent"), gateways=counted(gateways, "gateway"))
     yield from _namespaces(facts, bool(count))
 
 
@@ -324,7 +293,7 @@ def _blocks_twice(facts: Facts) -> Iterator[Finding]:
             holders[fields.block].add(fields.zid)
     for block, zids in sorted(holders.items()):
         if len(zids) > 1:
-            yield found("block_twice", f"block {block}", count=len(zids), who=_zids(zids))
+            yield found("block_twice", f"block {block}", count=len(zids), who=sessions(zids))
 
 
 def _ids_twice(facts: Facts) -> Iterator[Finding]:
@@ -334,7 +303,7 @@ def _ids_twice(facts: Facts) -> Iterator[Finding]:
             holders[f"{claim.type_name}/{claim.id}"].add(claim.zid)
     for agent, zids in sorted(holders.items()):
         if len(zids) > 1:
-            yield found("id_twice", agent, count=len(zids), who=_zids(zids))
+            yield found("id_twice", agent, count=len(zids), who=sessions(zids))
 
 
 def _names_twice(facts: Facts) -> Iterator[Finding]:
@@ -344,7 +313,7 @@ def _names_twice(facts: Facts) -> Iterator[Finding]:
             holders[fields.name].add(fields.zid)
     for name, zids in sorted(holders.items()):
         if len(zids) > 1:
-            yield found("name_twice", name, count=len(zids), who=_zids(zids))
+            yield found("name_twice", name, count=len(zids), who=sessions(zids))
 
 
 def _ids_and_blocks(facts: Facts) -> Iterator[Finding]:
@@ -391,7 +360,7 @@ def _programs(facts: Facts) -> Iterator[Finding]:
     pingable = any(endpoint.rights.pings for endpoint in facts.endpoints)
     pinged = facts.programs[: len(facts.programs) - facts.unpinged]
     for program in pinged:
-        where = _name(program)
+        where = name_of(program)
         if program.pong is None:
             if pingable:
                 yield found("program_silent", where)
@@ -402,7 +371,7 @@ def _programs(facts: Facts) -> Iterator[Finding]:
     macs: dict[str, list[str]] = defaultdict(list)
     for program in pinged:
         if program.pong is not None and program.pong.macs:
-            macs[program.pong.macs].append(_name(program))
+            macs[program.pong.macs].append(name_of(program))
     if facts.own.macs:
         macs[facts.own.macs].append("here")
     if len(macs) > 1:
@@ -416,8 +385,8 @@ def _one_program(facts: Facts, program: Program, where: str) -> Iterator[Finding
         "program_ok",
         where,
         macs=pong.macs or "(unknown)",
-        round_trip=_round_trip(program.path),
-        throughput=_throughput_words(program.path, crossings=2),
+        round_trip=round_trip(program.path),
+        throughput=throughput(program.path, crossings=2),
         clock=f"{clock.offset_s * 1000:+.1f} ms (±{clock.within_s * 1000:.1f})" if clock else "unknown",
     )
     if clock is not None:
@@ -431,28 +400,24 @@ def _one_program(facts: Facts, program: Program, where: str) -> Iterator[Finding
     if pong.mode != "client":
         yield found("program_peer", where, mode=pong.mode)
     if pong.drops:
-        yield found("losses", where, drops=_counts(pong.drops))
+        yield found("losses", where, drops=tallied(pong.drops))
     now = dict(pong.now)
     for kind in ("wrong_settings", "shared_graph"):
         if count := now.pop(kind, 0):
             yield found(kind, where, count=count)
     if now:
-        yield found("in_trouble", where, now=_counts(now))
-
-
-def _counts(counts: dict[str, int]) -> str:
-    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items()))
+        yield found("in_trouble", where, now=tallied(now))
 
 
 def _clock_off(clock: Clock, where: str) -> Iterator[Finding]:
     if abs(clock.offset_s) - clock.within_s > CLOCK_S:
         direction = "ahead of" if clock.offset_s > 0 else "behind"
-        yield found("clock_off", where, offset=_seconds(abs(clock.offset_s)), direction=direction)
+        yield found("clock_off", where, offset=seconds(abs(clock.offset_s)), direction=direction)
 
 
 def _way(path: NetworkPath, where: str) -> Iterator[Finding]:
     if path.lost_bytes:
-        yield found("large_lost", where, size=_bytes(path.lost_bytes))
+        yield found("large_lost", where, size=byte_size(path.lost_bytes))
 
 
 # -- our settings ------------------------------------------------------------------------------------------------
@@ -467,7 +432,7 @@ def _settings(facts: Facts) -> Iterator[Finding]:
             macs=facts.own.macs or "(not installed)",
             zenoh=facts.own.zenoh or "(unknown)",
             mode=_setting(facts, "mode") or "client",
-            lease=_seconds(_number(_setting(facts, "transport/link/tx/lease")) / 1000),
+            lease=seconds(_number(_setting(facts, "transport/link/tx/lease")) / 1000),
         )
     yield from _dropped(facts)
 
@@ -482,15 +447,15 @@ def _setting_problems(facts: Facts) -> Iterator[Finding]:
         yield found("own_mode", mode=mode)
     lease_ms = _number(_setting(facts, "transport/link/tx/lease"))
     if 0 < lease_ms < LEASE_MS[0]:
-        yield found("lease_short", lease=_seconds(lease_ms / 1000))
+        yield found("lease_short", lease=seconds(lease_ms / 1000))
     elif lease_ms > LEASE_MS[1]:
-        yield found("lease_long", lease=_seconds(lease_ms / 1000))
+        yield found("lease_long", lease=seconds(lease_ms / 1000))
     for name, size in sorted((_setting(facts, "transport/link/tx/queue/size") or {}).items()):
         if _number(size) > QUEUE_BATCHES:
             yield found("queue_long", name=name, size=size)
     wait_us = _number(_congestion(facts, "block", "wait_before_close"))
     if wait_us > max(CLOSE_US, lease_ms * 1000):  # with a longer lease it is for slow links: config/wan/policy.yaml
-        yield found("close_long", wait=_seconds(wait_us / 1e6))
+        yield found("close_long", wait=seconds(wait_us / 1e6))
 
 
 def _dropped(facts: Facts) -> Iterator[Finding]:
@@ -500,9 +465,9 @@ def _dropped(facts: Facts) -> Iterator[Finding]:
     queue = _number(sizes.get("data")) * BATCH_BYTES
     wait_s = _number(_congestion(facts, "drop", "max_wait_before_drop_fragments")) / 1e6
     for endpoint in facts.endpoints:
-        rate = _bytes_per_s(endpoint.path, crossings=4)
+        rate = bytes_per_s(endpoint.path, crossings=4)
         if rate and queue and (limit := queue + rate * wait_s) < 5e6:
-            yield found("large_dropped", endpoint.endpoint, throughput=_rate(rate), size=_bytes(limit))
+            yield found("large_dropped", endpoint.endpoint, throughput=bit_rate(rate), size=byte_size(limit))
 
 
 def _setting(facts: Facts, path: str) -> Any:
@@ -515,62 +480,3 @@ def _congestion(facts: Facts, kind: str, name: str) -> Any:
 
 def _number(value: Any) -> float:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else 0.0
-
-
-# -- words -------------------------------------------------------------------------------------------------------
-
-
-def _name(program: Program) -> str:
-    """A gateway by its blocks, others by their agents."""
-    if program.blocks:
-        return f"gateway {program.zid[:8]} (block {', '.join(map(str, sorted(program.blocks)))})"
-    return ", ".join(program.agents) or program.zid[:8]
-
-
-def _median_ms(path: NetworkPath) -> float:
-    return statistics.median(path.round_trips_ms) if path.round_trips_ms else 0.0
-
-
-def _round_trip(path: NetworkPath) -> str:
-    return f"{_median_ms(path):.1f} ms" if path.round_trips_ms else "an unknown time"
-
-
-def _bytes_per_s(path: NetworkPath, *, crossings: int) -> float:
-    """Throughput out of the largest echo: how much longer it took than the smallest. ``crossings``: how often the
-    bytes went over a link, one after the other. 0: unknown."""
-    if len(path.echoes) < 2:
-        return 0.0
-    small, large = path.echoes[0], path.echoes[-1]
-    took_s = large.took_s - small.took_s
-    return crossings * (large.size_bytes - small.size_bytes) / took_s if took_s > 0 else 0.0
-
-
-def _throughput_words(path: NetworkPath, *, crossings: int) -> str:
-    rate = _bytes_per_s(path, crossings=crossings)
-    return f", about {_rate(rate)}" if rate else ""
-
-
-def _rate(bytes_per_s: float) -> str:
-    mbit = bytes_per_s * 8 / 1e6
-    return f"{mbit:.3g} Mbit/s" if mbit < 999 else f"{mbit / 1000:.1f} Gbit/s"
-
-
-def _bytes(size: float) -> str:
-    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"
-
-
-def _seconds(value_s: float) -> str:
-    return f"{value_s:.3g} s" if value_s >= 1 else f"{value_s * 1000:.0f} ms"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
-
-
-def _some(who: list[str], most: int = 4) -> str:
-    shown = ", ".join(who[:most])
-    return shown if len(who) <= most else f"{shown} and {len(who) - most} more"
-
-
-def _zids(zids: set[str]) -> str:
-    return ", ".join(sorted(zid[:8] for zid in zids))

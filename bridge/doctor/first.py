@@ -18,8 +18,9 @@ from macs_zenoh.mesh import configuration
 from macs_zenoh.protocol import endpoints
 
 from . import transport
-from .analyze import Finding, of_endpoints
+from .analyze import of_endpoints
 from .facts import Endpoint, Facts, Own
+from .findings import Finding
 from .gather import JUDGED
 
 log = logging.getLogger("macs.mesh")

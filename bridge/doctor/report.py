@@ -8,9 +8,9 @@ from typing import Any
 
 import msgspec
 
-from .analyze import Finding, worst
 from .checks import Severity
 from .facts import Facts
+from .findings import Finding, worst
 
 
 def exit_code(findings: Sequence[Finding]) -> int:

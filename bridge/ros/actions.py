@@ -18,8 +18,8 @@ from msgspec import structs
 from rclpy.serialization import deserialize_message, serialize_message
 
 from bridge.ros.graph import SEND_GOAL
-from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
-from bridge.ros.services import ABSENT_S, Search, first_line
+from bridge.ros.interface import InterfaceNode, Registrant, Robot, first_line, ros_errors
+from bridge.ros.servers import ABSENT_S, Search
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import resolve
 from bridge.ros.unity_cdr import UnityCdr, to_ros

@@ -306,3 +306,9 @@ class ros_errors:  # noqa: N801 - reads like the context manager that it is
             # rcl adds "at /path/in/its/sources" and a second line that points at the letter
             problem = str(error).splitlines()[0].split(", at ")[0]
             raise Refused(f"{self._topic!r} cannot be used on this robot: {problem}") from error
+
+
+def first_line(error: Exception) -> str:
+    """What an error says, without the places in C++ that it came through."""
+    text = str(error).splitlines()
+    return text[0].split(", at ")[0] if text else type(error).__name__

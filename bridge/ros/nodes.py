@@ -16,11 +16,13 @@ from functools import partial
 
 from bridge.ros.actions import ActionNode, tell_no_goal
 from bridge.ros.early import ASKING, EarlyMessages, NodeKey
+from bridge.ros.failures import tell_failure
 from bridge.ros.graph import NamesAndTypes
-from bridge.ros.interface import InterfaceNode, Registrant, Robot, full_name, key_of
+from bridge.ros.interface import InterfaceNode, Registrant, Robot, first_line, full_name, key_of
 from bridge.ros.places import Places
 from bridge.ros.rights import Rights
-from bridge.ros.services import ClientNode, ServiceNode, first_line, tell_failure
+from bridge.ros.served import ServiceNode
+from bridge.ros.services import ClientNode
 from bridge.ros.stop import StopNode
 from bridge.ros.topics import PublisherNode, SubscriberNode
 from bridge.ros.types import InterfaceName

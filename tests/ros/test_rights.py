@@ -20,7 +20,7 @@ from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.requests import ControlRequest, control
 from bridge.ros.rules import Rules
-from bridge.ros.services import servers_elsewhere
+from bridge.ros.servers import servers_elsewhere
 from bridge.ros.session import RosSession
 from bridge.ros.topics import PublisherNode
 from bridge.settings import RobotSettings, Settings, TopicRule
@@ -406,7 +406,7 @@ async def test_a_headset_serves_until_a_node_of_the_robot_does(
     session: RosSession, peer: Peer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """When a ROS node begins to serve what a headset serves, the headset's service is withdrawn, and counted."""
-    monkeypatch.setattr("bridge.ros.services.ServiceNode.WATCH_S", 0.05)
+    monkeypatch.setattr("bridge.ros.served.ServiceNode.WATCH_S", 0.05)
     async with robot_nodes(session) as nodes:
         await nodes.add(adding("/lights", "std_srvs/SetBool", node_type=NodeType.SERVICE))
         await asyncio.sleep(0.3)

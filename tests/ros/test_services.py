@@ -18,7 +18,8 @@ from bridge.ros.early import EarlyMessages
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
-from bridge.ros.services import ClientNode, ServiceNode
+from bridge.ros.served import ServiceNode
+from bridge.ros.services import ClientNode
 from bridge.ros.session import RosSession
 from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused

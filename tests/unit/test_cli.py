@@ -16,9 +16,9 @@ import msgspec
 import pytest
 
 from bridge.cli import VERBS, build_parser, doctor, ls, main, options, robots, stop, supervisor, terminal, up
-from bridge.doctor.analyze import found
 from bridge.doctor.checks import Severity
 from bridge.doctor.facts import Facts, Own
+from bridge.doctor.findings import found
 from bridge.headset.verbs import script_parser
 from bridge.settings import OperatorSettings, Settings
 from macs_zenoh.config import MeshSettings

@@ -15,9 +15,10 @@ import pytest
 from bridge.cli import terminal
 from bridge.cli.doctor import shown
 from bridge.doctor import report, transport
-from bridge.doctor.analyze import analyze, found, worst
+from bridge.doctor.analyze import analyze
 from bridge.doctor.checks import CHECKS, ERROR, GROUPS, NOTE, OK, WARNING, Severity
 from bridge.doctor.facts import Certificate, Clock, Echo, Endpoint, Facts, Rights, RouterInfo, Session, Tls
+from bridge.doctor.findings import found, worst
 from macs_zenoh.protocol import endpoints
 from macs_zenoh.protocol.keyexpr import LEASE, NAME, PRESENCE
 from macs_zenoh.protocol.ping import Pong
