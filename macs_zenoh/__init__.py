@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from bridge.headset.client import Headset as Headset
 
     from .agent import Agent as Agent
-    from .agent import Call as Call
     from .agent import join as join
     from .config import MeshSettings as MeshSettings
     from .config import TrafficRule as TrafficRule
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from .protocol.messages import Metadata as Metadata
     from .protocol.messages import NodeType as NodeType
     from .protocol.reading import Message as Message
+    from .serving import Call as Call
     from .topics import TopicMessage as TopicMessage
     from .topics import TopicPublisher as TopicPublisher
     from .topics import TopicSubscription as TopicSubscription
@@ -61,7 +61,7 @@ _WHERE = {
     "bridge.awareness.afferent": ("GatewayClientAfferent", "Mode"),
     "bridge.awareness.client": ("GatewayClient",),
     "bridge.headset.client": ("Headset",),
-    "macs_zenoh.agent": ("Agent", "Call", "join"),
+    "macs_zenoh.agent": ("Agent", "join"),
     "macs_zenoh.config": ("MeshSettings", "TrafficRule"),
     "macs_zenoh.errors": (
         "BadField",
@@ -91,6 +91,7 @@ _WHERE = {
     "macs_zenoh.protocol.directory": ("AgentInfo",),
     "macs_zenoh.protocol.messages": ("Metadata", "NodeType"),
     "macs_zenoh.protocol.reading": ("Message",),
+    "macs_zenoh.serving": ("Call",),
     "macs_zenoh.topics": ("TopicMessage", "TopicPublisher", "TopicSubscription"),
     "macs_zenoh.typed": ("BadCdr", "BadValue", "Types", "UnknownType", "request_of", "response_of"),
 }

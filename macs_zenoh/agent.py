@@ -14,10 +14,10 @@ import asyncio
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
-from typing import Any, NamedTuple, overload
+from typing import Any, overload
 
 from .config import MeshSettings, TrafficRule
 from .errors import CallTimeout, Closed, OutOfRange, Unreachable, UsageError, WireError
@@ -29,13 +29,14 @@ from .presence import Presence
 from .protocol.agent_id import AgentId
 from .protocol.directory import AgentInfo, Change, Directory
 from .protocol.guard import Guard
-from .protocol.keyexpr import BROADCAST, CALL, GROUP, type_name, type_number
+from .protocol.keyexpr import BROADCAST, GROUP, type_name, type_number
 from .protocol.messages import BROADCAST as EVERYBODY
 from .protocol.messages import Metadata, NodeType
 from .protocol.reading import Message, Reader
 from .protocol.routing import call, inbox, keys_of
-from .protocol.wire import Layout, encode_frame, encode_message, parse_frame
+from .protocol.wire import Layout, encode_frame, encode_message
 from .sections import changed
+from .serving import Call, CallFirst, CallHandler, Served
 from .topics import DEPTH, Chosen, TopicPublisher, TopicSubscription, Value
 
 log = logging.getLogger("macs.agent")
@@ -44,19 +45,7 @@ RETRY_S = 0.05
 """How long a call waits before it asks again an agent that is online and does not serve it yet."""
 
 
-class Call(NamedTuple):
-    """What an agent that serves a verb is asked."""
-
-    verb: str
-    sender_type: str
-    sender_id: int
-    metadata: Metadata
-    data: bytes
-
-
-CallHandler = Callable[[Call], Awaitable[bytes]]
 OnMessage = Callable[[Message], None]
-CallFirst = Callable[[Call], None]
 OnPresence = Callable[[AgentInfo, bool], None]
 OnId = Callable[[int, int], None]
 
@@ -88,8 +77,7 @@ class Agent:
         self._declared: list[Subscription] = []
         self._on_presence: Callbacks[OnPresence] = Callbacks()
         self._on_id: Callbacks[OnId] = Callbacks()
-        self._served: dict[Handle, tuple[Callable[[], Subscription], Subscription]] = {}
-        """What makes it anew, for another id, and what there is now."""
+        self._served = Served(self._layout, lambda: self.key, guard)
         self._warned: set[tuple[int, int]] = set()
         self._nodes: Nodes | None = None
         """What it uses of robots, once it does."""
@@ -295,35 +283,8 @@ class Agent:
         again meanwhile.
         """
 
-        def read(key: str, payload: bytes) -> Call:
-            fields = CALL.parse(key)
-            if fields is None:
-                raise UsageError(f"{key} is not a call")
-            frame = parse_frame(payload, self._layout)
-            metadata = Metadata.decode(frame.metadata) if frame.metadata else Metadata()
-            metadata = metadata.sent_by(*fields.sender)
-            return Call(verb, type_name(fields.from_type), fields.from_id, metadata, bytes(frame.body))
-
-        async def answer(key: str, payload: bytes) -> bytes:
-            return await handler(read(key, payload))
-
-        def serve() -> Subscription:
-            at_once = None if first is None else lambda key, payload: first(read(key, payload))
-            serving = mesh or self.mesh
-            return serving.serve(self._calls_of(verb), answer, stand_in=stand_in, first=at_once, gate=self._guard)
-
         self._check_open()
-        serving = serve()
-        handle = Handle(lambda: self._end_serving(handle))
-        self._served[handle] = (serve, serving)
-        return handle
-
-    def _end_serving(self, handle: Handle) -> None:
-        _, serving = self._served.pop(handle)
-        serving.close()
-
-    def _calls_of(self, verb: str) -> str:
-        return CALL.every(type=self.type_number, id=self.id, verb=verb)
+        return self._served.add(verb, handler, first=first, stand_in=stand_in, mesh=mesh or self.mesh)
 
     # -- what robots have ----------------------------------------------------------------------------------------
 
@@ -454,8 +415,7 @@ class Agent:
 
     def _id_changed(self, old: int, new: int) -> None:
         self.id = new
-        for serve, serving in self._served.values():
-            serving.become(serve())
+        self._served.renew()
         if self._nodes is not None:
             self._nodes.id_changed((self.type_number, old), new)
         for callback in self._on_id:
@@ -491,8 +451,7 @@ class Agent:
         if self._nodes is not None:
             self._nodes.close()
         self._identity.close()
-        for handle in reversed(list(self._served)):
-            handle.close()
+        self._served.close()
         for declared in reversed(self._declared):
             declared.close()
         self._declared.clear()

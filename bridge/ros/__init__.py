@@ -1,10 +1,10 @@
 """The robot: interface nodes between a ROS 2 graph and the mesh. The only package that needs rclpy, with awareness.
 
 ``agent`` is the program, ``requests`` and ``parameters`` what it is asked and told. ``nodes`` is what headsets
-register: ``interface`` (what all have in common), ``topics``, ``services``, ``served``, ``actions``, ``stop``. ``rules`` and
-``safety`` (both pure) say what settings and safety make of that. ``session`` is the one ROS node and its thread;
-``qos``, ``types``, ``fields``, ``graph`` and ``stream`` are what ROS says about names and bytes. ``demo`` is a robot
-to try it with.
+register: ``interface`` (what all have in common), ``topics``, ``services`` of the robot, those of headsets
+(``served``), ``actions``, ``stop``. ``rules`` and ``safety`` (both pure) say what settings and safety make of that.
+``session`` is the one ROS node and its thread; ``qos``, ``types``, ``fields``, ``graph`` and ``stream`` are what ROS
+says about names and bytes. ``demo`` is a robot to try it with.
 """
 
 from macs_zenoh.errors import MacsError

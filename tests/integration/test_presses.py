@@ -7,9 +7,10 @@ import asyncio
 import pytest
 
 import macs_zenoh
-from macs_zenoh.agent import Agent, Call
+from macs_zenoh.agent import Agent
 from macs_zenoh.protocol.messages import Metadata, NodeType
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.serving import Call
 from tests.support.given import Connect, StartGateway
 from tests.support.waiting import until
 

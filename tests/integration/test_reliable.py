@@ -20,7 +20,7 @@ from bridge.gateway import Gateway
 from bridge.headset.client import Headset
 from bridge.settings import GatewaySettings
 from macs_zenoh import awareness
-from macs_zenoh.agent import Agent, Call
+from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.mesh import Mesh, Sample, Traffic
 from macs_zenoh.mesh import reliable as recovered
@@ -31,6 +31,7 @@ from macs_zenoh.protocol.keyexpr import NAMED_ALL
 from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, StreamData, decode_data, encode_management
 from macs_zenoh.protocol.named import Outcome
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.serving import Call
 from macs_zenoh.streams import Streams
 from tests.support.programs import free_port
 from tests.support.routers import Router

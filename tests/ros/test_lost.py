@@ -14,10 +14,10 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
+from bridge.ros.gaps import Gaps
 from bridge.ros.interface import Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.session import RosSession
-from bridge.ros.topics import Gaps
 from tests.support.ros_peer import Peer, adding
 from tests.support.waiting import until
 
