@@ -24,10 +24,10 @@ from contextlib import asynccontextmanager
 from typing import NamedTuple
 
 from .agent import Agent
+from .claims import settle, stale_until
 from .errors import Refused, Unreachable, UsageError, WireError
 from .handles import Callbacks, Handle
 from .mesh import Mesh, Sample, Subscription, Token, Traffic
-from .protocol import ids as blocks
 from .protocol import named
 from .protocol.agent_id import AgentId
 from .protocol.keyexpr import LAST, NAME, NAMED, NAMED_ALL, WANTED
@@ -36,9 +36,6 @@ from .protocol.wire import PROBE
 from .timeouts import within
 
 log = logging.getLogger("macs.awareness")
-
-SETTLE_S = 0.3
-"""How long a claimed name waits for somebody else's claim on it to show up."""
 
 ATTEMPT_S = 0.05
 """Pause before a message is offered again to a receiver that did not take it and about which nothing has changed."""
@@ -394,13 +391,12 @@ class Awareness:
         self._keep(self.mesh.serve(LAST.every(name=self.name), self._tell_last))
         self._keep(self._token_of_name)
         self._token_of_name.become(self._declare_name())
-        await asyncio.sleep(SETTLE_S)
-        if not blocks.keeps(self.mesh.zid, self.names.claimants(self.name)):
+        if not await settle(self.mesh.zid, lambda: self.names.claimants(self.name)):
             raise UsageError(f"another agent took the name {self.name!r} in this moment; choose another")
 
     async def _wait_for_stale(self) -> None:
         """Give the token of an earlier life of this agent the time of a lease to end."""
-        deadline = time.monotonic() + self.mesh.settings.lease_ms / 1000 + 1.0
+        deadline = stale_until(self.mesh.settings)
         while self.names.claimants(self.name):
             if not await self._change_before(deadline):
                 return

@@ -1,6 +1,6 @@
 """How an agent comes by its id and keeps it, or gives it up for another. Asyncio.
 
-An id is configured or leased; `blocks` has the rules for what several claim.
+An id is configured or leased; `claims` has what holds for all that several may claim.
 """
 
 from __future__ import annotations
@@ -12,19 +12,16 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
 
+from .claims import Disputes, settle, stale_until
 from .errors import MacsError, OutOfRange, Unreachable, UsageError
 from .mesh import Mesh, Subscription
 from .presence import Contested, Presence
-from .protocol import ids as blocks
 from .protocol.agent_id import AgentId
-from .protocol.ids import Contests
+from .protocol.ids import Contests, Verdict, free_id
 from .protocol.keyexpr import LEASE, type_name
 from .timeouts import within
 
 log = logging.getLogger("macs.agent")
-
-SETTLE_S = 0.3
-"""How long a claimed id waits for somebody else's claim on it to show up."""
 
 AGAIN_S = 5.0
 """After so long an agent that found no other id looks again."""
@@ -66,8 +63,7 @@ class Identity:
         self._on_id = on_id
         self._claim: _Claim | None = None
         self._is_fixed = False
-        self._contests: Contests[tuple[int, int]] = Contests(mesh.zid, lambda key: self._is_fixed)
-        self._timer: asyncio.TimerHandle | None = None
+        self._disputes = Disputes(Contests[tuple[int, int]](mesh.zid, lambda key: self._is_fixed), self._judged)
         self._changing: asyncio.Task[None] | None = None
 
     def __str__(self) -> str:
@@ -83,8 +79,7 @@ class Identity:
 
     def close(self) -> None:
         """Be offline."""
-        if self._timer is not None:
-            self._timer.cancel()
+        self._disputes.close()
         if self._changing is not None:
             self._changing.cancel()
         if self._claim is not None:
@@ -110,7 +105,7 @@ class Identity:
         if key not in directory:
             return
         log.info("%s is still online; waiting for it to go", name)
-        deadline = time.monotonic() + self._mesh.settings.lease_ms / 1000 + 1.0
+        deadline = stale_until(self._mesh.settings)
         while key in directory and time.monotonic() < deadline:
             with suppress(asyncio.TimeoutError):
                 await within(self._presence.change(), deadline - time.monotonic())
@@ -123,7 +118,7 @@ class Identity:
             if type_name(self._type) != "ros":
                 leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every())]
                 held = {lease.block for lease in leases if lease}
-            agent_id = blocks.free_id(taken, held)
+            agent_id = free_id(taken, held)
             if agent_id is None:
                 raise Unreachable("a free id", f"all ids of type {type_name(self._type)} are taken")
             if (claim := await self._settle(agent_id)) is not None:
@@ -136,18 +131,15 @@ class Identity:
         The inbox comes before the token: whoever sees the agent can reach it.
         """
         messages = self._listen(agent_id)
-        token = self._presence.declare(self._type, agent_id, self._group)
+        claim = _Claim(agent_id, (self._presence.declare(self._type, agent_id, self._group), messages))
+        claimants = self._presence.directory.claimants
+        kept = False
         try:
-            await asyncio.sleep(SETTLE_S)
-        except asyncio.CancelledError:
-            _Claim(agent_id, (token, messages)).close()
-            raise
-        claim = _Claim(agent_id, (token, messages))
-        others = [agent.zid for agent in self._presence.directory.claimants(self._type, agent_id)]
-        if blocks.keeps(self._mesh.zid, others):
-            return claim
-        claim.close()
-        return None
+            kept = await settle(self._mesh.zid, lambda: [agent.zid for agent in claimants(self._type, agent_id)])
+        finally:
+            if not kept:
+                claim.close()
+        return claim if kept else None
 
     # -- an id that others have as well --------------------------------------------------------------------------
 
@@ -156,23 +148,15 @@ class Identity:
         if self._claim is None:
             return
         key = (self._type, self._claim.id)
-        now = time.monotonic()
-        self._contests.look({key: contested[key]} if key in contested else {}, now)
-        self._judge()
+        self._disputes.look({key: contested[key]} if key in contested else {})
 
-    def _judge(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        now = time.monotonic()
-        for verdict in self._contests.judge(now):
+    def _judged(self, verdicts: list[Verdict[tuple[int, int]]]) -> None:
+        for verdict in verdicts:
             others = " and ".join(verdict.others)
             if not verdict.give_way:
                 log.error("%s is also held by session %s: change the id that one of them is given", self, others)
             elif self._changing is None:
                 self._changing = asyncio.get_running_loop().create_task(self._change(others))
-        if (deadline := self._contests.next_deadline()) is not None:
-            self._timer = asyncio.get_running_loop().call_later(max(0.0, deadline - now) + 0.01, self._judge)
 
     async def _change(self, others: str) -> None:
         """Take another id; the old one is given up when the new one is settled."""

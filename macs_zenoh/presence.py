@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 
+from .deadline import Deadline
 from .mesh import Mesh, Subscription, Token
 from .protocol.directory import AgentInfo, Change, Directory
 from .protocol.keyexpr import PRESENCE
@@ -51,7 +52,7 @@ class Presence:
         self._news: deque[tuple[str, bool]] = deque()
         self._handling: asyncio.Handle | None = None
         self._complained = False
-        self._sweep: asyncio.TimerHandle | None = None
+        self._sweep = Deadline(self._let_go)
         self._watching: Subscription | None = None
         self._unseen: set[str] = set()
         self._confirming: asyncio.Task[None] | None = None
@@ -106,9 +107,10 @@ class Presence:
         """Follow no more."""
         if self._watching is not None:
             self._watching.close()
-        for handle in (self._handling, self._looking, self._sweep, self._confirming):
+        for handle in (self._handling, self._looking, self._confirming):
             if handle is not None:
                 handle.cancel()
+        self._sweep.cancel()
 
     def declare(self, agent_type: int, agent_id: int, group: int, epoch: int = 0) -> Token:
         """Be online under this id, until the token is closed. Subscribe the inbox before: who is seen is sent to.
@@ -153,12 +155,7 @@ class Presence:
         self._on_contested(contested)
 
     def _schedule_sweep(self) -> None:
-        if self._sweep is not None:
-            self._sweep.cancel()
-            self._sweep = None
-        if (deadline := self.directory.next_deadline()) is not None:
-            delay_s = max(0.0, deadline - time.monotonic())
-            self._sweep = asyncio.get_running_loop().call_later(delay_s + 0.01, self._let_go)
+        self._sweep.set(self.directory.next_deadline())
 
     def _let_go(self) -> None:
         self._changes += self.directory.tick(time.monotonic())

@@ -11,16 +11,14 @@ import logging
 import time
 from collections.abc import Callable, Collection, Iterable
 
+from macs_zenoh.claims import SETTLE_S, Disputes, stale_until
 from macs_zenoh.errors import ConfigError, Unreachable
 from macs_zenoh.mesh import Mesh, Subscription, Token
 from macs_zenoh.protocol import ids as blocks
-from macs_zenoh.protocol.ids import Contests, FreeIds
+from macs_zenoh.protocol.ids import Contests, FreeIds, Verdict
 from macs_zenoh.protocol.keyexpr import BLOCK_SIZE, LEASE
 
 log = logging.getLogger("macs.gateway")
-
-SETTLE_S = 0.3
-"""How long a claimed block waits for somebody else's claim on it to show up."""
 
 LOW = 128
 """With fewer free ids than this, another block is leased ahead of need."""
@@ -65,9 +63,10 @@ class Leases:
         self.exhausted = False
         """Whether the last attempt found that all blocks are leased."""
         self._holders: dict[int, set[str]] = {}
-        self._contests: Contests[int] = Contests(mesh.zid, lambda block: block == wanted or block in only)
+        self._disputes = Disputes(
+            Contests[int](mesh.zid, lambda block: block == wanted or block in only), self._judged
+        )
         self._watching: Subscription | None = None
-        self._judging: asyncio.TimerHandle | None = None
         self._taking: asyncio.Task[None] | None = None
 
     async def take(self, count: int = 1) -> None:
@@ -76,7 +75,7 @@ class Leases:
         Raises ConfigError when the configured one is another gateway's, Unreachable when all are leased.
         """
         wanted = self._wanted if not self._tokens else None
-        patience_ends = time.monotonic() + self._mesh.settings.lease_ms / 1000 + 1.0
+        patience_ends = stale_until(self._mesh.settings)
         while True:
             held = await self._held()
             if self._watching is None:  # not before: while a watcher's first news are on their way, answers miss some
@@ -137,9 +136,9 @@ class Leases:
 
     def close(self) -> None:
         """Give the blocks back."""
-        for going_on in (self._taking, self._judging):
-            if going_on is not None:
-                going_on.cancel()
+        self._disputes.close()
+        if self._taking is not None:
+            self._taking.cancel()
         if self._watching is not None:
             self._watching.close()
         for token in [*self._tokens.values(), *self._claims.values()]:
@@ -154,12 +153,10 @@ class Leases:
             self._look()
 
     def _look(self) -> None:
-        if self._judging is not None:
-            self._judging.cancel()
-            self._judging = None
-        now = time.monotonic()
-        self._contests.look({block: self._holders.get(block, set()) - {self._mesh.zid} for block in self.blocks}, now)
-        for verdict in self._contests.judge(now):
+        self._disputes.look({block: self._holders.get(block, set()) - {self._mesh.zid} for block in self.blocks})
+
+    def _judged(self, verdicts: list[Verdict[int]]) -> None:
+        for verdict in verdicts:
             block, by = verdict.what, f"session {' and '.join(verdict.others)}"
             if verdict.give_way:
                 log.warning("block %d is also leased by %s, which keeps it", block, by)
@@ -169,9 +166,6 @@ class Leases:
                 self._on_lost(block)
             else:
                 log.error("block %d is also leased by %s: change gateway.block of one of the two", block, by)
-        if (deadline := self._contests.next_deadline()) is not None:
-            delay_s = max(0.0, deadline - now) + 0.01
-            self._judging = asyncio.get_running_loop().call_later(delay_s, self._look)
 
     # -- taking --------------------------------------------------------------------------------------------------
 

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from collections.abc import Callable, Iterable
 
+from macs_zenoh.claims import Disputes
 from macs_zenoh.presence import Contested, Presence
-from macs_zenoh.protocol.ids import Contests
+from macs_zenoh.protocol.ids import Contests, Verdict
 from macs_zenoh.protocol.keyexpr import block_of
 from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.registrations import AgentKey, Task
@@ -68,17 +68,17 @@ class Renumbering:
         self._declarations = declarations
         self._on_change = on_change
         self._on_block_left = on_block_left
-        self._contests: Contests[AgentKey] = Contests(zid, lambda agent: False, leases.has_lease)
+        self._disputes = Disputes(Contests[AgentKey](zid, lambda agent: False, leases.has_lease), self._judged)
         self._wanted: dict[Connection, None] = {}
         self._working: asyncio.Task[None] | None = None
         self._timers: set[asyncio.TimerHandle] = set()
-        self._judging: asyncio.TimerHandle | None = None
 
     def close(self) -> None:
         """Change nothing any more."""
         if self._working is not None:
             self._working.cancel()
-        for timer in [*self._timers, *([self._judging] if self._judging is not None else [])]:
+        self._disputes.close()
+        for timer in self._timers:
             timer.cancel()
 
     # -- who has to change ---------------------------------------------------------------------------------------
@@ -86,22 +86,14 @@ class Renumbering:
     def contested(self, contested: Contested) -> None:
         """What others claim of what this session holds."""
         ours = {agent: others for agent, others in contested.items() if self._agents.find(*agent)}
-        for agent in self._contests.look(ours, time.monotonic()):
+        for agent in self._disputes.look(ours):
             if self._agents.find(*agent):
                 # the other has left the id to ours, and on robots may have taken back what was registered under it
                 self._robots.repeat(agent)
-        self._judge()
 
-    def _judge(self) -> None:
-        if self._judging is not None:
-            self._judging.cancel()
-            self._judging = None
-        now = time.monotonic()
-        found = [self._agents.find(*verdict.what) for verdict in self._contests.judge(now)]
+    def _judged(self, verdicts: list[Verdict[AgentKey]]) -> None:
+        found = [self._agents.find(*verdict.what) for verdict in verdicts]
         self._want(connection for connection in found if connection is not None)
-        if (deadline := self._contests.next_deadline()) is not None:
-            delay_s = max(0.0, deadline - now) + 0.01
-            self._judging = asyncio.get_running_loop().call_later(delay_s, self._judge)
 
     def block_lost(self, block: int) -> None:
         """A block is another gateway's: everybody in it gets an id of another one, except robots."""
@@ -163,7 +155,7 @@ class Renumbering:
         kind, agent_id = connection.key
         if self._agents.find(kind, agent_id) is not connection:
             return False
-        return connection.key in self._contests or (kind != ROS and block_of(agent_id) not in self._leases.blocks)
+        return connection.key in self._disputes or (kind != ROS and block_of(agent_id) not in self._leases.blocks)
 
     async def _reserve(self, count: int) -> list[int]:
         """So many free ids of our blocks; more blocks are leased for them if need be."""

@@ -28,7 +28,7 @@ from bridge.ros.session import RosSession
 from bridge.ros.stop_line import StopLine
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh import managers
-from macs_zenoh.agent import Agent, Call
+from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError, Refused, WireError
 from macs_zenoh.locked_out import locked_out
 from macs_zenoh.managers import Asker, Managers
@@ -40,6 +40,7 @@ from macs_zenoh.protocol.messages import AddNode, FunctionalityRequest, Metadata
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.registrations import check_own
 from macs_zenoh.protocol.wire import Layout
+from macs_zenoh.serving import Call
 from macs_zenoh.streams import Streams
 
 log = logging.getLogger("macs.ros")

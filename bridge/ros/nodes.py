@@ -26,6 +26,7 @@ from bridge.ros.services import ClientNode
 from bridge.ros.stop import StopNode
 from bridge.ros.topics import PublisherNode, SubscriberNode
 from bridge.ros.types import InterfaceName
+from macs_zenoh.deadline import Deadline
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.protocol.budget import may_have_one_more
 from macs_zenoh.protocol.messages import (
@@ -81,7 +82,7 @@ class InterfaceNodes:
         self._early_lock = threading.RLock()
         """Held while it is settled whether a message waits for its node, and while a node takes those that did."""
         self._expiring = False
-        self._expiry: asyncio.TimerHandle | None = None
+        self._expiry = Deadline(self._expire)
         self._lingering: dict[tuple[NodeKey, Registrant], asyncio.TimerHandle] = {}
 
         self.stop: StopNode | None = None
@@ -353,8 +354,7 @@ class InterfaceNodes:
         """Remove all nodes."""
         for node in self:
             self._remove(node)
-        if self._expiry is not None:
-            self._expiry.cancel()
+        self._expiry.cancel()
         self.robot.alarms.close()
 
     def _create(self, kind: type[InterfaceNode], request: AddNode) -> InterfaceNode:
@@ -481,11 +481,10 @@ class InterfaceNodes:
         with self._early_lock:
             deadline = self._early.next_deadline()
             self._expiring = deadline is not None
-        if self._expiry is None and deadline is not None:
-            self._expiry = self._loop.call_later(max(0.0, deadline - time.monotonic()), self._expire)
+        if not self._expiry.is_set:
+            self._expiry.set(deadline)
 
     def _expire(self) -> None:
-        self._expiry = None
         now = time.monotonic()
         with self._early_lock:
             expired = self._early.expire(now)

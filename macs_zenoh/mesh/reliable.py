@@ -11,6 +11,7 @@ from functools import partial
 
 import zenoh
 
+from macs_zenoh.deadline import Deadline
 from macs_zenoh.protocol import keyexpr
 from macs_zenoh.protocol.recovery import Ask, Recovery
 
@@ -50,7 +51,7 @@ class Recovered:
         self._at_once = at_once
         self._on_miss = on_miss
         self._recovery = Recovery()
-        self._timer: asyncio.TimerHandle | None = None
+        self._deadline = Deadline(lambda: self._go_on([]))
         self._closed = False
         self._on_numbered = self._numbered
         self._on_heartbeat = self._heartbeat
@@ -74,8 +75,7 @@ class Recovered:
         """Ask nothing any more."""
         self._closed = True
         self._on_close(self)
-        if self._timer is not None:
-            self._timer.cancel()
+        self._deadline.cancel()
 
     def link_changed(self, linked: bool) -> None:
         """The way to the sources was lost or is there again."""
@@ -130,11 +130,7 @@ class Recovered:
         for ask in self._recovery.asks(now):
             self._ask(ask)
         deadline = self._recovery.next_deadline()
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        if deadline < math.inf:
-            self._timer = self._loop.call_later(max(0.0, deadline - now), self._go_on, [])
+        self._deadline.set(deadline if deadline < math.inf else None)
         if freed:
             self._arrivals.pass_on(self._on_batch, freed)
 

@@ -28,8 +28,7 @@ from bridge.cli import build_parser
 from bridge.headset.client import Headset
 from bridge.security import policy
 from bridge.security.generate import generate
-from bridge.settings import Settings
-from macs_zenoh import config
+from bridge.settings import Settings, load
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.sections import changed
@@ -109,7 +108,7 @@ def test_a_router_has_the_values_of_its_programs(router: str) -> None:
     """Whatever our programs set on their end of a link, the router's file sets on the other; nothing has drifted."""
     written = zenoh.Config.from_file(str(CONFIG / router))
     for settings in ENDS[router]:
-        agree(written, config.load(CONFIG / settings).mesh)
+        agree(written, load(CONFIG / settings).mesh)
     assert json.loads(written.get_json("mode")) == "router"
     assert json.loads(written.get_json("adminspace")) == {
         "enabled": True,
@@ -132,7 +131,7 @@ def test_both_ends_of_generated_links_agree(path: Path, tmp_path: Path) -> None:
     for router in read.routers:
         written = zenoh.Config.from_file(str(tmp_path / router.name / "router.json5"))
         for client in read.clients:
-            agree(written, config.load(tmp_path / client.name / "macs.toml").mesh)
+            agree(written, load(tmp_path / client.name / "macs.toml").mesh)
 
 
 async def test_a_site_works_on_either_router(tmp_path: Path) -> None:
@@ -147,7 +146,7 @@ async def test_a_site_works_on_either_router(tmp_path: Path) -> None:
         path.write_text(text.replace("tcp/[::]:7447", f"tcp/127.0.0.1:{ports.get(path.stem, 0)}"), encoding="utf-8")
         return path
 
-    robot = config.load(placed("robot.toml"))
+    robot = load(placed("robot.toml"))
     at_port = ["--host", "127.0.0.1", "--port", "0"]
     async with AsyncExitStack() as stack:
         routers = [await stack.enter_async_context(Router(placed(f"{name}.json5"))) for name in ports]
@@ -180,7 +179,7 @@ async def meet(headset: Headset, robot: macs_zenoh.Agent) -> None:
 @pytest.mark.parametrize("path", SETTINGS, ids=ids)
 def test_programs_accept_it(path: Path) -> None:
     """Each settings file has known names and values within their ranges, and says something, but for the full list."""
-    assert (config.load(path) == Settings()) == (path == CONFIG / "macs.toml")
+    assert (load(path) == Settings()) == (path == CONFIG / "macs.toml")
 
 
 @pytest.mark.parametrize("path", PLANS, ids=ids)

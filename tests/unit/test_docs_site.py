@@ -45,7 +45,9 @@ def _on_site(name: str, link: str) -> bool:
 
 def test_a_file_of_the_repository_is_linked_where_it_is_kept() -> None:
     """Pages lead to sources and settings in the repository, and to what is made from a source on the site."""
-    text = "[a](../config/macs.toml) [b](../macs_zenoh/config.py) [c](robot.md#qos) [d](#here) [e](../config/wan)"
+    text = (
+        "[a](../config/macs.toml) [b](../bridge/settings/__init__.py) [c](robot.md#qos) [d](#here) [e](../config/wan)"
+    )
     kept = f"{reference_pages.repository()}/"
     assert reference_pages.links_of_site(text, "deploy") == (
         f"[a]({kept}blob/main/config/macs.toml) [b](generated/settings.md) [c](robot.md#qos) [d](#here) "

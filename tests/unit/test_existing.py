@@ -20,7 +20,7 @@ from macs_zenoh.protocol.existing import (
     to_robot,
 )
 from macs_zenoh.protocol.messages import FOR_NEWER, MANAGERS, ROS, UNITY, AddNode, Metadata, NodeType
-from macs_zenoh.protocol.wire import Header, encode_frame, encode_message, parse_frame, parse_frames, split_message
+from macs_zenoh.protocol.wire import Header, encode_frame, encode_message, parse_frame, parse_runs, split_message
 
 TEXT = CDR + b"\x02\x00\x00\x00a\x00"
 FORBIDDEN = [
@@ -245,9 +245,7 @@ def test_a_run_is_judged_message_by_message() -> None:
     """Of messages that begin alike those that fit are sent, in order."""
     raw = said().encode()
     bodies = [CDR + bytes([n]) if n % 3 else b"abcde" for n in range(9)]
-    (frame,) = parse_frames(
-        b"".join(encode_frame(2, (1,), message=encode_message(raw, body)) for body in bodies), runs=True
-    )
+    (frame,) = parse_runs(b"".join(encode_frame(2, (1,), message=encode_message(raw, body)) for body in bodies))
     messages, others = fitting(frame, Data.CDR, said())
     assert [bytes(split_message(message)[1]) for message in messages] == [body for body in bodies if body[:4] == CDR]
     assert others == 3

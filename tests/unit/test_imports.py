@@ -26,6 +26,8 @@ WITH_ASYNCIO = WITH_ZENOH | {
     for name in (
         "agent.py",
         "awareness.py",
+        "claims.py",
+        "deadline.py",
         "identity.py",
         "locked_out.py",
         "nodes.py",

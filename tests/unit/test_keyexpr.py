@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import re
-import typing
 
 import pytest
 import zenoh
@@ -101,15 +100,6 @@ def test_a_key_is_parsed_into_what_it_was_built_of(space_name: str, data: st.Dat
     assert parsed is not None
     assert parsed._asdict() == fields
     assert keyexpr.parse(key) == (space_name, parsed)
-
-
-@by_space
-def test_what_a_key_says_has_the_fields_of_its_template(space_name: str) -> None:
-    """Each key space has a type of its own for its fields: these, in this order, numbers where they are numbers."""
-    space = KEYS[space_name]
-    assert space.read._fields == space.fields
-    kinds = typing.get_type_hints(space.read)
-    assert kinds == {name: int if name in NUMBERS else str for name in space.fields}
 
 
 @by_space

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from macs_zenoh.errors import BadField, BadJson, BadSizes, UsageError, WireError
 from macs_zenoh.protocol import named
+from macs_zenoh.protocol.key_fields import NameFields
 from macs_zenoh.protocol.keyexpr import NAME, WANTED
 from macs_zenoh.protocol.named import (
     Arrivals,
@@ -68,8 +69,8 @@ def test_any_bytes_give_a_message_or_a_wire_error(payload: bytes) -> None:
 def test_any_text_may_be_a_name(word: str) -> None:
     """Slashes, spaces, wildcards and Unicode are allowed, and a key brings them back."""
     check_word("agent name", word)
-    fields = {"name": word, "type": 1, "id": 7, "zid": "a"}
-    assert NAME.parse(NAME.of(**fields)) == fields
+    fields = NameFields(word, type=1, id=7, zid="a")
+    assert NAME.parse(NAME.of(**fields._asdict())) == fields
 
 
 @pytest.mark.parametrize("word", ["", "x" * 201, "\ud800"])
