@@ -42,8 +42,9 @@ def test_help_names_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--help"])
     assert ended.value.code == 0
     shown = capsys.readouterr().out
+    width = max(map(len, VERBS)) + 2
     for verb, module in VERBS.items():
-        assert f"    {verb:12}{module.SUMMARY}" in shown
+        assert f"    {verb:{width}}{module.SUMMARY}" in shown
     assert shown.count("\n  macs ") == 3
     assert "Exit codes: 0 done; 1 " in shown
 
