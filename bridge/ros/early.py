@@ -76,10 +76,14 @@ class EarlyMessages:
         """Whether anything of one sender waits. From any thread."""
         return sender in self._nodes
 
-    def of(self, sender: Sender, key: NodeKey | None = None) -> list[tuple[NodeKey, Message]]:
-        """What waits of one sender, for one node or all, with what it is for; of each node the oldest first."""
-        mine = ((own, waiting) for (who, own), waiting in self._waiting.items() if who == sender)
-        return [(own, early.message) for own, waiting in mine if key in (None, own) for early in waiting]
+    def keys(self, sender: Sender) -> list[NodeKey]:
+        """The nodes for which anything of one sender waits."""
+        return [key for who, key in self._waiting if who == sender]
+
+    def first(self, sender: Sender, key: NodeKey) -> Message | None:
+        """The oldest that waits of one sender for one node. It costs the same however many wait behind it."""
+        waiting = self._waiting.get((sender, key))
+        return waiting[0].message if waiting else None
 
     def waited_s(self, key: NodeKey, message: Message, now: float) -> float:
         """For how long one of them has waited here."""
@@ -88,7 +92,11 @@ class EarlyMessages:
 
     def remove(self, key: NodeKey, message: Message) -> None:
         """One message waits no more."""
-        self._take(_sender(message), key, lambda early: early.message is message)
+        sender = _sender(message)
+        if self.first(sender, key) is message:
+            self._take_first(sender, key)
+        else:
+            self._take(sender, key, lambda early: early.message is message)
 
     def waiting_for(self, key: NodeKey) -> list[Message]:
         """What waits for one node, of all senders, oldest first."""
@@ -104,14 +112,25 @@ class EarlyMessages:
     def expire(self, now: float) -> dict[NodeKey, list[Message]]:
         """Give up those that waited too long, and return them by node."""
         expired: dict[NodeKey, list[Message]] = {}
-        for sender, key in list(self._waiting):
-            if late := self._take(sender, key, lambda early: early.deadline <= now):
-                expired.setdefault(key, []).extend(early.message for early in late)
+        for (sender, key), waiting in list(self._waiting.items()):
+            while waiting and waiting[0].deadline <= now:  # the oldest first: those behind it have longer
+                expired.setdefault(key, []).append(self._take_first(sender, key))
         return expired
 
     def next_deadline(self) -> float | None:
         """When `expire` has something to do; None while nothing waits."""
         return min((waiting[0].deadline for waiting in self._waiting.values()), default=None)
+
+    def _take_first(self, sender: Sender, key: NodeKey) -> Message:
+        """The oldest of one sender's messages for a node, at a cost that does not grow with those behind it."""
+        waiting = self._waiting[sender, key]
+        message = waiting.popleft().message
+        self._bytes[sender] -= len(message.data)
+        if not waiting:
+            del self._waiting[sender, key]
+            self._nodes[sender] -= 1
+            self._forget_empty(sender)
+        return message
 
     def _take(self, sender: Sender, key: NodeKey, wanted: Callable[[EarlyMessage], bool]) -> list[EarlyMessage]:
         """Of one sender's messages for a node."""
@@ -123,9 +142,12 @@ class EarlyMessages:
         else:
             self._nodes[sender] -= 1
         self._bytes[sender] -= sum(len(early.message.data) for early in taken)
+        self._forget_empty(sender)
+        return taken
+
+    def _forget_empty(self, sender: Sender) -> None:
         if not self._nodes[sender]:
             del self._nodes[sender], self._bytes[sender]
-        return taken
 
 
 def _sender(message: Message) -> Sender:

@@ -236,7 +236,8 @@ class InterfaceNodes:
         """An agent is seen now; what it sent before waits to be judged."""
         self.rights.changed()
         with self._early_lock:
-            self._pass_waiting(registrant)
+            for key in self._early.keys(registrant):
+                self._pass_waiting(registrant, key)
 
     def returned(self, registrant: Registrant) -> None:
         """An agent that seemed to have left is there again, the same one."""
@@ -263,7 +264,7 @@ class InterfaceNodes:
             return
         with self._early_lock:
             self._pass_waiting(sender, key)
-            if self._early.of(sender, key) or not self._deliver(key, message):
+            if self._early.first(sender, key) is not None or not self._deliver(key, message):
                 self._keep_early(key, message)
 
     def _deliver(self, key: NodeKey, message: Message) -> bool:
@@ -279,17 +280,20 @@ class InterfaceNodes:
         node.receive(message)
         return True
 
-    def _pass_waiting(self, sender: Registrant, key: NodeKey | None = None) -> None:
-        """Deliver what waits of one sender, as far as it need not any more. With the lock, and until all is delivered
-        it counts as waiting: nothing newer overtakes it in another thread."""
-        for own, message in self._early.of(sender, key):
+    def _pass_waiting(self, sender: Registrant, key: NodeKey) -> None:
+        """Deliver what waits of one sender for one node, as far as it need not any more: where the oldest has to, so
+        have all. With the lock, and until all is delivered it counts as waiting: nothing newer overtakes it in another
+        thread."""
+        while (message := self._early.first(sender, key)) is not None:
             passed = True
             try:
-                aged = self._aged(own, message)
-                passed = aged is None or self._deliver(own, aged)
+                aged = self._aged(key, message)
+                passed = aged is None or self._deliver(key, aged)
             finally:
                 if passed:
-                    self._early.remove(own, message)
+                    self._early.remove(key, message)
+            if not passed:
+                return
 
     def _keep_early(self, key: NodeKey, message: Message) -> None:
         if self._has_just_left(key, message):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -20,6 +21,7 @@ from bridge.ros.session import RosSession
 from bridge.settings import RobotSettings
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import DataRefused, Metadata, NodeType, StreamData, decode_data, decode_management
+from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import parse_frame
 from tests.support.ros_peer import Peer, adding, command, removing
 from tests.support.waiting import get, until
@@ -578,6 +580,23 @@ def test_waiting_messages_are_bounded_in_names_and_bytes() -> None:
     early.remove(NodeKey(2, "0"), big)
     assert not early.waits((2, big.sender_id))
     assert early._bytes.total() == 0
+
+
+async def test_a_call_costs_the_same_however_many_wait(nodes: InterfaceNodes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a flood of calls for a node that nobody registered the next one is looked at, and not all that wait."""
+    looked: Counter[str] = Counter()
+    deliver = InterfaceNodes._deliver
+
+    def counted(self: InterfaceNodes, key: NodeKey, message: Message) -> bool:
+        looked["at"] += 1
+        return deliver(self, key, message)
+
+    monkeypatch.setattr(InterfaceNodes, "_deliver", counted)
+    said = Metadata(node_type=NodeType.CLIENT, node_name="nd__no")
+    for _ in range(2 * EarlyMessages.CALLS_PER_NODE):
+        nodes.deliver(Message("unity", 300, said, bytes([0, 1, 0, 0])))
+    assert nodes.drops["held_full"] == EarlyMessages.CALLS_PER_NODE
+    assert looked["at"] <= 2 * 2 * EarlyMessages.CALLS_PER_NODE
 
 
 def test_who_names_many_nodes_takes_nobodys_place() -> None:
