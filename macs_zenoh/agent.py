@@ -26,6 +26,7 @@ from .identity import Identity
 from .mesh import Aged, Mesh, Sample, Subscription, Traffic
 from .nodes import ANSWER_S, Nodes
 from .presence import Presence
+from .presses import REPLACES, STOP_NAME, WAITS, WAITS_INSTEAD, Presses
 from .protocol.agent_id import AgentId
 from .protocol.directory import AgentInfo, Change, Directory
 from .protocol.guard import Guard
@@ -54,7 +55,8 @@ class Agent:
     """One agent. Made by `join`; all methods belong to its event loop.
 
     ``drops`` counts by name what was lost: ``inbox_full`` (received faster than taken; the oldest goes),
-    ``bad_frame``, ``no_destination``, ``unknown_agent`` (sent to an id that is not online).
+    ``bad_frame``, ``no_destination``, ``unknown_agent`` (sent to an id that is not online), ``too_old`` (a release of
+    an emergency stop that waited for the stop to be answered, and was followed by another word).
     """
 
     INBOX = 4096
@@ -68,6 +70,7 @@ class Agent:
         self.drops: Counter[str] = Counter()
         self._presence = Presence(mesh, self._presence_changed, lambda contested: self._identity.contested(contested))
         self._identity = Identity(mesh, self._presence, agent_type, group, listen=self._listen, on_id=self._id_changed)
+        self._presses = Presses(mesh, self._presence.directory)
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
         self._reader = Reader(self._layout, self._bad_frame)
         self._inbox: deque[Message] = deque()
@@ -148,7 +151,19 @@ class Agent:
         traffic = Traffic.COMMAND if stamped.node_type == NodeType.PUBLISHER else Traffic.CALL
         for agent_id in ids:
             self._note_unknown(to, agent_id)
-        for key in keys_of(self._layout.unpack(frame), self.type_number, self.id):
+        header = self._layout.unpack(frame)
+        keys = keys_of(header, self.type_number, self.id)
+        if traffic is Traffic.COMMAND and stamped.node_name == STOP_NAME:
+            put = partial(self._put, keys, frame, traffic)
+            looked = self._presses.look(self.key, header, bytes(data[:5]), put)
+            if looked in (REPLACES, WAITS_INSTEAD):
+                self.drops["too_old"] += 1
+            if looked in (WAITS, WAITS_INSTEAD):
+                return
+        self._put(keys, frame, traffic)
+
+    def _put(self, keys: list[str], frame: bytes, traffic: Traffic) -> None:
+        for key in keys:
             self.mesh.put(key, frame, traffic)
 
     def _stamp(self, metadata: Metadata) -> Metadata:
@@ -214,7 +229,8 @@ class Agent:
     def _receive_judged(self, batch: Iterator[Aged], *, guard: Guard, by_group: bool = False) -> None:
         me = (self.type_number, self.id)
         for key, payload, age_s, now in batch:
-            for message in self._reader.read(key, payload, me, by_group=by_group):
+            messages = self._reader.read(key, payload, me, by_group=by_group)
+            for message in guard.covered(key, len(payload), messages, now):
                 if guard.judge(message, key, age_s, now):
                     self._on_message(message._replace(age_s=age_s))
 
@@ -414,6 +430,7 @@ class Agent:
                 callback(agent, online)
 
     def _id_changed(self, old: int, new: int) -> None:
+        self._presses.leave(AgentId(self.type_number, old))
         self.id = new
         self._served.renew()
         if self._nodes is not None:
@@ -450,6 +467,7 @@ class Agent:
         self._closed = True
         if self._nodes is not None:
             self._nodes.close()
+        self._presses.close()
         self._identity.close()
         self._served.close()
         for declared in reversed(self._declared):

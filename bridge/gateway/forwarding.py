@@ -10,6 +10,7 @@ import time
 from dataclasses import dataclass, field
 
 from macs_zenoh.mesh import Mesh, Payload, Traffic
+from macs_zenoh.presses import GOES, STOP_NAME, WAITS, WAITS_INSTEAD, Presses
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.existing import asks
@@ -23,7 +24,6 @@ from .agents import Agents
 from .backpressure import Backpressure
 from .connection import Connection
 from .judged import JudgedFrames, Read
-from .presses import Presses
 from .routes import Route, Routes
 
 PUBLISHER = int(NodeType.PUBLISHER)
@@ -71,6 +71,7 @@ class Forwarding:
 
     def leave(self, connection: Connection) -> None:
         """It has ended."""
+        self._presses.leave(connection.key)
         self._routes.pop(connection, None)
         self.afar.leave(connection)
 
@@ -81,6 +82,7 @@ class Forwarding:
     def forget(self, connection: Connection) -> None:
         """It is about to have another id: what it sent goes under the one that it had."""
         self.flush()
+        self._presses.leave(connection.key)
         self._routes[connection].forget()
 
     def forward(self, connection: Connection, sent: Sent) -> None:
@@ -183,8 +185,8 @@ class Forwarding:
         now, count, metadata = time.monotonic(), sent.frame.count, sent.metadata
         if traffic is COMMAND:
             may_stop = metadata.data_exchange_type in STOP_TYPES
-            if may_stop:
-                self._presses.look(connection.key, sent.frame, metadata)
+            if may_stop and metadata.node_name == STOP_NAME and self._waits_for_stop(connection, sent, route):
+                return False
             passing = connection.pace.command(count, now, may_stop=may_stop)
         else:
             passing = connection.pace.request(count, now)
@@ -202,3 +204,16 @@ class Forwarding:
         if older:
             connection.complain("too_old", "commands that waited with newer ones", older)
         return False
+
+    def _waits_for_stop(self, connection: Connection, sent: Sent, route: Route) -> bool:
+        """Whether a release, or what else may be on that topic, goes on later."""
+        *_, last = sent.frame.each()
+        looked = self._presses.look(
+            connection.key,
+            sent.frame.header,
+            bytes(last.body[:5]),
+            lambda: self._put(route.keys, sent.frame.data, COMMAND),
+        )
+        if looked not in (GOES, WAITS):
+            connection.complain("too_old", "a release that waited for a stop to be answered, and what came after it")
+        return looked in (WAITS, WAITS_INSTEAD)

@@ -52,6 +52,8 @@ class StopNode(InterfaceNode):
         self._shared: SharedStop | None = None
         self._lock = threading.RLock()
         """Held while the stop changes and that is told: what is told last is what holds."""
+        self.overtaken: Callable[[Message], bool] = lambda message: False
+        """Whether a release was sent before its sender asked for a stop, which is faster."""
 
     @property
     def in_use(self) -> bool:
@@ -94,7 +96,11 @@ class StopNode(InterfaceNode):
             self.robot.tell_refused(message, self.topic, "bad_cdr", problem)
             return
         try:
-            self.set(sender, message.data[4] != 0)
+            with self._lock:
+                if not message.data[4] and self.overtaken(message):
+                    self.robot.drops.note("too_old", f"{self.topic} from {sender}", "it released before it stopped")
+                    return
+                self.set(sender, message.data[4] != 0)
         except Refused as refusal:
             self.robot.drops.note("not_allowed", f"{self.topic} from {sender}", refusal.reason)
             self.robot.tell_refused(message, self.topic, "not_allowed", refusal.reason)

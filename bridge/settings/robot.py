@@ -8,6 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from macs_zenoh.config import Priority
+from macs_zenoh.protocol.guard import STOP_TOPIC
 from macs_zenoh.sections import AgentId, Bytes, GroupId, Seconds, Section, in_words
 
 from .agents import AgentPattern, names_agents
@@ -120,7 +121,7 @@ class RobotSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Calls that may be open on one service at one time."""
     result_timeout_s: Annotated[float, Meta(gt=0, le=604_800)] = 900.0
     """How long the result of an action is kept for a headset that has lost its connection."""
-    stop_topic: TopicOrNone = "/emergency_stop"
+    stop_topic: TopicOrNone = STOP_TOPIC
     """The emergency stop: true on this topic (std_msgs/Bool) stops, false releases. Empty: there is none."""
     stop_allow: list[AgentPattern] = msgspec.field(default_factory=lambda: ["*"])
     """Who may stop: ``*``, ``unity``, ``unity/5``, ``block/1`` (headsets of this block of ids), ``group/3`` or

@@ -19,12 +19,15 @@ from typing import NamedTuple, Protocol
 from ..errors import WireError
 from .agent_id import AgentId
 from .credit import Credit
-from .keyexpr import GROUP, UNICAST, sender_of
+from .keyexpr import GROUP, UNICAST, sender_of, type_number
 from .messages import ROS, NodeType
 from .reading import Message, Reader
 from .wire import Layout
 
+STOP_TOPIC = "/emergency_stop"
+"""Of a robot whose settings name no other."""
 COMMAND = int(NodeType.PUBLISHER)
+FLOODED = "it sends more than one agent may"
 Buffer = bytes | bytearray
 
 AGED_S = 0.01
@@ -58,8 +61,20 @@ class Allowances:
             credit = self._senders[sender] = self._credit_of_another(now)
         else:
             self._senders.move_to_end(sender)
-        cost = 1.0 if size <= SINGLE_BYTES else min(self._most, size / RUN_BYTES)
+        cost = self._cost(size)
         return credit.take(cost, now) and (credit.left(now) >= self._little or self._all.take(cost, now))
+
+    def covered(self, sender: str, size: int, messages: int, now: float) -> int:
+        """How many of a sample's messages may pass, the first ones: before it was read, `take` took what a sample of
+        its size costs as one message."""
+        paid = int(self._cost(size))
+        for number in range(paid, messages):
+            if not self.take(sender, 0, now):
+                return number
+        return messages
+
+    def _cost(self, size: int) -> float:
+        return 1.0 if size <= SINGLE_BYTES else min(self._most, size / RUN_BYTES)
 
     def _credit_of_another(self, now: float) -> Credit:
         """What a new sender begins with; once there are too many, with what is left to whom it displaces: names that
@@ -221,8 +236,13 @@ class Limits(NamedTuple):
 
 
 OnCommand = Callable[[Message], None]
-OnDropped = Callable[[str, str, str], None]
-"""The name of a loss, whose it was, and why."""
+
+
+class OnDropped(Protocol):
+    """Hears of losses."""
+
+    def __call__(self, name: str, about: str, text: str, count: int = 1, /) -> None:
+        """The name of a loss, whose it was, why, and how much it was."""
 
 
 class Gate(Protocol):
@@ -254,7 +274,7 @@ class Guard:
         self.me = (ROS, 0)
         """Type and id of the robot, kept by the agent."""
         self.on_command: OnCommand | None = None
-        self.on_dropped: OnDropped = lambda name, sender, why: None
+        self.on_dropped: OnDropped = lambda name, sender, why, count=1: None
         self._stop_name, self._stop_bytes = "", b""
         self._urgent = Allowances(limits.commands_per_s)
         self._requests = Allowances(limits.requests_per_s)
@@ -285,7 +305,7 @@ class Guard:
             admitted = (self._urgent if urgent else self._requests).take(sender, size, now)
         if admitted:
             return True
-        self.on_dropped("flooded", sender, "it sends more than one agent may")
+        self.on_dropped("flooded", sender, FLOODED)
         return False
 
     def age(self, key: str, clock: Hashable, stamp: float, now: float) -> float:
@@ -307,10 +327,27 @@ class Guard:
                         command(message)
                 return False
             sender = sender_of(key)
-            for message in messages:
+            for message in self._covered(self._urgent, sender, len(payload), messages, now):
                 if self._passes(message, sender, age_s, now):
                     command(message._replace(age_s=age_s) if age_s > AGED_S else message)
         return True
+
+    def covered(self, key: str, size: int, messages: list[Message], now: float) -> list[Message]:
+        """Of a sample that comes to the loop: as many of its messages as its sender may send, and stops."""
+        return self._covered(self._requests, sender_of(key), size, messages, now)
+
+    def _covered(
+        self, allowances: Allowances, sender: str, size: int, messages: list[Message], now: float
+    ) -> list[Message]:
+        """A sample may hold hundreds of messages, each of which has its cost."""
+        if len(messages) <= 1:
+            return messages
+        with self._counting:
+            most = allowances.covered(sender, size, len(messages), now)
+        kept = messages[:most] + [message for message in messages[most:] if self._stops(message)]
+        if len(kept) < len(messages):
+            self.on_dropped("flooded", sender, FLOODED, len(messages) - len(kept))
+        return kept
 
     def judge(self, message: Message, key: str, age_s: float, now: float) -> bool:
         """Whether a message that comes to the loop is delivered: commands among others, or in a sample too large to be
@@ -321,13 +358,19 @@ class Guard:
             return self._passes(message, sender_of(key), age_s, now)
 
     def pressed(self, sender: tuple[int, int], now: float) -> None:
-        """Somebody has stopped the robot by asking, which overtakes what it puts: a release that it sent before is not
-        what it wants now."""
-        with self._lock:
+        """Somebody stops the robot by asking, which overtakes what it puts: a release that it sent before is not what
+        it wants now. It waits for no command that is being carried out, so one that releases may be: whoever releases
+        asks `overtaken` once more in the moment in which he does."""
+        with self._counting:
             self._pressed[name := str(AgentId(*sender))] = now
             self._pressed.move_to_end(name)
             if len(self._pressed) > self.PRESSED:
                 self._pressed.popitem(last=False)
+
+    def overtaken(self, message: Message, now: float) -> bool:
+        """Whether a release was sent before the stop for which its sender asked."""
+        sender = str(AgentId(type_number(message.sender_type), message.sender_id))
+        return self._overtaken(message, sender, message.age_s, now)
 
     def rescue(self, key: str, payload: Buffer, now: float) -> None:
         """Of a sample that is not admitted: whoever floods may still stop the robot. What names the stop and does not

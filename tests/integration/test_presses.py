@@ -1,4 +1,5 @@
-"""A headset's emergency stop: its gateway asks the robot for it as well, in the headset's name."""
+"""An emergency stop that is sent as data: its gateway asks the robot for it as well, in the headset's name, and an
+agent does so for itself."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import asyncio
 import pytest
 
 import macs_zenoh
+from macs_zenoh import presses
 from macs_zenoh.agent import Agent
 from macs_zenoh.protocol.messages import Metadata, NodeType
 from macs_zenoh.protocol.wire import encode_frame, encode_message
@@ -76,3 +78,124 @@ async def test_nothing_else_is_asked_for(router: str, start_gateway: StartGatewa
         await until(lambda: asked.calls)
         await asyncio.sleep(0.2)
         assert len(asked.calls) == 1
+
+
+# -- a release and its stop ------------------------------------------------------------------------------------------
+
+
+class Slow:
+    """A robot that answers a question for its stop only when it is let, and notes all that comes, in order."""
+
+    def __init__(self, agent: Agent) -> None:
+        self.answer = asyncio.Event()
+        self.came: list[bytes] = []
+        agent.serve("stop", self._stop)
+        agent.on_message(lambda message: self.came.append(message.data))
+
+    async def _stop(self, call: Call) -> bytes:
+        self.came.append(b"asked " + call.data)
+        await self.answer.wait()
+        return b""
+
+
+async def test_a_release_does_not_overtake_the_question_for_its_stop(
+    router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """It waits until the robot has answered, and then it comes; what else the headset sends does not wait for it."""
+    gateway = await start_gateway()
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+        robot = Slow(agent)
+        headset = await connect(gateway)
+        await until(lambda: (1, 7) in gateway.directory)
+        for frame in (said(PRESS, ids=(7,)), said(RELEASE, ids=(7,)), said(b"else", ids=(7,), about=Metadata())):
+            await headset.send_frame(frame)
+        await until(lambda: {PRESS, b"asked true", b"else"} <= set(robot.came))
+        assert RELEASE not in robot.came
+        robot.answer.set()
+        await until(lambda: RELEASE in robot.came)
+        assert robot.came.count(RELEASE) == 1
+
+
+async def test_a_press_takes_the_place_of_a_release_that_waits(
+    router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """Who has released and stops again wants it stopped: the release is not sent any more, and that is counted."""
+    gateway = await start_gateway()
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+        robot = Slow(agent)
+        headset = await connect(gateway)
+        await until(lambda: (1, 7) in gateway.directory)
+        for data in (PRESS, RELEASE, PRESS):
+            await headset.send_frame(said(data, ids=(7,)))
+        await until(lambda: robot.came.count(PRESS) == 2)
+        robot.answer.set()
+        await asyncio.sleep(2 * presses.SETTLED_S)
+        await headset.send_frame(said(b"last", ids=(7,), about=Metadata()))
+        await until(lambda: b"last" in robot.came)
+        assert RELEASE not in robot.came
+        (connection,) = gateway.agents.online()
+        assert connection.drops["too_old"] == 1
+
+
+async def test_what_a_headset_released_counts_when_it_has_left(
+    router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """Its release does not wait any longer than the headset is there."""
+    gateway = await start_gateway()
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+        robot = Slow(agent)
+        headset = await connect(gateway)
+        await until(lambda: (1, 7) in gateway.directory)
+        for data in (PRESS, RELEASE):
+            await headset.send_frame(said(data, ids=(7,)))
+        await until(lambda: PRESS in robot.came and b"asked true" in robot.came)
+        await headset.close()
+        await until(lambda: RELEASE in robot.came)
+        robot.answer.set()
+
+
+async def test_a_question_that_is_lost_keeps_no_other_from_being_asked(
+    router: str, start_gateway: StartGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who presses again is asked for again, though the first question has no answer yet; not for every press."""
+    monkeypatch.setattr(presses, "ANSWER_S", 60.0)
+    gateway = await start_gateway()
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+        robot = Slow(agent)
+        headset = await connect(gateway)
+        await until(lambda: (1, 7) in gateway.directory)
+        await headset.send_frame(said(PRESS, ids=(7,)) * 20)
+        await until(lambda: b"asked true" in robot.came)
+        await asyncio.sleep(presses.AGAIN_S)
+        await headset.send_frame(said(PRESS, ids=(7,)))
+        await until(lambda: robot.came.count(b"asked true") == 2)
+        robot.answer.set()
+
+
+async def test_an_agent_asks_for_its_own_stop(router: str) -> None:
+    """What a program on the mesh sends on the topic of the stop is asked for as well, and its release waits."""
+    async with (
+        macs_zenoh.join("ros", id=7, connect=[router]) as agent,
+        macs_zenoh.join("unity", id=300, connect=[router]) as presser,
+    ):
+        robot = Slow(agent)
+        await until(lambda: (1, 7) in presser.directory)
+        for data in (PRESS, RELEASE):
+            presser.send(data, to="ros", ids=[7], metadata=STOP)
+        await until(lambda: {PRESS, b"asked true"} <= set(robot.came))
+        assert RELEASE not in robot.came
+        robot.answer.set()
+        await until(lambda: RELEASE in robot.came)
+
+
+async def test_what_an_agent_released_is_sent_before_it_leaves(router: str) -> None:
+    """The last thing that a program says is not lost."""
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+        robot = Slow(agent)
+        async with macs_zenoh.join("unity", id=300, connect=[router]) as presser:
+            await until(lambda: (1, 7) in presser.directory)
+            for data in (PRESS, RELEASE):
+                presser.send(data, to="ros", ids=[7], metadata=STOP)
+            await until(lambda: b"asked true" in robot.came)
+        await until(lambda: RELEASE in robot.came)
+        robot.answer.set()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 
 import pytest
 
@@ -235,7 +236,7 @@ def test_commands_among_others_are_held_to_their_age(guard: Guard, taken: list[M
     """What goes to the loop with other messages is judged there: what has waited too long, on the way or for the loop,
     is not delivered; what is no command is, and a stop has been carried out before."""
     dropped = []
-    guard.on_dropped = lambda name, sender, why: dropped.append(name)
+    guard.on_dropped = lambda name, sender, why, count=1: dropped.append(name)
     mixed = frame(data=b"old") + frame(kind=NodeType.CLIENT) + frame(STOP)
     assert not guard.first(KEY, mixed, 0.7, 0.0)
     assert [message.metadata.node_name for message in taken] == [STOP]
@@ -260,7 +261,7 @@ def test_a_group_copy_is_dropped_where_the_id_is_named(guard: Guard, taken: list
 def test_a_stop_passes_however_old_and_however_many(guard: Guard, taken: list[Message]) -> None:
     """Who floods may stop the robot, in the middle of it, and a stop that has waited stops; a release does neither."""
     dropped = []
-    guard.on_dropped = lambda name, sender, why: dropped.append(name)
+    guard.on_dropped = lambda name, sender, why, count=1: dropped.append(name)
     stop, release = frame(STOP), frame(STOP, b"\x00\x01\x00\x00\x00")
     assert guard.first(KEY, stop, 9.0, 0.0)
     assert guard.first(KEY, release, 9.0, 0.0)
@@ -288,6 +289,27 @@ def test_a_release_that_a_stop_has_overtaken_releases_nothing(guard: Guard, take
     for number in range(2 * Guard.PRESSED):
         guard.pressed((2, 1000 + number), 11.0)
     assert len(guard._pressed) == Guard.PRESSED
+
+
+def test_a_sample_of_many_messages_costs_what_they_cost(guard: Guard, taken: list[Message]) -> None:
+    """However small they are: of a thousand in one sample as many pass as their sender may send, and each stop."""
+    dropped: Counter[str] = Counter()
+
+    def note(name: str, sender: str, why: str, count: int = 1) -> None:
+        dropped[name] += count
+
+    guard.on_dropped = note
+    small = encode_frame(1, (7,), message=encode_message(b'{"nodeType":2,"nodeName":"x"}', b"c"))
+    sample = small * 1000 + frame(STOP)
+    assert guard.admits(KEY, len(sample), True, 0.0)
+    assert guard.first(KEY, sample, 0.0, 0.0)
+    assert [message.metadata.node_name for message in taken[-1:]] == [STOP]
+    assert 1 < len(taken) <= 101
+    assert dropped == {"flooded": 1001 - len(taken)}
+    asked = Reader(MACS, lambda key, error: None).read(KEY, frame("", kind=0) * 300, ME, by_group=False)
+    assert guard.admits(KEY, 300 * 200, False, 0.0)
+    assert 1 < len(guard.covered(KEY, 300 * 200, asked, 0.0)) <= 10
+    assert len(guard.covered(unicast_key(1, 7, 2, 301), 200 * 5, asked[:5], 0.0)) == 5
 
 
 def test_a_command_tells_how_long_it_has_waited(guard: Guard, taken: list[Message]) -> None:

@@ -32,6 +32,7 @@ WITH_ASYNCIO = WITH_ZENOH | {
         "locked_out.py",
         "nodes.py",
         "presence.py",
+        "presses.py",
         "timeouts.py",
         "registration_calls.py",
         "serving.py",
