@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import uuid
 from contextlib import suppress
 
 from .config import MeshSettings
 from .errors import MacsError
 from .mesh import Mesh
+from .sections import changed
 
 log = logging.getLogger("macs.mesh")
 
@@ -23,10 +25,19 @@ AGAIN_S = 1.0
 TRY_S = 2.0
 
 
-async def locked_out(mesh: Mesh) -> None:
+def apart(settings: MeshSettings) -> MeshSettings:
+    """The settings of a second session beside one with these: routers let nobody in who has another's Zenoh id."""
+    others = [override for override in settings.overrides if not override.lstrip().startswith("id:")]
+    if len(others) == len(settings.overrides) and settings.config_file is None:
+        return settings  # Zenoh chooses the id
+    return changed(settings, overrides=[*others, f'id:"a{uuid.uuid4().hex[1:]}"'])
+
+
+async def locked_out(mesh: Mesh, *, any_id: bool = False) -> None:
     """Return when this session has been without a router for some time, and a second one, in its place, was let in
-    three times meanwhile. Never where the id is in the settings: another one is not wanted."""
-    if mesh.settings.mode != "client" or _id_is_chosen(mesh.settings):
+    three times meanwhile. Never where the id is in the settings, since another one is not wanted then; ``any_id``: it
+    is, this program has made it up (`apart`)."""
+    if mesh.settings.mode != "client" or (mesh.id_is_chosen and not any_id):
         await asyncio.Event().wait()
     while True:
         await asyncio.sleep(AGAIN_S)
@@ -46,10 +57,6 @@ async def _stays_out(mesh: Mesh) -> bool:
 
 async def _lets_another_in(settings: MeshSettings) -> bool:
     with suppress(MacsError):
-        async with await Mesh.open_once(settings, timeout_s=TRY_S):
+        async with await Mesh.open_once(apart(settings), timeout_s=TRY_S):
             return True
     return False
-
-
-def _id_is_chosen(settings: MeshSettings) -> bool:
-    return any(override.lstrip().startswith("id:") for override in settings.overrides)

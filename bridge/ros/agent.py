@@ -30,6 +30,7 @@ from bridge.settings import RobotSettings, Settings
 from macs_zenoh import managers
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError, Refused, WireError
+from macs_zenoh.handles import Handle
 from macs_zenoh.locked_out import locked_out
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import Mesh, now_s
@@ -135,6 +136,9 @@ class RobotAgent:
         if self._guard is not None:
             self._guard.on_dropped = self.nodes.drops.note
             self._guard.stop_name = self.nodes.stop.key.node_name if self.nodes.stop is not None else ""
+            if self.nodes.stop is not None:
+                guard = self._guard
+                self.nodes.stop.overtaken = lambda message: guard.overtaken(message, now_s())
             self._guard.on_command = self.nodes.deliver
 
     def _receive(self, message: Message) -> None:
@@ -245,8 +249,8 @@ class RobotAgent:
     async def _control(self, call: Call) -> bytes:
         return encode_data(self._controlled(Registrant(type_number(call.sender_type), call.sender_id), call.data))
 
-    def _serve_stop(self, mesh: Mesh) -> None:
-        self.agent.serve("stop", self._stopped, first=self._stop, mesh=mesh)
+    def _serve_stop(self, mesh: Mesh) -> Handle:
+        return self.agent.serve("stop", self._stopped, first=self._stop, mesh=mesh)
 
     def _stop(self, call: Call) -> None:
         """The emergency stop with an answer: data ``true`` or ``false``, as on its topic. In a thread of Zenoh's."""

@@ -10,46 +10,63 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import uuid
 from collections.abc import Callable
 
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
+from macs_zenoh.handles import Handle
+from macs_zenoh.locked_out import apart, locked_out
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.sections import changed
 
 log = logging.getLogger("macs.ros")
 
+AGAIN_S = 5.0
+"""Until a session that could not be had, or has failed, is tried again."""
+
 
 class StopLine:
     """That session. ``serve`` declares what it is for; until `close` it is kept, through outages of its router."""
 
-    def __init__(self, settings: MeshSettings, serve: Callable[[Mesh], object]) -> None:
-        self._settings = apart(settings)
+    def __init__(self, settings: MeshSettings, serve: Callable[[Mesh], Handle]) -> None:
+        self._settings = settings
         self._serve = serve
         self.is_open = False
+        self._problem = ""
         self._task = asyncio.get_running_loop().create_task(self._run())
 
     async def _run(self) -> None:
-        try:
-            async with await Mesh.open(self._settings, on_waiting=lambda target: None) as mesh:
-                self._serve(mesh)
-                self.is_open = True
-                await asyncio.Event().wait()
-        except MacsError as error:
-            log.warning("the emergency stop shares the session of everything else: %s", error)
-        finally:
-            self.is_open = False
+        while True:
+            try:
+                await self._once()
+            except MacsError as error:
+                self._tell(str(error))
+                await asyncio.sleep(AGAIN_S)
+            except Exception as error:
+                if self._tell(repr(error)):
+                    log.exception("serving the emergency stop in a session of its own failed")
+                await asyncio.sleep(AGAIN_S)
+
+    async def _once(self) -> None:
+        """Serve in one session, until somebody else has taken its Zenoh id."""
+        async with await Mesh.open(apart(self._settings), on_waiting=lambda target: None) as mesh:
+            serving = self._serve(mesh)
+            self.is_open, self._problem = True, ""
+            try:
+                await locked_out(mesh, any_id=True)
+            finally:
+                self.is_open = False
+                serving.close()
+
+    def _tell(self, problem: str) -> bool:
+        """Say what is wrong; whether it is news."""
+        if problem == self._problem:
+            return False
+        self._problem = problem
+        log.warning("the emergency stop shares the session of everything else: %s", problem)
+        return True
 
     async def close(self) -> None:
         """End it."""
         self._task.cancel()
         await asyncio.wait([self._task])
-
-
-def apart(settings: MeshSettings) -> MeshSettings:
-    """The settings of a second session beside one with these: routers let nobody in who has another's Zenoh id."""
-    others = [override for override in settings.overrides if not override.lstrip().startswith("id:")]
-    if len(others) == len(settings.overrides) and settings.config_file is None:
-        return settings  # Zenoh chooses the id
-    return changed(settings, overrides=[*others, f'id:"a{uuid.uuid4().hex[1:]}"'])

@@ -32,7 +32,7 @@ from .outgoing import Outgoing
 from .panics import call, end_on_panics, last_words, watched
 from .reliable import Recovered
 from .threads import keep_attached, shared_threads
-from .zenoh_config import check_files, first_line, insert, zenoh_config
+from .zenoh_config import check_files, first_line, id_is_chosen, insert, zenoh_config
 
 log = logging.getLogger("macs.mesh")
 
@@ -68,8 +68,9 @@ class Mesh:
         self.drops: Counter[str] = Counter()
         self.policer = Policer(traffic, self.drops)
         own = str(session.zid())
-        chosen = any(override.lstrip().startswith("id:") for override in settings.overrides)
-        self.zid = own if chosen else published(own)
+        self.id_is_chosen = id_is_chosen(settings)
+        """Whether its Zenoh id is in its settings, and no other one is wanted."""
+        self.zid = own if self.id_is_chosen else published(own)
         """As whom others know this session. One that was chosen is no secret."""
         self._session = session = watched(session)
         self._loop = asyncio.get_running_loop()

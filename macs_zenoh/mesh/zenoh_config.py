@@ -48,6 +48,15 @@ def zenoh_config(settings: MeshSettings) -> zenoh.Config:
     return config
 
 
+def id_is_chosen(settings: MeshSettings) -> bool:
+    """Whether the settings, or the file that they name, say which Zenoh id the session has. Otherwise Zenoh makes one
+    up for each session.
+
+    Raises ConfigError.
+    """
+    return zenoh_config(settings).get_json("id") not in ("null", zenoh.Config().get_json("id"))
+
+
 _CERTIFICATE, _KEY = b"CERTIFICATE-----", b"PRIVATE KEY-----"
 TLS_FILES = {
     "root_ca_certificate": _CERTIFICATE,

@@ -7,15 +7,20 @@ import threading
 from typing import Any
 
 import pytest
+import zenoh
 
+from bridge.ros import stop_line
 from bridge.ros.agent import open_robot
-from bridge.ros.stop_line import apart
 from bridge.settings import RobotSettings, Settings
-from macs_zenoh import join
+from macs_zenoh import join, locked_out
 from macs_zenoh.config import MeshSettings
-from macs_zenoh.errors import Refused
+from macs_zenoh.errors import ConfigError, Refused
+from macs_zenoh.handles import Handle
+from macs_zenoh.locked_out import apart
+from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.guard import Guard
 from macs_zenoh.protocol.messages import Metadata
+from tests.support.links import counted
 from tests.support.routers import Router
 from tests.support.waiting import until
 
@@ -108,3 +113,45 @@ def test_a_second_session_has_another_id() -> None:
         one, other = apart(chosen).overrides, apart(chosen).overrides
         assert one != other
         assert [kept for kept in one if not kept.startswith("id:")] == ["scouting/delay:1"]
+
+
+async def test_a_session_that_fails_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever goes wrong, of Zenoh's or of ours: it is tried again, and says once what is wrong."""
+    monkeypatch.setattr(stop_line, "AGAIN_S", 0.01)
+    failures: list[Exception] = [ConfigError("tls", "no certificate"), zenoh.ZError("closed"), RuntimeError("ours")]
+    closed: list[bool] = []
+
+    def serve(mesh: Mesh) -> Handle:
+        if failures:
+            raise failures.pop()
+        return Handle(lambda: closed.append(True))
+
+    async with Router() as router:
+        line = stop_line.StopLine(MeshSettings(connect=[router.endpoint]), serve)
+        await until(lambda: line.is_open)
+        await line.close()
+        assert closed == [True]
+        assert not line.is_open
+
+
+async def test_who_takes_its_id_gets_no_stop_of_it(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Routers let a thief in and not this session: it goes on under another id, and serves the stop again."""
+    monkeypatch.setattr(locked_out, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(locked_out, "AGAIN_S", 0.1)
+    sessions: list[Mesh] = []
+
+    def serve(mesh: Mesh) -> Handle:
+        sessions.append(mesh)
+        return Handle(lambda: None)
+
+    async with Router() as router, counted(router.endpoint) as link:
+        line = stop_line.StopLine(MeshSettings(connect=[link.endpoint], overrides=['id:"abc"']), serve)
+        await until(lambda: line.is_open)
+        before = str(sessions[0]._session.zid())
+        link.cut()
+        await until(lambda: not sessions[0].linked)
+        async with await Mesh.open(MeshSettings(connect=[router.endpoint], overrides=[f'id:"{before}"'])):
+            link.mend()
+            await until(lambda: len(sessions) == 2 and line.is_open, 60)
+            assert str(sessions[1]._session.zid()) != before
+        await line.close()
