@@ -13,7 +13,9 @@ It stays on loopback: attackers come from 127.0.0.2, everybody else from 127.0.0
   pair of headsets that talk, a headset that drives the robot, an operator, and a ROS node that listens to the robot's
   wheels. The same attack is first made on the second site, so that what the machine's cores are short of is measured
   apart from what the attack costs its victims.
-* `inputs`, `floods`, `sessions`: the attacks, each a function in a table with who makes it and what it sends.
+* `inputs`, `floods`, `sessions`, `insiders`: the attacks, each a function in a table with who makes it and what it
+  sends.
+* `secured`: a policy for sites with certificates, for attackers who have one.
 * `attacker`: the process that makes one of them. `raw`: a TCP agent that keeps no rule.
 * `judge`: what must hold, as figures with limits. Pure.
 * `rights`: attacks that gain something instead of costing something, each with a site of its own.

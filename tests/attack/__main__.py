@@ -21,13 +21,14 @@ from tests.attack.scene import scene
 
 
 async def run(rows: list[table.Attack], options: argparse.Namespace) -> list[judge.Report]:
-    """Each attack, in one scene as long as everything is as before after it."""
+    """Each attack, in one scene as long as everything is as before after it, and it is one of the kind."""
     reports: list[judge.Report] = []
-    waiting = list(rows)
+    waiting = sorted(rows, key=lambda row: row.certified)
     while waiting:
         with tempfile.TemporaryDirectory() as directory:
-            async with scene(Path(directory), random.randint(1, 100)) as stage:
-                while waiting:
+            certified = waiting[0].certified
+            async with scene(Path(directory), random.randint(1, 100), certified=certified) as stage:
+                while waiting and waiting[0].certified == certified:
                     row = waiting.pop(0)
                     began = time.monotonic()
                     try:

@@ -41,6 +41,8 @@ class Window:
     """Of the driver's commands, to the robot's wheels; infinite likewise."""
     stops: list[float] = field(default_factory=list)
     """From pressing once to no more motion; infinite when it had no effect."""
+    at_rest: int = 0
+    """How often the driver could not get the robot to move before a stop was pressed, or the driver let go."""
     late_commands: int = 0
     """Carried out between a stop that held and its release."""
     deadman: list[float] = field(default_factory=list)
@@ -89,6 +91,8 @@ class Report:
     under: Window
     memory: dict[str, Memory] = field(default_factory=dict)
     memory_limits: dict[str, int] = field(default_factory=dict)
+    commands_promised: bool = True
+    """Whether the driver's commands have to arrive: not where somebody may put to the robot past every gateway."""
     broken: list[str] = field(default_factory=list)
     """What was not as before, in words; nothing of it is a matter of time."""
 
@@ -117,6 +121,8 @@ class Report:
             late = [took for took in here if took > allowed]
             if late:
                 wrong.append(f"{len(late)} of {len(here)}: {what} took up to {ms(max(late))}, allowed {ms(allowed)}")
+        if self.under.at_rest and self.commands_promised:
+            wrong.append(f"{self.under.at_rest} times the driver could not get the robot to move")
         if self.under.late_commands:
             wrong.append(f"{self.under.late_commands} commands were carried out after a stop")
         for program, memory in self.memory.items():
@@ -173,7 +179,7 @@ def figures(report: Report) -> dict[str, object]:
             return {"count": len(values), **named}
 
         kinds = {"neighbours": w.latencies, "commands": w.commands, "stops": w.stops, "deadman": w.deadman}
-        return {name: spread(values) for name, values in kinds.items()} | {"trips": w.trips}
+        return {name: spread(values) for name, values in kinds.items()} | {"trips": w.trips, "at_rest": w.at_rest}
 
     return {
         "attack": report.name,

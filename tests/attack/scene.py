@@ -12,6 +12,7 @@ import os
 import signal
 import struct
 import sys
+import tempfile
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
@@ -36,6 +37,7 @@ from macs_zenoh.errors import MacsError
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.limits import UNFINISHED_IN_ALL_BYTES, WAITING_IN_ALL_BYTES
 from macs_zenoh.protocol.messages import OPERATOR
+from tests.attack import secured
 from tests.attack.judge import Memory, Report, Window
 from tests.attack.table import Attack
 from tests.support.programs import ROOT, Program, free_port
@@ -80,14 +82,27 @@ deadman_message = {{ linear = {{ z = -1 }} }}
 
 
 class Site:
-    """A router, a gateway and a robot agent."""
+    """A router, a gateway and a robot agent; with certificates where there is a directory for them."""
 
-    def __init__(self, settings: Path, domain: int) -> None:
+    def __init__(self, settings: Path, domain: int, pki: Path | None = None) -> None:
+        self.pki = pki
+        env = {"ROS_DOMAIN_ID": str(domain)}
+        if pki is not None:
+            self.endpoint = secured.made(pki)
+            self.mesh = secured.mesh_of(pki, secured.OPERATED)
+            mine = {name: pki / name / "macs.toml" for name in (secured.GATEWAY, secured.ROBOT)}
+            with mine[secured.ROBOT].open("a") as robots:
+                robots.write(settings.read_text())
+            self.router = Router(pki / "site" / "router.json5")
+            self.gateway = Program("gateway", "--port", "0", "--settings", str(mine[secured.GATEWAY]))
+            self.robot = Program("agent", "--settings", str(mine[secured.ROBOT]), env=env)
+            return
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.mesh = MeshSettings(connect=[self.endpoint])
         common = ("-e", self.endpoint, "--settings", str(settings))
         self.router = Router(listen=[self.endpoint])
         self.gateway = Program("gateway", "--port", "0", "--robots", "any", *common)
-        self.robot = Program("agent", "--id", str(ROBOT), *common, env={"ROS_DOMAIN_ID": str(domain)})
+        self.robot = Program("agent", "--id", str(ROBOT), *common, env=env)
 
     @property
     def programs(self) -> dict[str, Router | Program]:
@@ -284,8 +299,7 @@ class Scene:
         left, right, driver, self.presser = headsets
         while ROBOT not in (await driver.online()).ros_agent_ids:
             await asyncio.sleep(0.02)
-        mesh = MeshSettings(connect=[self.site.endpoint])
-        asking = robots.operator(mesh, AgentId(OPERATOR, 7), timeout_s=10)
+        asking = robots.operator(self.site.mesh, AgentId(OPERATOR, 7), timeout_s=10)
         self.operator = await stack.enter_async_context(asking)
         self.pair = Pair(left, right)
         stack.callback(self.pair.close)
@@ -323,13 +337,14 @@ class Scene:
             for name, m in memory.items()
             if m.kept > SLACK_BYTES and name in MEMORY_LIMITS
         ]
-        return Report(attack.name, attack.single, calm, benign, under, memory, MEMORY_LIMITS, broken)
+        promised = attack.by not in ("mesh", "operator")
+        return Report(attack.name, attack.single, calm, benign, under, memory, MEMORY_LIMITS, promised, broken)
 
     @asynccontextmanager
     async def _attacked(self, attack: Attack, site: Site, seconds: float, stops: int | None) -> AsyncIterator[None]:
         """While the block runs this site is attacked."""
         length = seconds if stops is None else 3600.0
-        words = (attack.name, str(site.gateway.port), site.endpoint, str(length))
+        words = (attack.name, str(site.gateway.port), site.endpoint, str(length), str(site.pki or ""))
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "tests.attack.attacker", *words), cwd=ROOT, stdout=asyncio.subprocess.PIPE
         )
@@ -363,9 +378,9 @@ class Scene:
         return [came[sent] - sent if sent in came else math.inf for sent in self.driver.sent if begin <= sent < end]
 
     async def _stop_once(self, window: Window) -> bool:
-        """Press once, alternately a headset's button and an operator's, and measure until nothing moves any more."""
-        if not await self._moves(window):
-            return False
+        """Press once, alternately a headset's button and an operator's, and measure until nothing moves any more. Also
+        where the driver cannot get the robot to move: then until it is known that it is stopped."""
+        await self._moves(window)
         self._turn += 1
         by_headset = bool(self._turn % 2)
         pressed = time.monotonic()
@@ -392,11 +407,12 @@ class Scene:
             await self.operator.ask(ROBOT, "stop", data, timeout_s=NO_EFFECT_S, urgent=True)
 
     async def _release(self, *, by_headset: bool) -> bool:
-        """Let the robot go on, by who has stopped it, however often that has to be said."""
-        deadline = time.monotonic() + 2 * NO_EFFECT_S
-        while time.monotonic() < deadline:
+        """Let the robot go on, by who has stopped it, however often that has to be said; a release may get lost where
+        commands may, and then the operator releases it."""
+        began = time.monotonic()
+        while (passed := time.monotonic() - began) < 2 * NO_EFFECT_S:
             with suppress(MacsError, asyncio.TimeoutError):
-                if by_headset:
+                if by_headset and passed < NO_EFFECT_S:
                     await self._button.publish(STATES[False])
                 else:
                     await asyncio.wait_for(self._ask_stop(b"false"), 0.5)
@@ -408,19 +424,19 @@ class Scene:
         """Whether the driver drives."""
         self.driver.drives = True
         moves = await until(lambda: self.wheels.moving, NO_EFFECT_S, quietly=True)
-        if not moves:
-            window.stops.append(math.inf)
+        window.at_rest += not moves
         return moves
 
     async def _let_go_once(self, window: Window) -> bool:
-        """The driver stops commanding without a word; when the dead-man does its work."""
+        """The driver stops commanding without a word; when the dead-man does its work. Of a robot at rest nothing is
+        learned. Whether to go on."""
         if not await self._moves(window):
-            return False
+            return True
         begin = time.monotonic()
         await asyncio.sleep(0.15)
         window.trips += sum(heard.stop and heard.at > begin for heard in self.wheels.heard)
         if not await self._moves(window):
-            return False
+            return True
         self.driver.drives = False
         last = self.driver.sent[-1]
         stopped = await until(lambda: self._stopped_since(last), NO_EFFECT_S, quietly=True)
@@ -522,12 +538,13 @@ async def until(
 
 
 @asynccontextmanager
-async def scene(directory: Path, domain: int) -> AsyncIterator[Scene]:
-    """Everything started, the robot driving."""
+async def scene(directory: Path, domain: int, *, certified: bool = False) -> AsyncIterator[Scene]:
+    """Everything started, the robot driving; ``certified``: on sites that let in nobody without a certificate."""
     settings = directory / "macs.toml"
     settings.write_text(SETTINGS)
+    pki = [Path(tempfile.mkdtemp(dir=directory)) / "pki" if certified else None for _ in range(2)]
     async with AsyncExitStack() as stack:
-        site, other = Site(settings, domain), Site(settings, domain % 100 + 1)
+        site, other = Site(settings, domain, pki[0]), Site(settings, domain % 100 + 1, pki[1])
         await asyncio.gather(site.start(stack), other.start(stack))
         wheels = Wheels(domain)
         stack.callback(wheels.close)

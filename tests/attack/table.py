@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
-By = Literal["headset", "tcp robot", "mesh", "operator"]
-"""Who attacks: a TCP agent of either type, a Zenoh session without any right but the router's address, or one that
-calls itself an operator."""
+By = Literal["headset", "tcp robot", "mesh", "operator", "certificate"]
+"""Who attacks: a TCP agent of either type, a Zenoh session without any right but the router's address, one that calls
+itself an operator, or one with a certificate, on a site that lets in nobody else."""
 
 
 @dataclass
@@ -24,6 +25,8 @@ class Target:
     seconds: float
     begins: Callable[[], object] = lambda: None
     robot: int = 1
+    pki: Path | None = None
+    """Where everybody's certificates and settings are, if the site has any."""
     _ends: float | None = None
 
     def running(self) -> bool:
@@ -53,6 +56,11 @@ class Attack:
     run: Callable[[Target], None]
 
     @property
+    def certified(self) -> bool:
+        """Whether it needs a site with certificates."""
+        return self.by == "certificate"
+
+    @property
     def says(self) -> str:
         """What is sent."""
         return " ".join((self.run.__doc__ or "").split())
@@ -69,17 +77,19 @@ def attack(
     1 size and cost before parsing, 2 budgets, 3 the way of the stop, 4 other people's values, 5 rights.
     """
 
-    def enter(run: Callable[[Target], None]) -> Attack:
-        row = Attack(run.__name__, section, by, single, seen, run)
-        assert row.says, f"{row.name} does not say what it sends"
-        assert ATTACKS.setdefault(row.name, row) is row, f"two attacks are called {row.name}"
-        return row
+    return lambda run: enter(run, section, by, single=single, seen=seen)
 
-    return enter
+
+def enter(run: Callable[[Target], None], section: int, by: By, *, single: bool = False, seen: bool = False) -> Attack:
+    """Put a function into the table, under its name."""
+    row = Attack(run.__name__, section, by, single, seen, run)
+    assert row.says, f"{row.name} does not say what it sends"
+    assert ATTACKS.setdefault(row.name, row) is row, f"two attacks are called {row.name}"
+    return row
 
 
 def every() -> dict[str, Attack]:
     """All rows, by name."""
-    from tests.attack import floods, inputs, sessions  # noqa: F401 - they fill the table
+    from tests.attack import floods, inputs, insiders, sessions  # noqa: F401 - they fill the table
 
     return ATTACKS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import random
 import time
 from collections.abc import AsyncIterator
 from typing import Any
@@ -20,6 +21,7 @@ from bridge.ros.safety import Control, DeadMan, EmergencyStop
 from bridge.ros.session import RosSession
 from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
+from macs_zenoh.protocol.guard import Ages
 from macs_zenoh.protocol.messages import NodeType
 from tests.support.ros_peer import Peer, adding, command, drive
 from tests.support.waiting import get, until
@@ -77,6 +79,24 @@ def test_a_command_that_waited_counts_from_when_it_was_sent() -> None:
     assert deadman.deadline() == 10.5
     assert not deadman.tick(10.4)
     assert deadman.tick(10.5)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_dead_man_on_a_link_that_jitters(seed: int) -> None:
+    """It does not trip as long as somebody commands and no command is later than it waits; and when the last one was
+    sent it trips in its time, however late that one came. Clocks are far apart, and what is late holds up the rest."""
+    chance, ages, deadman = random.Random(seed), Ages(), DeadMan(0.3)
+    every_s, jitter_s, way_s, clock = 0.05, 0.24, 0.02, 1e6
+    now = sent = 0.0
+    for number in range(1200):
+        sent = number * every_s
+        arrives = max(now, sent + way_s + jitter_s * chance.random() ** 3)
+        trips = [at for at in (now + 0.001 * n for n in range(round((arrives - now) / 0.001))) if deadman.tick(at)]
+        assert not trips, f"while somebody drove, {arrives - sent:.3f} s after a command was sent"
+        now = arrives
+        deadman.command("a", now - ages.age("unity/300", "router", clock + sent, now))
+    tripped = next(at for at in (now + 0.001 * n for n in range(1000)) if deadman.tick(at))
+    assert sent + 0.3 <= tripped <= sent + 0.3 + way_s + 0.01
 
 
 def test_a_dead_man_trips_once_per_silence() -> None:
