@@ -481,10 +481,16 @@ class Connection(asyncio.BufferedProtocol):
     def charge(self) -> None:
         """The agent asked for something that costs: one that does so too often is not read from for a moment."""
         hold_s = self._toll.pay(time.monotonic())
-        if hold_s > 0 and self._tolled is None:
+        if hold_s > 0 and self.slow_down(hold_s):
             self.complain("slowed_down", f"it asks for more than {REQUESTS_PER_S} things a second")
-            self.pause()
-            self._tolled = self._loop.call_later(hold_s, self._go_on)
+
+    def slow_down(self, hold_s: float) -> bool:
+        """Do not read from the agent for a moment, unless such a one is under way; whether it begins now."""
+        if self._tolled is not None:
+            return False
+        self.pause()
+        self._tolled = self._loop.call_later(hold_s, self._go_on)
+        return True
 
     def _go_on(self) -> None:
         self._tolled = None

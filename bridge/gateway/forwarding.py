@@ -30,6 +30,9 @@ PUBLISHER = int(NodeType.PUBLISHER)
 STOP_TYPES = frozenset({"std_msgs/Bool", "std_msgs/msg/Bool"})
 """Of emergency stops, which no limit here concerns: what a robot's is called, only the robot knows."""
 
+SLOWED_EACH_S, SLOWED_S = 0.02, 0.25
+"""So long for each who floods now nobody of them is read from, and so long at most: a headset may freeze."""
+
 COMMAND, CALL, STREAM = Traffic.COMMAND, Traffic.CALL, Traffic.STREAM  # a Python call otherwise, for each message
 
 
@@ -62,6 +65,8 @@ class Forwarding:
         self._waited: dict[tuple[bytes, str], tuple[Route, Sent]] = {}
         """Commands that have waited in their connection, the newest of each kind, until all that came is seen."""
         self._presses = Presses(mesh, directory)
+        self._flooding: dict[Connection, float] = {}
+        """Who is not read from for having flooded, and until when."""
         self._backpressure = Backpressure()
         mesh.on_room(self._backpressure.release)
 
@@ -196,6 +201,7 @@ class Forwarding:
             return True
         if passing is Passing.FLOODED:
             connection.complain("flooded", "it sends robots more than one agent may", count)
+            self._slow_down(connection, now)
             return False
         newest = sent.frame.each()[-1]
         held = (sent.frame.destination, metadata.node_name)
@@ -204,6 +210,14 @@ class Forwarding:
         if older:
             connection.complain("too_old", "commands that waited with newer ones", older)
         return False
+
+    def _slow_down(self, connection: Connection, now: float) -> None:
+        """What is dropped has to be read first, which costs others the time of the loop: all who flood have a small
+        part of it together."""
+        self._flooding = {each: until for each, until in self._flooding.items() if until > now}
+        hold_s = min(SLOWED_S, SLOWED_EACH_S * (1 + len(self._flooding)))
+        if connection.slow_down(hold_s):
+            self._flooding[connection] = now + hold_s
 
     def _waits_for_stop(self, connection: Connection, sent: Sent, route: Route) -> bool:
         """Whether a release, or what else may be on that topic, goes on later."""

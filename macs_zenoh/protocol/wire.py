@@ -270,10 +270,14 @@ class Run(_Alike):
         layout, message_at, body_at = self.layout, self._message_at, self._body_at
         return [Frame(data[start : start + size], layout, message_at, body_at) for start in range(0, len(data), size)]
 
-    def with_metadata(self, metadata: bytes) -> Frame | Run:
-        """The same with other metadata in each. Raises TooLong."""
-        (changed,) = parse_runs(b"".join([frame.with_metadata(metadata).data for frame in self.each()]), self.layout)
-        return changed
+    def with_metadata(self, metadata: bytes) -> Run:
+        """The same with other metadata in each. Raises TooLong. What begins them is made once."""
+        old, size, at = self.data, self._size, self._body_at
+        first = Frame(old[:size], self.layout, self._message_at, at).with_metadata(metadata)
+        pieces = [first.beginning, b""] * self.count
+        pieces[1::2] = [old[start + at : start + size] for start in range(0, len(old), size)]
+        data = b"".join(pieces)
+        return Run(data, self.layout, first.message_at, len(first.beginning), len(first.data))
 
 
 Frames = Frame | Run

@@ -335,3 +335,16 @@ def test_several_frames_in_a_sample_are_bounded_together() -> None:
         with pytest.raises(TooLong):
             parse_frames(data)
     assert len(parse_frames(encode_frame(message=encode_message(b"{}", bytes(2 * SAMPLE_BYTES))))) == 1
+
+
+@given(bodies=st.lists(st.binary(min_size=3, max_size=3), min_size=1, max_size=5), said=st.binary(max_size=40))
+def test_a_run_gets_other_metadata_as_its_frames_would_one_by_one(bodies: list[bytes], said: bytes) -> None:
+    """Byte for byte, however many they are; and what comes out is such a run itself."""
+
+    def run(metadata: bytes) -> bytes:
+        return b"".join(encode_frame(2, (1,), (3,), message=encode_message(metadata, body)) for body in bodies)
+
+    (frame,) = parse_runs(run(b'{"a":1}'))
+    other = frame.with_metadata(said)
+    assert (other.data, other.count, other.metadata) == (run(said), len(bodies), said)
+    assert [bytes(single.body) for single in other.each()] == bodies
