@@ -38,7 +38,7 @@ from macs_zenoh.protocol.keyexpr import (
     router,
 )
 from macs_zenoh.protocol.messages import OPERATOR, ROS, UNITY
-from tests.programs import free_port
+from tests.support.programs import free_port
 
 ROBOT, GATEWAY, OPERATED = "robot-1", "hall-1", "anna"
 """The well-behaved: a robot, a gateway, and an operator who may stop the robot."""

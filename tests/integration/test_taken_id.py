@@ -16,9 +16,9 @@ from macs_zenoh import locked_out
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.locked_out import apart
 from macs_zenoh.mesh import Mesh
-from tests.integration.conftest import until
-from tests.links import counted
-from tests.routers import Router
+from tests.support.links import counted
+from tests.support.routers import Router
+from tests.support.waiting import until
 
 
 @pytest.fixture(autouse=True)
