@@ -17,7 +17,6 @@ from macs_zenoh.errors import MacsError
 from macs_zenoh.handles import Handle
 from macs_zenoh.locked_out import apart, locked_out
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.sections import changed
 
 log = logging.getLogger("macs.ros")
 

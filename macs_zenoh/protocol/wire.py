@@ -274,7 +274,7 @@ class Run(_Alike):
         """The same with other metadata in each. Raises TooLong. What begins them is made once."""
         old, size, at = self.data, self._size, self._body_at
         first = Frame(old[:size], self.layout, self._message_at, at).with_metadata(metadata)
-        pieces = [first.beginning, b""] * self.count
+        pieces: list[bytes | bytearray] = [first.beginning, b""] * self.count
         pieces[1::2] = [old[start + at : start + size] for start in range(0, len(old), size)]
         data = b"".join(pieces)
         return Run(data, self.layout, first.message_at, len(first.beginning), len(first.data))
