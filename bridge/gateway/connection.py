@@ -18,10 +18,11 @@ from typing import Protocol, cast
 from macs_zenoh.protocol.addresses import joined, of_peer
 from macs_zenoh.protocol.budget import Toll
 from macs_zenoh.protocol.decoders import FrameDecoder
-from macs_zenoh.protocol.existing import Asked, Verdict, to_headset, to_newer, to_robot
+from macs_zenoh.protocol.existing import Asked, OwnNode, Verdict, to_headset, to_newer, to_robot
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.protocol.limits import REQUESTS_PER_S, UNFINISHED_FREE_BYTES
 from macs_zenoh.protocol.messages import ROS, AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
+from macs_zenoh.protocol.offers import short_type
 from macs_zenoh.protocol.outbox import Chunk, Outbox
 from macs_zenoh.protocol.rate_limit import Pace
 from macs_zenoh.protocol.robot_nodes import RobotNodes
@@ -44,8 +45,8 @@ stands still acknowledges all the same."""
 LOOK_S = 1.0
 """How often it is looked whether the host of an agent that is away is gone."""
 
-LAST_TYPES = 4096
-"""Of how many names of nodes it is remembered which type the agent last had."""
+LAST_NODES = 4096
+"""Of how many names it is remembered which node the agent last had."""
 
 VERDICTS = 1024
 """How many metadata are remembered per connection as already judged."""
@@ -140,10 +141,12 @@ class Connection(asyncio.BufferedProtocol):
         self._nodes: dict[str, set[int]] = {}
         self._depths: dict[str, tuple[int, bool]] = {}
         """How many messages of a topic may wait, and whether new ones are dropped rather than old ones, by node."""
+        self.topic_types: dict[str, str] = {}
+        """Of which type the agent takes a topic's messages, by node, as existing robots write it."""
         self.node_count = 0
         """How many interface nodes the agent has, by type and name."""
-        self._last_types: dict[str, int] = {}
-        """An existing headset keeps its nodes by name: of two types under one name it has the last."""
+        self._last: dict[str, OwnNode] = {}
+        """An existing headset keeps its nodes by name: of two under one name it has the last."""
         self._verdicts: dict[Subject, Verdict] = {}
         self.existing = True
         """Whether the agent is an existing program, which gets only what those are known to survive."""
@@ -389,13 +392,15 @@ class Connection(asyncio.BufferedProtocol):
         types = self._nodes.setdefault(node_name, set())
         self.node_count += node_type not in types
         types.add(node_type)
-        self._last_types.pop(node_name, None)
-        self._last_types[node_name] = node_type
-        if len(self._last_types) > LAST_TYPES:
-            del self._last_types[next(iter(self._last_types))]
+        data_type = short_type(node.data_exchange_type)
+        self._last.pop(node_name, None)
+        self._last[node_name] = OwnNode(node_type, data_type)
+        if len(self._last) > LAST_NODES:
+            del self._last[next(name for name in self._last if name not in self._nodes)]
         self._verdicts.clear()
         if node_type == NodeType.SUBSCRIBER:
             self._depths[node_name] = node.buffer_size, node.drop_new
+            self.topic_types[node_name] = data_type
             self._writer.open_direct()
 
     def is_registered(self, node: AddNode) -> bool:
@@ -409,6 +414,7 @@ class Connection(asyncio.BufferedProtocol):
         types.discard(node_type)
         if node_type == NodeType.SUBSCRIBER:
             self._depths.pop(node_name, None)
+            self.topic_types.pop(node_name, None)
         if not types:
             self._nodes.pop(node_name, None)
         self._verdicts.clear()
@@ -433,7 +439,7 @@ class Connection(asyncio.BufferedProtocol):
             node = self.robot_nodes.find(metadata.node_type, metadata.node_name)
             return to_robot(metadata, node, self.asked)
         registered_there = bool(metadata.node_name) and self.owner.registered_there(self, metadata)
-        return to_headset(metadata, self._last_types, self.asked, registered_there=registered_there)
+        return to_headset(metadata, self._last, self.asked, registered_there=registered_there)
 
     def asks(self, metadata: Metadata, header: Header) -> None:
         """The agent sends a request to others, which they may answer."""
@@ -447,8 +453,8 @@ class Connection(asyncio.BufferedProtocol):
 
     def other_type(self, node: AddNode) -> int | None:
         """The type that this node's name had until now, if it is another one."""
-        before = self._last_types.get(node.node_name, node.node_type)
-        return None if before == node.node_type else before
+        before = self._last.get(node.node_name)
+        return None if before is None or before.node_type == node.node_type else before.node_type
 
     def has(self, metadata: Metadata) -> bool:
         """Whether the agent registered the node of this name and type itself."""

@@ -15,7 +15,7 @@ from macs_zenoh.errors import WireError
 from macs_zenoh.mesh import Payload, Sample
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import Directory
-from macs_zenoh.protocol.existing import CDR, PASS, PASS_ONCE, Data, Verdict, fitting, least_bytes, refuses, topic_data
+from macs_zenoh.protocol.existing import CDR, PASS, PASS_ONCE, Data, Verdict, fitting, least_bytes, refuses
 from macs_zenoh.protocol.judging import Judge
 from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST
 from macs_zenoh.protocol.least_bytes import TEXT_TYPE, is_whole
@@ -77,6 +77,7 @@ class Seen(NamedTuple):
     beginning: bytes
     message_at: int
     registrants: list[AgentKey]
+    data_type: str
     is_text: bool
     """Whether its data has a length in it, which each message is judged by."""
 
@@ -165,6 +166,7 @@ class Delivery:
             may_hold: bool | None = None
             for frame, metadata in self._read(key, payload, stream.robot):
                 registered = stream.registrants if stream.carries(metadata) else NOBODY
+                data_type = metadata.data_exchange_type
                 fits = isinstance(frame, Frame) and _fits(frame, metadata)  # a run lists no registrants
                 messages = frame.messages
                 for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
@@ -179,8 +181,8 @@ class Delivery:
                             keep = may_hold and connection.robot_backpressure.hold(
                                 robot, connection.moved, ROBOT_HOLD_S
                             )
-                        if connection.existing and not fits:
-                            self._send_fitting(connection, frame, metadata, topic_data(metadata), stream.node, keep)
+                        if connection.existing and not (fits and connection.topic_types.get(stream.node) == data_type):
+                            self._send_topic(connection, frame, metadata, keep)
                         else:
                             self._gather_stream(connection, stream.node, messages, keep=keep)
                     else:
@@ -206,6 +208,8 @@ class Delivery:
             if connection is not None:
                 if registrant not in stream.registrants or not connection.free:
                     return False
+                if connection.existing and connection.topic_types.get(stream.node) != seen.data_type:
+                    return False
                 receivers.append(connection)
         message = bytes(payload[seen.message_at :])
         for connection in receivers:
@@ -227,8 +231,10 @@ class Delivery:
             self._seen.clear()
         if judged.true != frame.metadata or not frame.carries(CDR, least_bytes(judged.metadata)):
             return None
-        is_text = judged.metadata.data_exchange_type == TEXT_TYPE
-        seen = self._seen[key, len(payload)] = Seen(frame.beginning + CDR, frame.message_at, registrants, is_text)
+        data_type = judged.metadata.data_exchange_type
+        seen = self._seen[key, len(payload)] = Seen(
+            frame.beginning + CDR, frame.message_at, registrants, data_type, data_type == TEXT_TYPE
+        )
         return seen
 
     def _flush(self) -> None:
@@ -300,6 +306,14 @@ class Delivery:
             self._send_fitting(connection, first, metadata, verdict.data)
         else:
             self._send_fitting(connection, frame, metadata, verdict.data)
+
+    def _send_topic(self, connection: Connection, frame: Frame, metadata: Metadata, keep: bool) -> None:
+        """Topic data that does not simply pass to an existing program."""
+        verdict = connection.verdict(metadata)
+        if verdict.name:
+            self._refuse(connection, frame, metadata, verdict, by_id=False)
+        else:
+            self._send_fitting(connection, frame, metadata, verdict.data, metadata.node_name, keep)
 
     def _refuse(
         self, connection: Connection, frame: Frames, metadata: Metadata, verdict: Verdict, *, by_id: bool

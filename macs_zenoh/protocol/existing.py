@@ -11,11 +11,12 @@ of a router         from its gateway only                          from its gate
 of a manager        a plain name that is none of the protocol's    none: registrations are written by its gateway
 plain               an answer to what it asked, JSON; others where  none
                     they cannot be taken for one
-of a node, type 1   a robot on which it registered: CDR            none
+of a node, type 1   a robot on which it registered: CDR of the     none
+                    type that it registered
 type 2              none                                           nodes that it has, with their type: CDR
-type 3              an answer to its request: CDR                  likewise
-type 4              a robot on which it registered: CDR            the registrant's answer to its request: CDR
-type 5              where it registered such a node                none
+type 3              an answer to its request, with its type: CDR   likewise
+type 4              as type 1                                      the registrant's answer to its request: CDR
+type 5              where it registered such a node, with its type none
 ==================  =============================================  ==================================================
 """
 
@@ -26,6 +27,8 @@ import re
 from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple
+
+from msgspec import structs
 
 from .least_bytes import ANSWERS, LEAST, is_whole
 from .messages import (
@@ -41,6 +44,7 @@ from .messages import (
     Welcome,
     is_json_object,
 )
+from .offers import short_type
 from .wire import Buffer, Frame, Frames, Header, encode_message
 
 CDR = b"\x00\x01\x00\x00"
@@ -119,6 +123,14 @@ def _answer(data: Data) -> Verdict:
     return Verdict(data=data, stays=False, answers=True)
 
 
+class OwnNode(NamedTuple):
+    """An interface node of an existing headset, which reads what comes for it as the type that it has itself."""
+
+    node_type: int
+    data_type: str
+    """As `short_type` writes it."""
+
+
 _KEYS = {
     "senderAgentType": int,
     "senderAgentId": int,
@@ -146,6 +158,12 @@ def readable(metadata: bytes) -> bool:
 # -- who asked what --------------------------------------------------------------------------------------------------
 
 
+class _Question(NamedTuple):
+    failures: bool
+    """Whether the asker understands a `CallFailure`."""
+    data_type: str
+
+
 class Asked:
     """Requests of one TCP agent that may still be answered: plain ones, and calls of services.
 
@@ -155,8 +173,8 @@ class Asked:
     LIMIT = 1024
 
     def __init__(self) -> None:
-        self._open: dict[tuple[str, int, AgentKey], bool] = {}
-        """By node name, request id and who was asked: whether the asker understands a `CallFailure`."""
+        self._open: dict[tuple[str, int, AgentKey], _Question] = {}
+        """By node name, request id and who was asked."""
         self._plain: dict[int, int] = {}
         """How many were asked the plain request of this number."""
 
@@ -165,10 +183,10 @@ class Asked:
         to = [(header.agent_type, agent_id) for agent_id in header.ids] if header.agent_type else []
         if header.groups or not header.agent_type:
             to.append(ANYBODY)
-        failures = metadata.message_manager == CallFailure.manager
+        question = _Question(metadata.message_manager == CallFailure.manager, metadata.data_exchange_type)
         for agent in to:
             self._forget((metadata.node_name, metadata.request_id, agent))
-            self._open[metadata.node_name, metadata.request_id, agent] = failures
+            self._open[metadata.node_name, metadata.request_id, agent] = question
             if not metadata.node_name:
                 self._plain[metadata.request_id] = self._plain.get(metadata.request_id, 0) + 1
         while len(self._open) > self.LIMIT:
@@ -176,15 +194,18 @@ class Asked:
 
     def awaits(self, answer: Metadata) -> Data | None:
         """What an answer must be, by its metadata; None for one that nobody asked for."""
-        name, number = answer.node_name, answer.request_id
-        failures = self._open.get((name, number, _sender(answer)))
-        if failures is None:
-            failures = self._open.get((name, number, ANYBODY))
-        if failures is None:
+        question = self._question(answer)
+        if question is None:
             return None
-        if not name:
+        if not answer.node_name:
             return Data.JSON
-        return Data.FAILURE_TOO if failures and answer.message_manager == CallFailure.manager else Data.CDR
+        understands = question.failures and answer.message_manager == CallFailure.manager
+        return Data.FAILURE_TOO if understands else Data.CDR
+
+    def type_asked(self, answer: Metadata) -> str:
+        """Which type the question names that this answers."""
+        question = self._question(answer)
+        return question.data_type if question is not None else ""
 
     def awaits_another(self, message: Metadata) -> bool:
         """Whether a plain message would be taken for the answer to what somebody else was asked."""
@@ -198,6 +219,10 @@ class Asked:
     def answered(self, answer: Metadata) -> None:
         """An answer was passed on: the next one like it answers nothing."""
         self._forget((answer.node_name, answer.request_id, _sender(answer)))
+
+    def _question(self, answer: Metadata) -> _Question | None:
+        about = answer.node_name, answer.request_id
+        return self._open.get((*about, _sender(answer))) or self._open.get((*about, ANYBODY))
 
     def _forget(self, key: tuple[str, int, AgentKey]) -> None:
         if self._open.pop(key, None) is not None and not key[0]:
@@ -232,11 +257,11 @@ def to_newer(metadata: Metadata, nodes: Mapping[str, set[int]]) -> Verdict:
     return PASS
 
 
-def to_headset(metadata: Metadata, node_types: Mapping[str, int], asked: Asked, *, registered_there: bool) -> Verdict:
-    """A message to an existing headset; ``node_types`` are those of its nodes, ``registered_there`` says whether the
-    message's node is registered on the sender."""
+def to_headset(metadata: Metadata, nodes: Mapping[str, OwnNode], asked: Asked, *, registered_there: bool) -> Verdict:
+    """A message to an existing headset; ``nodes`` are its own by name, ``registered_there`` says whether the message's
+    node is registered on the sender."""
     if metadata.node_name:
-        return _node_to_headset(metadata, node_types.get(metadata.node_name), asked, registered_there)
+        return _node_to_headset(metadata, nodes.get(metadata.node_name), asked, registered_there)
     manager = metadata.message_manager
     if manager:
         wrong = _name_problem(manager)
@@ -253,23 +278,25 @@ def to_headset(metadata: Metadata, node_types: Mapping[str, int], asked: Asked, 
     return PASS_ONCE if asked.plainly else PASS  # until it asks something
 
 
-def _node_to_headset(metadata: Metadata, own: int | None, asked: Asked, registered_there: bool) -> Verdict:
+def _node_to_headset(metadata: Metadata, own: OwnNode | None, asked: Asked, registered_there: bool) -> Verdict:
     kind = metadata.node_type
-    if own is not None and kind != own:
+    if own is not None and kind != own.node_type:
         return _wrong_type(metadata)
     if metadata.sender_agent_type != ROS:
         if own is None:
             return PASS  # for no node of it: ignored
         return _no("not_from_robot", f"{_node(metadata)} takes messages of robots only")
+    if own is not None and kind != CLIENT and not _is_of(own.data_type, metadata):
+        return _other_type(metadata, own.data_type)
     if kind in (SUBSCRIBER, SERVICE):
         if registered_there:
-            return Verdict(
-                data=topic_data(metadata) if kind == SUBSCRIBER else _data(metadata, _REQUESTS), stays=False
-            )
+            return Verdict(data=_data(metadata, _TOPICS if kind == SUBSCRIBER else _REQUESTS), stays=False)
         return _no("not_registered", f"a message of {_node(metadata)}, which it has not registered there", stays=False)
     if kind == CLIENT:
         wanted = asked.awaits(metadata)
         if wanted is not None:
+            if not _is_of(data_type := asked.type_asked(metadata), metadata):
+                return _other_type(metadata, data_type, stays=False)
             return _answer(_data(metadata, _ANSWERS) if wanted is Data.CDR else wanted)
         return _no("not_asked", f"an answer of {_node(metadata)} that it has not asked for", stays=False)
     if kind == ACTION and own is not None:
@@ -288,8 +315,7 @@ def to_robot(metadata: Metadata, node: AddNode | None, asked: Asked) -> Verdict:
     if node is None:
         return _no("unknown_node", f"nobody registered {_node(metadata)} there")
     if metadata.data_exchange_type != node.data_exchange_type:
-        types = f"{metadata.data_exchange_type[:80] or 'no type'}, and {_node(metadata)} has {node.data_exchange_type}"
-        return _no("other_type", f"a message with {types}")
+        return _other_type(metadata, node.data_exchange_type)
     data = _data(metadata, {PUBLISHER: _TOPICS, CLIENT: _REQUESTS, SERVICE: _ANSWERS}[kind])
     if kind == SERVICE:
         if _sender(metadata) != (node.registrant_agent_type, node.registrant_agent_id):
@@ -300,13 +326,14 @@ def to_robot(metadata: Metadata, node: AddNode | None, asked: Asked) -> Verdict:
     return Verdict(data=data)
 
 
-def topic_data(metadata: Metadata) -> Data:
-    """What a topic's message to a headset must be."""
-    return _data(metadata, _TOPICS)
-
-
 def _data(metadata: Metadata, without_fields: frozenset[str]) -> Data:
-    return Data.EMPTY_TOO if metadata.data_exchange_type in without_fields else Data.CDR
+    return Data.EMPTY_TOO if short_type(metadata.data_exchange_type) in without_fields else Data.CDR
+
+
+def _is_of(data_type: str, metadata: Metadata) -> bool:
+    """Whether a message says that it is of this type: as existing programs write it, or as ROS does."""
+    said = metadata.data_exchange_type
+    return said == data_type or short_type(said) == short_type(data_type)
 
 
 def least_bytes(metadata: Metadata) -> int:
@@ -319,6 +346,8 @@ def least_bytes(metadata: Metadata) -> int:
 
 def fitting(frame: Frames, data: Data, metadata: Metadata) -> tuple[Sequence[Buffer], int]:
     """The messages of a frame, or of a run, whose data is as it must be; and how many are not."""
+    if metadata.data_exchange_type.count("/") > 1:
+        metadata = structs.replace(metadata, data_exchange_type=short_type(metadata.data_exchange_type))
     good: list[Buffer] = []
     for single in frame.each():
         if (message := _fitting(single, data, metadata)) is not None:
@@ -352,6 +381,11 @@ def _name_problem(manager: str) -> str:
 
 def _wrong_type(metadata: Metadata) -> Verdict:
     return _no("wrong_node_type", f"a message for its node {_node(metadata)}, which has another type there")
+
+
+def _other_type(metadata: Metadata, data_type: str, *, stays: bool = True) -> Verdict:
+    types = f"{metadata.data_exchange_type[:80] or 'no type'}, and {_node(metadata)} has {data_type[:80] or 'none'}"
+    return _no("other_type", f"a message with {types}", stays=stays)
 
 
 def _node(metadata: Metadata) -> str:

@@ -11,6 +11,7 @@ from macs_zenoh.protocol.existing import (
     PASS,
     Asked,
     Data,
+    OwnNode,
     Verdict,
     asks,
     fitting,
@@ -20,6 +21,7 @@ from macs_zenoh.protocol.existing import (
     to_robot,
 )
 from macs_zenoh.protocol.messages import FOR_NEWER, MANAGERS, ROS, UNITY, AddNode, Metadata, NodeType
+from macs_zenoh.protocol.offers import short_type
 from macs_zenoh.protocol.wire import Header, encode_frame, encode_message, parse_frame, parse_runs, split_message
 
 TEXT = CDR + b"\x02\x00\x00\x00a\x00"
@@ -50,7 +52,12 @@ def of_node(node_type: int, name: str = "nd__a", kind: int = ROS, **fields: Any)
 
 def heard(metadata: Metadata, nodes: dict[str, int] | None = None, *, there: bool = False, asked: Any = None) -> str:
     """What an existing headset makes of a message: the name of the counter, empty for one that it gets."""
-    return to_headset(metadata, nodes or {}, asked or Asked(), registered_there=there).name
+    return to_headset(metadata, own(nodes or {}), asked or Asked(), registered_there=there).name
+
+
+def own(nodes: dict[str, int], of_type: str = "std_msgs/String") -> dict[str, OwnNode]:
+    """A headset's nodes."""
+    return {name: OwnNode(kind, of_type) for name, kind in nodes.items()}
 
 
 # -- names -----------------------------------------------------------------------------------------------------------
@@ -103,7 +110,7 @@ def test_a_node_of_another_type_is_never_named(node_type: int, own: int) -> None
 @pytest.mark.parametrize("node_type", [NodeType.SUBSCRIBER, NodeType.SERVICE])
 def test_topics_and_requests_come_from_where_they_are_registered(node_type: int) -> None:
     """Topic data and requests of services reach a headset only from robots on which it registered the node."""
-    registered = to_headset(of_node(node_type), {"nd__a": node_type}, Asked(), registered_there=True)
+    registered = to_headset(of_node(node_type), own({"nd__a": node_type}), Asked(), registered_there=True)
     assert (registered.name, registered.data) == ("", Data.CDR)
     assert heard(of_node(node_type), {"nd__a": node_type}) == "not_registered"
     assert heard(of_node(node_type)) == "not_registered"
@@ -117,12 +124,52 @@ def test_answers_come_from_who_was_asked() -> None:
     request = of_node(3, kind=UNITY, request_id=5)
     assert heard(of_node(3, request_id=5), nodes, asked=asked) == "not_asked"
     asked.note(request, Header(ROS, (1, 2), (), 0, 0))
-    for wrong in (of_node(3, request_id=6), of_node(3, "nd__b", request_id=5), Metadata(ROS, 3, 5, "", 3, "nd__a")):
+    others = Metadata(ROS, 3, 5, "", 3, "nd__a", "std_msgs/String")
+    for wrong in (of_node(3, request_id=6), of_node(3, "nd__b", request_id=5), others):
         assert heard(wrong, nodes, asked=asked) == "not_asked"
     assert heard(of_node(3, request_id=5), nodes, asked=asked) == ""
     asked.answered(of_node(3, request_id=5))
     assert heard(of_node(3, request_id=5), nodes, asked=asked) == "not_asked"
-    assert heard(Metadata(ROS, 2, 5, "", 3, "nd__a"), nodes, asked=asked) == ""
+    assert heard(Metadata(ROS, 2, 5, "", 3, "nd__a", "std_msgs/String"), nodes, asked=asked) == ""
+
+
+SPELLINGS = [("std_msgs/String", "std_msgs/String"), ("std_msgs/msg/String", "std_msgs/String")]
+SPELLINGS += [(ros, unity) for unity, ros in SPELLINGS]
+OTHERS = ["std_msgs/Bool", "std_msgs/msg/Bool", "my_msgs/String", "String", "std_msgs", "std_msgs/string", "/", ""]
+
+
+@pytest.mark.parametrize("node_type", [NodeType.SUBSCRIBER, NodeType.SERVICE, NodeType.ACTION])
+def test_data_is_of_the_type_that_was_registered(node_type: int) -> None:
+    """What names another type than the headset's own node, or none, is not sent; both ways to write a type are one."""
+    for said_type, own_type in SPELLINGS:
+        message = Metadata(ROS, 1, 0, "", node_type, "nd__a", said_type)
+        nodes = own({"nd__a": node_type}, short_type(own_type))
+        assert to_headset(message, nodes, Asked(), registered_there=True).name == ""
+    for other in OTHERS:
+        message = Metadata(ROS, 1, 0, "", node_type, "nd__a", other)
+        assert heard(message, {"nd__a": node_type}, there=True) == "other_type", other
+
+
+def test_an_answer_is_of_the_type_that_was_asked_for() -> None:
+    """Also where the headset never registered the service: its request says what it reads."""
+    for said_type, asked_type in SPELLINGS:
+        asked = Asked()
+        asked.note(Metadata(UNITY, 9, 5, "", 3, "nd__a", asked_type), Header(ROS, (1,), (), 0, 0))
+        assert heard(Metadata(ROS, 1, 5, "", 3, "nd__a", said_type), asked=asked) == ""
+    for other in OTHERS:
+        assert heard(Metadata(ROS, 1, 5, "", 3, "nd__a", other), asked=asked) == "other_type", other
+
+
+def test_data_is_judged_by_its_type_however_that_is_written() -> None:
+    """As ROS writes a type, the same is known of it."""
+    raw = said().encode()
+    for name in ("std_msgs/msg/String", "std_msgs/msg/Float64", "geometry_msgs/msg/Twist"):
+        metadata = Metadata(ROS, 1, 0, "", 1, "nd__a", name)
+        frame = parse_frame(encode_frame(2, (1,), message=encode_message(raw, CDR + b"\x07\x00\x00\x00ab")))
+        assert fitting(frame, Data.CDR, metadata) == ([], 1)
+    empty = Metadata(ROS, 1, 0, "", 1, "nd__a", "std_msgs/msg/Empty")
+    nodes = own({"nd__a": 1}, "std_msgs/Empty")
+    assert to_headset(empty, nodes, Asked(), registered_there=True).data is Data.EMPTY_TOO
 
 
 def test_who_asked_a_group_may_be_answered_by_anybody_in_it() -> None:
