@@ -307,7 +307,7 @@ class Delivery:
         else:
             self._send_fitting(connection, frame, metadata, verdict.data)
 
-    def _send_topic(self, connection: Connection, frame: Frame, metadata: Metadata, keep: bool) -> None:
+    def _send_topic(self, connection: Connection, frame: Frames, metadata: Metadata, keep: bool) -> None:
         """Topic data that does not simply pass to an existing program."""
         verdict = connection.verdict(metadata)
         if verdict.name:

@@ -86,8 +86,15 @@ def to_ros(both: UnityCdr | None, cdr: bytes) -> bytes:
 
 
 def to_unity(both: UnityCdr | None, cdr: bytes) -> bytes:
-    """ROS's message as an existing headset reads it. What is not of its type, ROS has not made: it stays as it is."""
-    return cdr if both is None else both.to_unity(cdr) or cdr
+    """ROS's message as an existing headset reads it. What is not of its type, ROS has not made: it stays as it is.
+
+    One without fields keeps the byte that it has in ROS. The headset reads none of it, and gateways, which know few
+    types, take one that ends behind its header for one that is cut short.
+    """
+    unity = both.to_unity(cdr) if both is not None else None
+    if unity is None:
+        return cdr
+    return unity + b"\0" if unity == HEADER else unity
 
 
 class _Copy:

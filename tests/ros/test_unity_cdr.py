@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,24 @@ from std_srvs.srv import Empty as EmptyService
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from bridge.gateway import Gateway
+from bridge.headset.client import Headset
 from bridge.ros import types
+from bridge.ros.agent import open_robot
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.session import RosSession
 from bridge.ros.types import least_cdr_bytes
 from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
+from bridge.settings import GatewaySettings, RobotSettings, Settings
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.mesh import Mesh
+from macs_zenoh.protocol.existing import Data, fitting
 from macs_zenoh.protocol.messages import Metadata, NodeType, node_name
 from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.wire import encode_frame, encode_message, parse_frame
 from tests.support.ros_peer import Peer, adding, command
+from tests.support.routers import Router
 from tests.support.waiting import get, until
 
 pytestmark = pytest.mark.timeout(600)  # the first of them compiles its messages, on a busy machine for minutes
@@ -151,6 +161,41 @@ def test_what_is_no_message_stays_what_it_is(cdr: bytes, kinds: Any) -> None:
         assert to_unity(both, cdr) == cdr or both.to_unity(cdr) is not None
 
 
+def test_a_message_without_fields_is_not_taken_for_one_cut_short(kinds: Any) -> None:
+    """Gateways know few types: what the robot sends of one without fields passes them and is read by a headset, and
+    what is cut short stays so."""
+    metadata = Metadata(1, 7, 0, "", 1, "nd__nothing", "macs_kinds_msgs/Nothing")
+    for kind, whole in ((kinds.Nothing, True), (Empty, True), (JointState, False)):
+        both = UnityCdr.of(kind)
+        data = to_unity(both, bytes(serialize_message(kind())) if whole else NOTHING)
+        frame = parse_frame(encode_frame(2, (5,), message=encode_message(metadata.encode(), data)))
+        assert len(fitting(frame, Data.CDR, metadata)[0]) == whole
+        assert not whole or unity_serializer.read(kind, data) == kind()
+    assert to_unity(UnityCdr.of(kinds.Nothing), NOTHING) == NOTHING
+
+
+async def test_a_type_of_ones_own_without_fields_reaches_an_existing_headset(
+    kinds: Any, domain: int, peer: Peer
+) -> None:
+    """From a ROS topic over the mesh and its gateway, each message."""
+    async with AsyncExitStack() as stack:
+        router = await stack.enter_async_context(Router())
+        mesh = MeshSettings(connect=[router.endpoint])
+        settings = Settings(mesh=mesh, robot=RobotSettings(id=7))
+        await stack.enter_async_context(open_robot(settings, domain_id=domain))
+        gateway = Gateway(await stack.enter_async_context(await Mesh.open(mesh)), GatewaySettings(port=0))
+        stack.push_async_callback(gateway.close)
+        await gateway.start()
+        headset = await stack.enter_async_context(await Headset.connect("127.0.0.1", gateway.port, extensions=0))
+        topic = await headset.subscribe("/nothing", "macs_kinds_msgs/Nothing", agents=[7])
+        publisher = await peer.publisher(kinds.Nothing, "/nothing", matched=1)
+        for _ in range(3):
+            await peer.session.run(lambda: publisher.publish(kinds.Nothing()))
+            message = await asyncio.wait_for(topic.__anext__(), 10)
+            assert unity_serializer.read(kinds.Nothing, bytes(message.data)) == kinds.Nothing()
+        assert gateway.drops.total() == 0
+
+
 # -- through interface nodes -----------------------------------------------------------------------------------------
 
 NOTHING = b"\x00\x01\x00\x00"
@@ -222,7 +267,7 @@ async def test_a_call_without_fields_reaches_ros(
     assert len(calls) == 1
     if unity:
         assert unity_serializer.read(kind.Response, data) == calls_answer(kind)
-        assert kind is Trigger or data == NOTHING
+        assert kind is Trigger or data == NOTHING + b"\0"
     else:
         assert deserialize_message(data, kind.Response) == calls_answer(kind)
 
@@ -247,7 +292,8 @@ async def test_a_service_without_fields_is_served(nodes: InterfaceNodes, sent: S
 
     await peer.session.run(call)
     _, metadata, data = await get(sent)
-    assert data == NOTHING
+    assert data == NOTHING + b"\0"
+    assert unity_serializer.read(kind.Request, data) == kind.Request()
     answer = unity_serializer.write(calls_answer(kind))
     nodes.deliver(of_service("/do", NodeType.SERVICE, answer, metadata.request_id))
     assert await asyncio.wait_for(answered, 10) == calls_answer(kind)
