@@ -216,6 +216,30 @@ async def test_threads_of_zenoh_stay_attached(mesh: Mesh, sender: Mesh) -> None:
     assert max(counts) > 5
 
 
+async def test_who_makes_room_wakes_the_loop_once(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However often what waits is handed over to make room, the loop is asked once to hand over the rest."""
+    arrivals, handed_over = mesh._arrivals, 0
+    deliver = arrivals._deliver
+
+    def counted() -> None:
+        nonlocal handed_over
+        handed_over += 1
+        deliver()
+
+    monkeypatch.setattr(arrivals, "_deliver", counted)
+    receiver = Receiver()
+    mesh.subscribe(KEY, receiver.batch)
+    await asyncio.sleep(0.1)
+    count = 50 * (Arrivals.LOOPED + 1)
+    for sent in range(count):
+        mesh.put(KEY, sent.to_bytes(4, "big"), Traffic.CALL)
+        mesh.make_room()
+    await until(lambda: len(receiver.numbers) == count)
+    await asyncio.sleep(0.1)
+    assert receiver.numbers == list(range(count))
+    assert handed_over <= 2
+
+
 class Admitting:
     """A gate that takes everything at once, and notes what it took."""
 

@@ -12,6 +12,7 @@ from bridge.gateway import Gateway
 from bridge.headset.client import Headset
 from macs_zenoh.agent import Agent
 from macs_zenoh.protocol.messages import Metadata
+from macs_zenoh.protocol.rate_limit import Pace, Passing
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.test_gateway import Socket, socket
@@ -69,6 +70,27 @@ async def test_a_headset_whose_network_stood_still_does_not_make_up_for_it(
         headset.writer.write(frame(1000))
         await until(lambda: taken(robot)[-1] == 1000)
         assert drops(gateway, headset)["too_old"] > 190
+
+
+class OnePaused(Pace):
+    """Of a connection whose first command has waited, and the second not: they are far apart in one long read."""
+
+    def command(self, count: int, now: float, *, may_stop: bool = False) -> Passing:
+        first, self._flow = self._flow == 0, 1
+        return Passing.WAITED if first else Passing.NOW
+
+
+async def test_a_newer_command_is_not_followed_by_one_that_waited(start_gateway: StartGateway, robot: Agent) -> None:
+    """What waits until all that came with it is seen is dropped when a newer one of its kind goes on before."""
+    gateway = await start_gateway()
+    async with socket(gateway) as headset:
+        await ready(gateway, headset)
+        gateway.agents.find(2, headset.id).pace = OnePaused(1000, 1000, 0.0)
+        headset.writer.write(frame(1) + frame(3, ("nd__arm", MOVE[1])) + frame(2) + frame(4))
+        await until(lambda: taken(robot)[-1:] == [4] and taken(robot, ("nd__arm", MOVE[1])) == [3])
+        await asyncio.sleep(0.1)
+        assert taken(robot) == [2, 4]
+        assert drops(gateway, headset) == {"too_old": 1}
 
 
 async def test_a_burst_of_commands_is_passed_on(start_gateway: StartGateway, robot: Agent) -> None:

@@ -218,6 +218,39 @@ async def test_topic_data_stops_when_the_registration_does(
         assert gateway.drops == {"not_registered": 1}
 
 
+async def test_what_comes_with_the_configuration_is_by_who_the_agent_becomes(
+    router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """A robot gets another id when it says that it is one. What it sent in the same moment, before it or after, bears
+    that id, reaches existing programs so, and what it registered ends with it."""
+    gateway = await start_gateway(robots=[9])
+    callers: list[tuple[int, int]] = []
+
+    async def add(call: macs_zenoh.Call) -> bytes:
+        node = decode_data(AddNode, call.data)
+        callers.append((call.sender_id, node.registrant_agent_id))
+        return b""
+
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as other, socket(gateway) as headset:
+        other.serve("add_node", add)
+        headset.configure()
+        await until(lambda: (ROS, 7) in gateway.directory and (UNITY, headset.id) in gateway.directory)
+        async with socket(gateway) as robot:
+            about = Metadata(ROS, robot.id, message_manager="Greeting")
+            greeting = encode_frame(UNITY, (headset.id,), message=encode_message(about.encode(), b"{}"))
+            robot.writer.write(greeting)
+            robot.configure(agent_type=ROS)
+            node = AddNode(ROS, robot.id, 1, "nd__chatter", "/chatter", "std_msgs/String")
+            robot.writer.write(registration(robot, [7], node) + greeting)
+            said = [(await headset.message())[0] for _ in range(2)]
+            assert [(about.message_manager, about.sender_agent_id) for about in said] == [("Greeting", 9)] * 2
+            await until(lambda: callers)
+            assert robot.id != 9
+            assert set(callers) == {(9, 9)}
+            assert len(gateway._robots._registrations) == 1
+        await until(lambda: not len(gateway._robots._registrations))
+
+
 async def _accept(_call: macs_zenoh.Call) -> bytes:
     return b""
 

@@ -86,6 +86,18 @@ def heard(ages: Ages, sender: str, *, delay: float, until: float = 10.0, clock: 
         ages.age(sender, clock, now - delay, now)
 
 
+def test_two_stamps_in_one_moment_make_a_backlog_no_younger() -> None:
+    """What was put twice in one moment and came much later is as old as it is: only a clock that stands still for
+    longer was put forward."""
+    for step in (0.0, 1e-7, 5e-6):
+        ages = Ages()
+        for number in range(100):
+            assert ages.age("unity/300", "router", number / 10, number / 10) == 0.0
+        assert ages.age("unity/300", "router", 10.0, 10.0) == 0.0
+        waited = [ages.age("unity/300", "router", 10.0 + step, 11.5), ages.age("unity/300", "router", 10.05, 11.5)]
+        assert waited == pytest.approx([1.5, 1.45], abs=0.001)
+
+
 @pytest.mark.parametrize("forged", [-3600.0, -0.4, 3600.0])
 def test_who_forges_stamps_changes_nobody_elses_age(forged: float) -> None:
     """With stamps in the future or the past, on the clock that others use: their commands are as old as before."""

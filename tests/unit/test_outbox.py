@@ -85,6 +85,8 @@ def test_the_limit_holds(story_steps: list[tuple[str, int]]) -> None:
         large = [len(chunk) for chunk in story.outbox._calls if len(chunk) > LIMIT]
         assert story.outbox.bytes - sum(large) <= LIMIT or len(story.outbox) == 1
         assert len(large) <= 1
+        streams = story.outbox._streams
+        assert story.outbox._stream_bytes == {node: sum(map(len, each)) for node, each in streams.items() if each}
         assert bool(story.outbox) == (len(story.outbox) > 0)
     waiting, counted = story.outbox.bytes, len(story.outbox)
     chunks = story.outbox.take(1 << 30)
@@ -243,6 +245,29 @@ def test_calls_give_way_to_nothing() -> None:
     assert outbox.drops == {"outbox_full": 1}
     assert [len(chunk) for chunk in outbox.take(1000)] == [60, 40]
     assert outbox.put_call(bytes(41))
+
+
+class Measured(bytes):
+    """A message that counts how often its size is asked for."""
+
+    asked = 0
+
+    def __len__(self) -> int:
+        Measured.asked += 1
+        return super().__len__()
+
+
+@pytest.mark.parametrize("waiting", [100, 1600])
+def test_a_drop_costs_no_more_when_more_waits(waiting: int) -> None:
+    """What a full outbox does for a message does not grow with what waits in it."""
+    outbox = Outbox(100 * waiting)
+    for _ in range(waiting):
+        outbox.put_stream("camera", Measured(100), depth=1 << 20, drop_new=False)
+    Measured.asked = 0
+    for _ in range(10):
+        outbox.put_stream("camera", Measured(100), depth=1 << 20, drop_new=False)
+    assert outbox.drops == {"outbox_full": 10}
+    assert Measured.asked <= 10 * 12
 
 
 @pytest.mark.parametrize("kind", ["call", "stream"])
