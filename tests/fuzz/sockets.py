@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 from bridge.headset.client import Headset
 from tests.support.programs import Program, free_port
+from tests.support.waiting import PATIENCE_S
 
 VECTORS = Path(__file__).parents[1] / "vectors"
 CONNECTIONS = 8
@@ -92,7 +93,7 @@ async def attack(port: int, frames: Iterator[bytes]) -> int:
                 await asyncio.sleep(0)
             if sent >= PER_CONNECTION or draining.done() or writer.is_closing():
                 break
-        await asyncio.wait_for(writer.drain(), 5)
+        await asyncio.wait_for(writer.drain(), PATIENCE_S)
     writer.close()
     draining.cancel()
     return sent
@@ -131,7 +132,7 @@ async def run(frames: int, seed: int) -> Report:
             connections += len(shares)
         talk.cancel()
         await left.send(b"end", to=2, ids=[right.id], manager="Neighbour")
-        messages = await asyncio.wait_for(listen, 10)
+        messages = await asyncio.wait_for(listen, PATIENCE_S)
         deadline = time.monotonic() + GONE_S
         while _descriptors(gateway.pid) > before[1] and time.monotonic() < deadline:
             await left.online()

@@ -23,6 +23,7 @@ from macs_zenoh.protocol.keyexpr import NAMED, PRESENCE, STREAM
 from macs_zenoh.protocol.messages import OPERATOR, Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
+from tests.support.waiting import PATIENCE_S
 
 RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
 USERS = ("robot-7", "gateway-1", "observer")
@@ -60,7 +61,7 @@ async def online(agent: Any, agent_type: int, agent_id: int) -> None:
     """Wait until the agent sees the other one."""
     seen = asyncio.Event()
     agent.on_presence(lambda who, here: seen.set() if here and (who.type, who.id) == (agent_type, agent_id) else None)
-    await asyncio.wait_for(seen.wait(), 5)
+    await asyncio.wait_for(seen.wait(), PATIENCE_S)
 
 
 async def test_what_the_rules_allow_works(as_user: Callable[[str], MeshSettings]) -> None:
@@ -80,18 +81,18 @@ async def test_what_the_rules_allow_works(as_user: Callable[[str], MeshSettings]
         robot.broadcast(b"serving")  # what a session declares arrives before what it sends afterwards
         headset.broadcast(b"serving")
         for agent in (robot, headset):
-            assert (await asyncio.wait_for(agent.receive(), 5)).data == b"serving"
+            assert (await asyncio.wait_for(agent.receive(), PATIENCE_S)).data == b"serving"
         assert await headset.call("ros", 7, "ask", b"headset") == b"yes, headset"
         assert await robot.call("unity", 9, "ask", b"robot") == b"yes, robot"
 
         headset.send(b"by id", to="ros", ids=[7])
         headset.send(b"by group", to="ros", groups=[3])
         headset.broadcast(b"to all")
-        got = {(await asyncio.wait_for(robot.receive(), 5)).data for _ in range(3)}
+        got = {(await asyncio.wait_for(robot.receive(), PATIENCE_S)).data for _ in range(3)}
         assert got == {b"by id", b"by group", b"to all"}
 
         robot.send(b"back", to="unity", ids=[9])
-        assert (await asyncio.wait_for(headset.receive(), 5)).data == b"back"
+        assert (await asyncio.wait_for(headset.receive(), PATIENCE_S)).data == b"back"
 
         streamed: asyncio.Queue[bytes] = asyncio.Queue()
 
@@ -102,7 +103,7 @@ async def test_what_the_rules_allow_works(as_user: Callable[[str], MeshSettings]
         headset.mesh.subscribe(STREAM.every(type=1, id=7), take)
         await headset.call("ros", 7, "ask")  # by its answer the robot knows of the subscription
         Streams(robot).publish("nd__pose", b"topic data")
-        assert await asyncio.wait_for(streamed.get(), 5) == b"topic data"
+        assert await asyncio.wait_for(streamed.get(), PATIENCE_S) == b"topic data"
 
 
 async def test_an_agent_uses_a_robot_within_the_rules(as_user: Callable[[str], MeshSettings]) -> None:
@@ -145,7 +146,7 @@ async def test_a_robot_cannot_speak_as_another(as_user: Callable[[str], MeshSett
         with pytest.raises(Unreachable):
             await headset.call("ros", 8, "ask", timeout_s=1)
         robot.send(b"I am robot 7", to="unity", ids=[9])
-        assert (await asyncio.wait_for(headset.receive(), 5)).data == b"I am robot 7"
+        assert (await asyncio.wait_for(headset.receive(), PATIENCE_S)).data == b"I am robot 7"
         assert {agent.id for agent in headset.online() if agent.type == 1} == {7}
 
 
@@ -171,7 +172,7 @@ async def test_a_robot_has_its_own_name_only(as_user: Callable[[str], MeshSettin
                 break
             except Unreachable:
                 await asyncio.sleep(0.05)
-        assert (await asyncio.wait_for(received.get(), 5)).data == b"as itself"
+        assert (await asyncio.wait_for(received.get(), PATIENCE_S)).data == b"as itself"
         for mesh, message_type, sender in ((thief, "t", "drone8"), (gateway, "t", "drone8"), (gateway, "unity", "9")):
             key = NAMED.of(name="drone7", message_type=message_type, from_name=sender)
             with pytest.raises(Unreachable):
@@ -199,8 +200,8 @@ async def test_an_observer_asks_robots_and_stops_none(as_user: Callable[[str], M
 
     async with (
         macs_zenoh.join("ros", id=7, settings=as_user("robot-7")) as robot,
-        operator(as_user("observer"), AgentId(OPERATOR, 0), timeout_s=5) as nobody,
-        operator(as_user("observer"), AgentId(OPERATOR, 5), timeout_s=5) as somebody,
+        operator(as_user("observer"), AgentId(OPERATOR, 0), timeout_s=PATIENCE_S) as nobody,
+        operator(as_user("observer"), AgentId(OPERATOR, 5), timeout_s=PATIENCE_S) as somebody,
     ):
         for verb in ("status", "offers", "stop"):
             robot.serve(verb, answer)

@@ -24,7 +24,7 @@ from macs_zenoh.protocol.messages import ROS, UNITY, Configuration, Welcome, dec
 from macs_zenoh.protocol.wire import encode_frame, split_message
 from tests.support.given import StartGateway
 from tests.support.programs import Program, free_port
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 
 class Plain:
@@ -120,12 +120,12 @@ async def test_who_waits_for_an_id_may_speak_and_leave(
         await asyncio.sleep(0.05)
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
         writer.close()
-    await until(lambda: "3 connections wait for an id" in caplog.text, 20)
-    answer, _ = ping.decode(await gateway.mesh.query(PING.of(zid=gateway.mesh.zid), b"", timeout_s=5))
+    await until(lambda: "3 connections wait for an id" in caplog.text)
+    answer, _ = ping.decode(await gateway.mesh.query(PING.of(zid=gateway.mesh.zid), b"", timeout_s=PATIENCE_S))
     assert answer.now == {"waiting_for_id": 3}
     takes.set()
     async with crowd(gateway.port, 1):
-        await asyncio.wait_for(stays.join(UNITY), 5)
+        await asyncio.wait_for(stays.join(UNITY), PATIENCE_S)
         await until(lambda: len(gateway.agents) == 2)
     stays.writer.close()
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
@@ -137,7 +137,7 @@ async def test_when_there_are_no_ids_a_newcomer_is_closed(start_gateway: StartGa
     async with crowd(gateway.port, 256) as agents:
         assert {agent.id for agent in agents} == set(range(5 * 256, 6 * 256))
         reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port)
-        assert await asyncio.wait_for(reader.read(), 10) == b""
+        assert await asyncio.wait_for(reader.read(), PATIENCE_S) == b""
         writer.close()
         assert gateway.drops["no_id"] == 1
         agents[7].writer.close()
@@ -180,7 +180,7 @@ async def test_who_asks_too_much_is_slowed(start_gateway: StartGateway) -> None:
         before = len(gateway.agents)
         await until(lambda: gateway.agents.find(UNITY, greedy.id).drops["slowed_down"])  # type: ignore[union-attr]
         neighbour.writer.write(frames.online_request(neighbour.id, 1))
-        assert await asyncio.wait_for(neighbour.read(), 5)
+        assert await asyncio.wait_for(neighbour.read(), PATIENCE_S)
         assert before == 2
 
 
@@ -196,12 +196,12 @@ async def test_without_descriptors_it_is_said() -> None:
     ):
         assert "connections have room" in "\n".join(gateway.log)
         newcomers = [await asyncio.open_connection("127.0.0.1", gateway.port) for _ in range(150)]
-        ends = [await asyncio.wait_for(reader.read(1), 10) for reader, _ in newcomers]
+        ends = [await asyncio.wait_for(reader.read(1), PATIENCE_S) for reader, _ in newcomers]
         assert 20 < ends.count(b"") < 150
         for _, writer in newcomers:
             writer.close()
         there[0].writer.write(frames.online_request(there[0].id, 1))
-        assert await asyncio.wait_for(there[0].read(), 5)
+        assert await asyncio.wait_for(there[0].read(), PATIENCE_S)
         deadline = time.monotonic() + 20
         while True:
             try:

@@ -17,7 +17,7 @@ async def test_what_says_who_is_there_says_where_to_send(router: str) -> None:
         macs_zenoh.join("2", id=300, connect=[router]) as headset,
     ):
         assert (robot.type, headset.type) == ("ros", "unity")
-        await until(lambda: len(headset.online()) == 2, 20)
+        await until(lambda: len(headset.online()) == 2)
         info = next(agent for agent in headset.online() if agent.id == 7)
         assert str(info.key) == "ros/7"
         headset.send(b"by number", to=info.type, ids=[info.id])
@@ -37,7 +37,7 @@ async def test_a_reply_goes_to_who_asked_with_its_number(router: str) -> None:
         macs_zenoh.join("unity", id=300, connect=[router]) as headset,
         macs_zenoh.join("unity", id=301, connect=[router]) as other,
     ):
-        await until(lambda: len(headset.online()) == len(robot.online()) == 3, 20)
+        await until(lambda: len(headset.online()) == len(robot.online()) == 3)
         headset.send(b"?", to="ros", ids=[7], metadata=macs_zenoh.Metadata(request_id=41))
         robot.reply(await asyncio.wait_for(robot.receive(), 20), b"!")
         robot.send(b"to you", to="unity", ids=[301])
@@ -67,7 +67,7 @@ async def test_a_drained_agent_has_sent_all(router: str) -> None:
         macs_zenoh.join("ros", id=7, connect=[router]) as robot,
         macs_zenoh.join("unity", id=300, connect=[router]) as headset,
     ):
-        await until(lambda: len(headset.online()) == len(robot.online()) == 2, 20)
+        await until(lambda: len(headset.online()) == len(robot.online()) == 2)
         for number in range(pieces):
             headset.send(bytes([number]) + bytes(size), to="ros", ids=[7])
             await headset.drain()
@@ -83,7 +83,7 @@ async def test_drain_waits_for_what_was_sent_before(router: str) -> None:
         macs_zenoh.join("ros", id=7, connect=[router]) as robot,
         macs_zenoh.join("unity", id=300, connect=[router]) as headset,
     ):
-        await until(lambda: len(headset.online()) == len(robot.online()) == 2, 20)
+        await until(lambda: len(headset.online()) == len(robot.online()) == 2)
         headset.send(bytes(12 << 20), to="ros", ids=[7])
         headset.send(b"after it", to="ros", ids=[7])
         draining = asyncio.ensure_future(headset.drain())
@@ -108,7 +108,7 @@ async def test_every_callback_ends_with_its_handle(router: str) -> None:
 
         heard: list[bytes] = []
         async with macs_zenoh.join("unity", id=300, connect=[router]) as headset:
-            await until(lambda: 300 in second, 20)
+            await until(lambda: 300 in second)
             assert first == [7]
 
             async def look(call: macs_zenoh.Call) -> bytes:
@@ -122,7 +122,7 @@ async def test_every_callback_ends_with_its_handle(router: str) -> None:
 
             with robot.on_message(lambda message: heard.append(message.data)):
                 headset.send(b"to the callback", to="ros", ids=[7])
-                await until(lambda: heard == [b"to the callback"], 20)
+                await until(lambda: heard == [b"to the callback"])
             headset.send(b"to receive", to="ros", ids=[7])
             assert (await asyncio.wait_for(robot.receive(), 20)).data == b"to receive"
         assert heard == [b"to the callback"]
@@ -136,7 +136,7 @@ async def test_another_handler_is_not_ended_by_the_first_ones_handle(router: str
         robot.on_message(lambda message: heard.append(message.data))
         old.close()
         robot.send(b"to itself", to="ros", ids=[7])
-        await until(lambda: heard == [b"to itself"], 20)
+        await until(lambda: heard == [b"to itself"])
 
 
 async def test_a_callback_may_end_callbacks(router: str) -> None:
@@ -154,7 +154,7 @@ async def test_a_callback_may_end_callbacks(router: str) -> None:
         handles.append(robot.on_presence(tell))
         handles.append(robot.on_presence(lambda agent, online: told.append(f"second {agent.id}")))
         async with macs_zenoh.join("unity", id=300, connect=[router]):
-            await until(lambda: "first" in told, 20)
+            await until(lambda: "first" in told)
         assert told == ["second 7", "first"]
 
 

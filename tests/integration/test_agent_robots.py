@@ -23,9 +23,8 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
 from tests.support.routers import Router
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
-PATIENCE_S = 20
 TOPIC = "/chatter"
 STRING = "std_msgs/String"
 

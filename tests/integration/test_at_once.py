@@ -16,7 +16,7 @@ from macs_zenoh.errors import NotServed
 from macs_zenoh.mesh import Mesh, Payload, Sample, Traffic
 from macs_zenoh.mesh.arrivals import Arrivals
 from macs_zenoh.protocol.keyexpr import CALL
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 KEY, OTHER_KEY = "macs/to/ros/7/from/unity/256", "macs/to/ros/7/from/unity/257"
 PAUSE_S = 3 * Arrivals.CALM_S
@@ -154,7 +154,7 @@ async def test_no_sample_goes_past_a_question(mesh: Mesh, sender: Mesh) -> None:
         with suppress(NotServed):
             await sender.query(key, b"", timeout_s=1)
     receiver.numbers.clear()
-    asked = asyncio.create_task(sender.query(key, b"", timeout_s=5))
+    asked = asyncio.create_task(sender.query(key, b"", timeout_s=PATIENCE_S))
     await asyncio.sleep(0)  # it is asked now
     deadline = time.monotonic() + 5
     while not mesh._arrivals.asked and time.monotonic() < deadline:  # the loop stands still

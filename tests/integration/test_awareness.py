@@ -15,7 +15,7 @@ from macs_zenoh.errors import Unreachable, UsageError
 from macs_zenoh.protocol.keyexpr import NAME, NAMED, NAMED_ALL
 from macs_zenoh.protocol.named import Outcome
 from tests.support.programs import Program, free_port, macs
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 Meet = Callable[..., Awaitable[Awareness]]
 
@@ -40,7 +40,7 @@ class Module:
         self.registration = owner.register(message_type, self.received.put_nowait, last_value=last_value)
 
     async def next(self) -> Received:
-        return await asyncio.wait_for(self.received.get(), 5)
+        return await asyncio.wait_for(self.received.get(), PATIENCE_S)
 
 
 async def test_a_message_reaches_its_receiver_only(meet: Meet) -> None:
@@ -48,7 +48,7 @@ async def test_a_message_reaches_its_receiver_only(meet: Meet) -> None:
     a, b, c = [await meet(name) for name in "abc"]
     modules = [Module(agent, "t") for agent in (a, b, c)]
     for name in "bc":
-        await a.wait_for(name, "t", timeout_s=5)
+        await a.wait_for(name, "t", timeout_s=PATIENCE_S)
     assert a.send("b", "t", b"to b") is Outcome.SENT
     assert a.send("", "t", b"to all") is Outcome.SENT
     first, second = await modules[1].next(), await modules[1].next()
@@ -65,7 +65,7 @@ async def test_a_message_reaches_its_receiver_only(meet: Meet) -> None:
 async def test_delivery_is_known(meet: Meet) -> None:
     """Sent, delivered, no such agent, nobody registered, to itself: each is told and counted."""
     a, b = await meet("a"), await meet("b")
-    await a.wait_for("b", timeout_s=5)
+    await a.wait_for("b", timeout_s=PATIENCE_S)
     assert a.send("b", "t", b"") is Outcome.NOT_REGISTERED
     assert a.send("", "t", b"") is Outcome.NOT_REGISTERED
     assert a.send("nobody", "t", b"") is Outcome.NO_SUCH_AGENT
@@ -81,7 +81,7 @@ async def test_an_unregistered_type_is_warned_of_once(meet: Meet, caplog: pytest
     """Messages of a type that nobody registered cost one line in the log and are counted."""
     a, b = await meet("a"), await meet("b")
     module = Module(b, "known")
-    await a.wait_for("b", "known", timeout_s=5)
+    await a.wait_for("b", "known", timeout_s=PATIENCE_S)
     for _ in range(5):
         a.send("b", "unknown", b"")
     assert await a.deliver("b", "known", b"end", deadline_s=5) is Outcome.DELIVERED
@@ -97,7 +97,7 @@ async def test_a_message_waits_for_its_receiver_until_its_deadline(meet: Meet) -
     b = await meet("b")
     assert not delivery.done()
     module = Module(b, "t")
-    assert await asyncio.wait_for(delivery, 5) is Outcome.DELIVERED
+    assert await asyncio.wait_for(delivery, PATIENCE_S) is Outcome.DELIVERED
     assert (await module.next()).data == b"waited"
     assert module.received.empty()
 
@@ -106,7 +106,7 @@ async def test_a_deadline_travels_along(meet: Meet) -> None:
     """The receiver knows until when a message is good; without a deadline it always is."""
     a, b = await meet("a"), await meet("b")
     module = Module(b, "t")
-    await a.wait_for("b", "t", timeout_s=5)
+    await a.wait_for("b", "t", timeout_s=PATIENCE_S)
     now = asyncio.get_running_loop().time()
     await a.deliver("b", "t", b"", deadline_s=60)
     good_until = (await module.next()).good_until
@@ -125,7 +125,7 @@ async def test_who_joins_late_learns_the_last_values(meet: Meet) -> None:
     late = Module(await meet("late"), "t", last_value=True)
     assert (await late.next()).data == b"a2"
     plain = Module(await meet("plain"), "t")
-    await a.wait_for("plain", "t", timeout_s=5)
+    await a.wait_for("plain", "t", timeout_s=PATIENCE_S)
     a.send("", "t", b"a3")
     assert [(await late.next()).data, (await plain.next()).data] == [b"a3", b"a3"]
     assert late.received.empty()
@@ -135,8 +135,8 @@ async def test_a_rate_limit_holds_per_type(meet: Meet) -> None:
     """What is sent more often than allowed is dropped, told and counted; other types pass."""
     a, b = await meet("a", max_hz={"t": 0.1}), await meet("b")
     module, other = Module(b, "t"), Module(b, "other")
-    await a.wait_for("b", "t", timeout_s=5)
-    await a.wait_for("b", "other", timeout_s=5)
+    await a.wait_for("b", "t", timeout_s=PATIENCE_S)
+    await a.wait_for("b", "other", timeout_s=PATIENCE_S)
     outcomes = [a.send("b", "t", b"%d" % n) for n in range(4)]
     assert outcomes == [Outcome.SENT, *[Outcome.RATE_LIMITED] * 3]
     assert [a.send("b", "other", b"") for _ in range(3)] == [Outcome.SENT] * 3
@@ -152,7 +152,7 @@ async def test_any_text_is_a_name_and_a_type(meet: Meet, name: str) -> None:
     """Slashes, spaces, wildcards and Unicode reach exactly the agent of that name."""
     a, b = await meet("a"), await meet(name)
     module, other = Module(b, name), Module(a, name)
-    await a.wait_for(name, name, timeout_s=5)
+    await a.wait_for(name, name, timeout_s=PATIENCE_S)
     assert a.send(name, name, b"1") is Outcome.SENT
     assert (await module.next())[:3] == ("a", name, b"1")
     assert await b.deliver("a", name, b"2", deadline_s=5) is Outcome.DELIVERED
@@ -185,7 +185,7 @@ async def test_ten_megabytes_arrive_whole(meet: Meet, how: str) -> None:
     """10 MB to one and to all arrive byte for byte, with small messages in between; above the limit is refused."""
     a, b = await meet("a"), await meet("b", max_bytes=20)
     module, small = Module(b, "t"), Module(b, "small")
-    await a.wait_for("b", "small", timeout_s=5)
+    await a.wait_for("b", "small", timeout_s=PATIENCE_S)
     data = bytes(range(256)) * 40_000
     if how == "send":
         assert a.send("b", "t", data) is Outcome.SENT
@@ -225,11 +225,11 @@ async def test_a_bad_message_costs_only_itself(meet: Meet, caplog: pytest.LogCap
     """Bytes that are no message, by put and by query, are counted and logged once; the next message arrives."""
     a, b = await meet("a"), await meet("b")
     module = Module(b, "t")
-    await a.wait_for("b", "t", timeout_s=5)
+    await a.wait_for("b", "t", timeout_s=PATIENCE_S)
     for payload in (b"", b"\xff\xff\xff\xff", b"\x02\0\0\0{}\0\0\0\0"):
         a.mesh.put(NAMED.of(name="b", message_type="t", from_name="a"), payload)
         a.mesh.put(NAMED_ALL.of(message_type="t", from_name="a"), payload)
-        await a.mesh.query(NAMED.of(name="b", message_type="t", from_name="a"), payload, timeout_s=5)
+        await a.mesh.query(NAMED.of(name="b", message_type="t", from_name="a"), payload, timeout_s=PATIENCE_S)
     assert await a.deliver("b", "t", b"good", deadline_s=5) is Outcome.DELIVERED
     assert (await module.next()).data == b"good"
     await until(lambda: b.counters["bad_message"] == 9)
@@ -251,7 +251,7 @@ async def test_a_closed_registration_is_known(meet: Meet) -> None:
     """After the last registration of a type is closed, senders know that nobody takes it."""
     a, b = await meet("a"), await meet("b")
     modules = [Module(b, "t"), Module(b, "t")]
-    await a.wait_for("b", "t", timeout_s=5)
+    await a.wait_for("b", "t", timeout_s=PATIENCE_S)
     modules[0].registration.close()
     modules[0].registration.close()
     assert await a.deliver("b", "t", b"x", deadline_s=5) is Outcome.DELIVERED
@@ -271,7 +271,7 @@ async def test_names_are_listed() -> None:
                 macs_zenoh.join("unity", id=300, connect=[endpoint]) as headset,
                 awareness.join(headset, "ground"),
             ):
-                await drone.wait_for("ground", timeout_s=5)
+                await drone.wait_for("ground", timeout_s=PATIENCE_S)
                 listed = await macs("ls", "--json", "-e", endpoint)
                 assert {(a["type"], a["id"], a["name"]) for a in listed} == {
                     ("ros", 3, "drone0"),
@@ -298,7 +298,7 @@ async def test_nothing_is_lost_for_ever_with_a_router(tmp_path: object) -> None:
             awareness.join(two, "b") as b,
         ):
             module = Module(b, "t")
-            await a.wait_for("b", "t", timeout_s=5)
+            await a.wait_for("b", "t", timeout_s=PATIENCE_S)
             await router.stop()
             await until(lambda: not a.mesh.linked)
             assert a.send("b", "t", b"") is Outcome.NO_ROUTER

@@ -187,7 +187,7 @@ async def test_half_frames_are_not_kept_for_ever(start_gateway: StartGateway, co
     while (message := await asyncio.wait_for(neighbour.receive(), 20)).metadata.message_manager != "Big":
         pass
     assert len(message.data) == 600_000
-    await until(lambda: gateway.drops["unfinished_frame"] == 1, 20)
+    await until(lambda: gateway.drops["unfinished_frame"] == 1)
     trickling.cancel()
     await answers(neighbour)
     slow.socket.close()

@@ -16,6 +16,7 @@ import pytest
 import macs_zenoh
 from bridge.headset.client import Headset
 from tests.support.programs import ROOT, Program, ended, free_port, macs
+from tests.support.waiting import PATIENCE_S
 
 
 @pytest.fixture
@@ -85,6 +86,7 @@ async def test_a_namespace_is_a_mesh_of_its_own(endpoint: str) -> None:
         assert shown.startswith("nobody is online here; 1 in 'site1' (--namespace site1)\n")
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
 async def test_servers_stop_on_a_signal(endpoint: str, number: signal.Signals) -> None:
     """Router and gateway end with 0 within 2 s, the gateway also when its router is gone before it."""
@@ -205,7 +207,7 @@ async def test_a_waiting_gateway_stops_too(endpoint: str) -> None:
     assert process.stderr is not None
     assert endpoint in (await asyncio.wait_for(process.stderr.readline(), 20)).decode()
     process.send_signal(signal.SIGTERM)
-    assert await asyncio.wait_for(process.wait(), 2) == 0
+    assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
@@ -241,6 +243,7 @@ async def test_a_taken_port_is_one_line(endpoint: str) -> None:
             assert where in errors.splitlines()[-1]
 
 
+@pytest.mark.alone
 async def test_up_runs_router_and_gateway(endpoint: str) -> None:
     """`macs up` without a robot's ROS side still serves headsets, and stops all its programs within 2 s."""
     port, router_port = free_port(), free_port()

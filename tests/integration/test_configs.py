@@ -35,7 +35,7 @@ from macs_zenoh.sections import changed
 from tests.support.programs import ROOT, Program, free_port
 from tests.support.routers import Router
 from tests.support.tools import zenohd
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -157,12 +157,12 @@ async def test_a_site_works_on_either_router(tmp_path: Path) -> None:
         agent = await stack.enter_async_context(
             macs_zenoh.join("ros", id=robot.robot.id, group=robot.robot.group, settings=robot.mesh)
         )
-        await asyncio.wait_for(meet(headset, agent), 10)
+        await asyncio.wait_for(meet(headset, agent), PATIENCE_S)
         for router in routers:
             await router.stop(signal.SIGKILL)
-            await asyncio.wait_for(meet(headset, agent), 10)
+            await asyncio.wait_for(meet(headset, agent), PATIENCE_S)
             await router.start()
-            await asyncio.wait_for(meet(headset, agent), 10)
+            await asyncio.wait_for(meet(headset, agent), PATIENCE_S)
 
 
 async def meet(headset: Headset, robot: macs_zenoh.Agent) -> None:

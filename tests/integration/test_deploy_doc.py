@@ -23,6 +23,7 @@ from bridge.headset.client import Headset
 from tests.support.processes import LINE_BYTES
 from tests.support.programs import ROOT, free_port
 from tests.support.tools import zenohd
+from tests.support.waiting import PATIENCE_S
 
 PAGE = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
 
@@ -150,7 +151,7 @@ class Reader:
             process = self._running.pop(line)
             if process.returncode is None:
                 process.terminate()
-            await asyncio.wait_for(process.wait(), 10)
+            await asyncio.wait_for(process.wait(), PATIENCE_S)
 
 
 @pytest.mark.timeout(300)
@@ -166,7 +167,7 @@ async def test_the_page_from_top_to_bottom(tmp_path: Path) -> None:
                 await somebody.stop(but="bridge.ros.demo")
             before = section
             if line.startswith("macs headset"):
-                await asyncio.wait_for(somebody.sees_a_robot(), 15)
+                await asyncio.wait_for(somebody.sees_a_robot(), PATIENCE_S)
             out = await somebody.run(line)
             if " sub " in line:
                 messages = [json.loads(text) for text in out.splitlines()]

@@ -340,7 +340,7 @@ async def stage(start_gateway: StartGateway, connect: Connect) -> Any:
     served = Metadata(ROS, robot.id, 0, StreamData.manager, 1, "nd__chatter", "std_msgs/String")
     robot.manage(StreamData.manager, {"destAgents": {"2": [headset.id]}}, encode_message(served.encode(), DONE))
     headset.say(ROS, [robot.id], DONE, nodeType=2, nodeName="nd__cmd", dataExchangeType="std_msgs/String")
-    await until(lambda: all(DONE in [data for _, data in each.got] or each.deaf for each in (headset, robot)), 30)
+    await until(lambda: all(DONE in [data for _, data in each.got] or each.deaf for each in (headset, robot)))
     assert (headset.deaf, robot.deaf) == ("", "")
     for program in (headset, robot):
         await program.close()

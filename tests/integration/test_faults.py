@@ -6,12 +6,15 @@ import asyncio
 import signal
 from contextlib import AsyncExitStack, suppress
 
+import pytest
+
 import macs_zenoh
 from bridge.headset.client import Headset
 from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
 from tests.support.programs import Program, free_port
+from tests.support.waiting import PATIENCE_S
 
 
 def chatter(registrants: list[int], text: bytes) -> bytes:
@@ -53,12 +56,12 @@ async def test_the_router_is_killed_and_comes_back() -> None:
                     Streams(robot).publish("nd__chatter", chatter([first.id, second.id], b"y"))
                     await asyncio.wait([arrived], timeout=0.05)
 
-        await asyncio.wait_for(works(), 10)
+        await asyncio.wait_for(works(), PATIENCE_S)
         router.send_signal(signal.SIGKILL)
         with suppress(AssertionError):
             await router.stop()
         replacement = await stack.enter_async_context(Program("router", "-l", endpoint))
-        await asyncio.wait_for(works(), 10)
+        await asyncio.wait_for(works(), PATIENCE_S)
         assert first.connected
         assert second.connected
         assert replacement.ready
@@ -78,16 +81,17 @@ async def test_programs_start_without_a_router() -> None:
         stack.push_async_callback(gateway.stop)
         joining = macs_zenoh.join("unity", id=9, connect=[endpoint], on_waiting=lambda target: waiting.set())
         agent = asyncio.ensure_future(stack.enter_async_context(joining))
-        await asyncio.wait_for(waiting.wait(), 5)
+        await asyncio.wait_for(waiting.wait(), PATIENCE_S)
         while not any("waiting" in line for line in gateway.log):
             await asyncio.sleep(0.02)
         assert not starting.done()
         await stack.enter_async_context(Program("router", "-l", endpoint))
-        await asyncio.wait_for(starting, 10)
-        await asyncio.wait_for(agent, 10)
+        await asyncio.wait_for(starting, PATIENCE_S)
+        await asyncio.wait_for(agent, PATIENCE_S)
         assert sum("waiting" in line for line in gateway.log) == 1
 
 
+@pytest.mark.alone
 async def test_sigterm_is_a_clean_goodbye() -> None:
     """SIGTERM ends router, gateway and agent with exit code 0 within 2 s, and connected headsets get a FIN."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -101,7 +105,7 @@ async def test_sigterm_is_a_clean_goodbye() -> None:
             begun = loop.time()
             assert await program.stop() == 0
             assert loop.time() - begun < 2
-        assert await asyncio.wait_for(headset.wait_ended(), 2)
+        assert await asyncio.wait_for(headset.wait_ended(), PATIENCE_S)
 
 
 async def test_two_signals_at_once_are_a_goodbye_too() -> None:
@@ -115,6 +119,7 @@ async def test_two_signals_at_once_are_a_goodbye_too() -> None:
             assert await gateway.stop() == 0
 
 
+@pytest.mark.alone
 async def test_a_waiting_gateway_stops_on_sigint() -> None:
     """Ctrl-C ends a gateway that still waits for its router, within 2 s."""
     gateway = Program("gateway", "--port", "0", "-e", f"tcp/127.0.0.1:{free_port()}")

@@ -11,13 +11,13 @@ import zenoh
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
 from tests.support.programs import free_port
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 
 async def test_the_next_router_is_tried_at_the_start(router: str) -> None:
     """A program whose first router does not run joins over its second one."""
     away = f"tcp/127.0.0.1:{free_port()}"
-    async with await asyncio.wait_for(Mesh.open(MeshSettings(connect=[away, router])), 10) as mesh:
+    async with await asyncio.wait_for(Mesh.open(MeshSettings(connect=[away, router])), PATIENCE_S) as mesh:
         await until(lambda: mesh.linked)
 
 
@@ -58,6 +58,9 @@ async def test_waiting_goes_on_until_any_router_is_there() -> None:
         waiting.set()
 
     opening = asyncio.create_task(Mesh.open(MeshSettings(connect=[first, second]), on_waiting=on_waiting))
-    await asyncio.wait_for(waiting.wait(), 10)
-    async with await Mesh.open(MeshSettings(mode="router", listen=[second])), await asyncio.wait_for(opening, 10):
+    await asyncio.wait_for(waiting.wait(), PATIENCE_S)
+    async with (
+        await Mesh.open(MeshSettings(mode="router", listen=[second])),
+        await asyncio.wait_for(opening, PATIENCE_S),
+    ):
         assert waits == [f"{first}, {second}"]

@@ -28,7 +28,7 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.wire import encode_frame, encode_message, split_message
 from macs_zenoh.streams import Streams
 from tests.support.given import Connect, StartGateway
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 METADATA = Metadata(message_manager="Greeting").encode()
 
@@ -50,7 +50,7 @@ class Socket:
     async def raw_message(self) -> tuple[bytes, bytes]:
         """The same with its metadata as it came."""
         while not self._messages:
-            data = await asyncio.wait_for(self.reader.read(65536), 5)
+            data = await asyncio.wait_for(self.reader.read(65536), PATIENCE_S)
             if not data:
                 raise ConnectionError
             self._messages += self._decoder.feed(data)
@@ -236,7 +236,7 @@ async def test_an_existing_robot_program_is_reached(start_gateway: StartGateway,
         management = encode_management(StreamData({"2": [headset.id]}))
         frame = encode_frame(1, management=management, message=encode_message(data.encode(), b"topic data"))
         robot.writer.write(frame)
-        message = await asyncio.wait_for(subscription.__anext__(), 5)
+        message = await asyncio.wait_for(subscription.__anext__(), PATIENCE_S)
         assert bytes(message.data) == b"topic data"
 
 
@@ -257,7 +257,7 @@ async def test_registrations_reach_robots_that_come_later(
 
         async with macs_zenoh.join("ros", id=9, group=5, connect=[router]) as robot:
             robot.serve("add_node", add)
-            topics = {(await asyncio.wait_for(wanted.get(), 5)).tos_name for _ in range(2)}
+            topics = {(await asyncio.wait_for(wanted.get(), PATIENCE_S)).tos_name for _ in range(2)}
             assert topics == {"/pose", "/scan"}
 
 
@@ -294,7 +294,7 @@ async def test_encoding_of_the_first_message(start_gateway: StartGateway) -> Non
     """The welcome carries the connection's number as request id, and the id in its data, as agents expect."""
     gateway = await start_gateway()
     reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port)
-    messages = MessageDecoder().feed(await asyncio.wait_for(reader.read(4096), 5))
+    messages = MessageDecoder().feed(await asyncio.wait_for(reader.read(4096), PATIENCE_S))
     metadata, body = split_message(messages[0])
     assert json.loads(metadata) == {
         "senderAgentType": None,

@@ -36,6 +36,7 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
 from macs_zenoh.typed import Types, request_of, response_of
+from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 SET_BOOL = "std_srvs/SetBool"
@@ -93,7 +94,7 @@ class EchoRobot:
                 await self._changed.wait()
             return ids
 
-        return await asyncio.wait_for(wait(), 10)
+        return await asyncio.wait_for(wait(), PATIENCE_S)
 
     async def _add(self, call: macs_zenoh.Call) -> bytes:
         node = decode_data(AddNode, call.data)
@@ -241,7 +242,7 @@ async def test_a_service_is_served(start: Start, robot: EchoRobot) -> None:
     request = TYPES.serialize(request_of(SET_BOOL), {"data": True})
     metadata = Metadata(request_id=5, node_type=NodeType.SERVICE, node_name="nd__ask", data_exchange_type=SET_BOOL)
     robot.agent.send(request, to="unity", ids=[headset_id], metadata=metadata)
-    response = await asyncio.wait_for(robot.answers.get(), 10)
+    response = await asyncio.wait_for(robot.answers.get(), PATIENCE_S)
     assert TYPES.deserialize(response_of(SET_BOOL), response) == {"success": True, "message": "done"}
     code, lines, log = await process.end()
     assert (code, lines) == (0, [{"service": "/ask", "from": 1, "request": {"data": True}}]), log
@@ -318,7 +319,7 @@ async def test_a_stopped_subscription_ends_well(start: Start, robot: EchoRobot, 
     code, lines, log = await process.end()
     assert (code, lines) == (0, []), log
     assert "Traceback" not in log
-    await asyncio.wait_for(gone.wait(), 5)
+    await asyncio.wait_for(gone.wait(), PATIENCE_S)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)

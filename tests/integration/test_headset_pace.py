@@ -121,5 +121,5 @@ async def test_a_flood_is_held_to_its_share_and_a_stop_is_not(
         for number in range(10):
             await commands.publish(b"%d" % number)
         await until(lambda: taken(robot, STOP) == [1] and len(taken(robot, ("nd__arm", ""))) == 10)
-        await until(lambda: drops(gateway, headset).get("flooded", 0) > 10_000, 20)
+        await until(lambda: drops(gateway, headset).get("flooded", 0) > 10_000)
         assert len(taken(robot)) < 5000

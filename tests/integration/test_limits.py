@@ -29,7 +29,7 @@ from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
 from tests.support.given import Connect, StartGateway
 from tests.support.programs import Program, free_port
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 CONFIGURATION = encode_frame(
     management=b'{"agentType":2,"agentId":2,"groupId":0,"requestId":1,"messageManager":"AgentclientConfigurer"}'
@@ -67,7 +67,7 @@ async def test_declared_sizes_cost_nothing() -> None:
             declared = 0xFFFFFFFF if number % 2 else (32 << 20) - 39
             writer.write(struct.pack("<B30xII", 2, 0, declared) + bytes(10))
         for reader, _ in connections[1::2]:
-            assert await asyncio.wait_for(reader.read(), 5)  # the greeting, then FIN
+            assert await asyncio.wait_for(reader.read(), PATIENCE_S)  # the greeting, then FIN
         await answers(neighbour)
         assert memory_bytes(gateway.pid) - before < 48 << 20
         for _, writer in connections:
@@ -143,7 +143,7 @@ async def test_silent_connections_are_closed(start_gateway: StartGateway) -> Non
     gateway = await start_gateway(handshake_timeout_s=1.0)
     connections = [await asyncio.open_connection("127.0.0.1", gateway.port) for _ in range(500)]
     for reader, writer in connections:
-        assert await asyncio.wait_for(reader.read(), 10)  # the greeting, then FIN
+        assert await asyncio.wait_for(reader.read(), PATIENCE_S)  # the greeting, then FIN
         writer.close()
     await until(lambda: len(gateway.agents) == 0)
 
@@ -346,11 +346,11 @@ async def test_frames_that_do_not_end_have_a_limit_together() -> None:
                 await writer.drain()
             halves.append(reader)
         await good.send(bytes(4 << 20), to=2, ids=[neighbour.id])
-        while len((await asyncio.wait_for(neighbour.__anext__(), 10)).data) < 4 << 20:
+        while len((await asyncio.wait_for(neighbour.__anext__(), PATIENCE_S)).data) < 4 << 20:
             pass
         await answers(neighbour)
         assert memory_bytes(gateway.pid) - before < (256 + 96) << 20
-        ended = asyncio.wait_for(halves[0].read(), 10)
+        ended = asyncio.wait_for(halves[0].read(), PATIENCE_S)
         with suppress(ConnectionError):
             await ended
         assert any("its frame does not end" in line for line in gateway.log)

@@ -50,7 +50,7 @@ from macs_zenoh.streams import Streams
 from tests.support.links import Link, counted
 from tests.support.programs import Program, macs
 from tests.support.routers import Router
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 RIGHT_S = 3.0
 """How soon after the merge everything must be right."""
@@ -227,7 +227,7 @@ class RobotProgram:
     async def next(self) -> Incoming:
         """The next message that comes."""
         while not self._messages:
-            received = await asyncio.wait_for(self._reader.read(65536), 5)
+            received = await asyncio.wait_for(self._reader.read(65536), PATIENCE_S)
             assert received, "the gateway closed the connection"
             for raw in self._decoder.feed(received):
                 metadata, data = split_message(raw)
@@ -278,7 +278,7 @@ async def heard(robot: Robot, stream: Subscription, text: bytes) -> None:
     robot.chatter(b"last")
     rest: list[bytes] = []
     while not rest or rest[-1] != b"last":
-        rest.append((await asyncio.wait_for(stream.__anext__(), 5)).data)
+        rest.append((await asyncio.wait_for(stream.__anext__(), PATIENCE_S)).data)
     assert rest == [*(b"%s %d" % (text, n) for n in range(first + 1, number + 1)), b"last"]
 
 
@@ -321,7 +321,7 @@ async def test_both_sites_have_leased_the_same_block(sites: Sites, later_keeps: 
     }
     for site in "ab":
         for stream in streams[site]:
-            await asyncio.wait_for(heard(robots[site], stream, b"parted"), 10)
+            await asyncio.wait_for(heard(robots[site], stream, b"parted"), PATIENCE_S)
         await headsets[site][0].send(b"inside", to=UNITY, ids=[2])
         assert (await headsets[site][1].receive(5)).data == b"inside"
 
@@ -336,11 +336,11 @@ async def test_both_sites_have_leased_the_same_block(sites: Sites, later_keeps: 
     for site in "ab":
         robot, (first, second) = robots[site], headsets[site]
         for stream in streams[site]:
-            await asyncio.wait_for(heard(robot, stream, b"together"), 10)
+            await asyncio.wait_for(heard(robot, stream, b"together"), PATIENCE_S)
         assert robot.registrants == {(NodeType.SUBSCRIBER, "nd__chatter"): {first.id, second.id}}
         await first.send(b"by id", to=UNITY, ids=[second.id])
         assert (await next_with(second, b"by id")).sender_id == first.id
-        assert await first.call("/set", "std_srvs/SetBool", robot.agent.id, b"1", timeout_s=5) == b"done: 1"
+        assert await first.call("/set", "std_srvs/SetBool", robot.agent.id, b"1", timeout_s=PATIENCE_S) == b"done: 1"
     await headsets[moves][0].send(b"group", to=UNITY, groups=[3])
     for headset in (headsets[moves][1], *headsets[keeps]):
         assert (await next_with(headset, b"group")).sender_id == headsets[moves][0].id
@@ -379,7 +379,7 @@ async def test_who_leaves_before_it_has_its_other_id_is_forgotten(sites: Sites) 
     )
     robot.added = asyncio.Event()
     await sites.meet()
-    await asyncio.wait_for(robot.added.wait(), 10)
+    await asyncio.wait_for(robot.added.wait(), PATIENCE_S)
     registrants = robot.registrants[NodeType.SUBSCRIBER, "nd__chatter"]
     assert registrants == {1, 256}
     robot.added = None
@@ -394,18 +394,18 @@ async def test_the_winner_keeps_what_it_registered_at_the_other_site(sites: Site
     robot = await sites.robot("b", 1002)
     winner = await sites.headset(here)
     stream = await winner.subscribe("/chatter", "std_msgs/String", agents=[1002])
-    await asyncio.wait_for(heard(robot, stream, b"before"), 10)
+    await asyncio.wait_for(heard(robot, stream, b"before"), PATIENCE_S)
     await sites.part()
     await there.close()
     there = await sites.gateway("b", "bc")
     loser = await sites.headset(there)
     assert (winner.id, loser.id) == (1, 1)
     streams = [stream, await loser.subscribe("/chatter", "std_msgs/String", agents=[1002])]
-    await asyncio.wait_for(heard(robot, streams[1], b"parted"), 10)
+    await asyncio.wait_for(heard(robot, streams[1], b"parted"), PATIENCE_S)
     await sites.right(await sites.meet(), [(1, 1002), (2, 1), (2, 256)], [here, there])
     await until(lambda: robot.registrants == {(NodeType.SUBSCRIBER, "nd__chatter"): {1, 256}})
     for each in streams:
-        await asyncio.wait_for(heard(robot, each, b"together"), 10)
+        await asyncio.wait_for(heard(robot, each, b"together"), PATIENCE_S)
 
 
 async def test_two_agents_have_leased_the_same_id(sites: Sites, caplog: pytest.LogCaptureFixture) -> None:
@@ -434,9 +434,9 @@ async def test_two_agents_have_leased_the_same_id(sites: Sites, caplog: pytest.L
     assert errors(caplog) == ["handling the new id of ros/2 failed"]
     assert await other.call("ros", 2, "name") == b"2"
     other.send(b"to two", to="ros", ids=[2])
-    assert (await asyncio.wait_for(two.receive(), 5)).data == b"to two"
+    assert (await asyncio.wait_for(two.receive(), PATIENCE_S)).data == b"to two"
     two.send(b"from two", to="unity", ids=[700])
-    assert (await asyncio.wait_for(other.receive(), 5)).sender_id == 2
+    assert (await asyncio.wait_for(other.receive(), PATIENCE_S)).sender_id == 2
     streamed: list[str] = []
     watching = other.mesh.subscribe("macs/from/**", lambda batch: streamed.extend(key for key, _ in batch))
     while not streamed:
@@ -466,9 +466,9 @@ async def test_an_agent_uses_robots_under_its_new_id(sites: Sites) -> None:
     await asyncio.wait_for(heard(b"parted"), 20)
     assert await two.call_service("/set", b"x", robot=1002, type="std_srvs/SetBool") == b"done: x"
     await sites.meet()
-    await until(lambda: two.id != one.id, 20)
+    await until(lambda: two.id != one.id)
     topic, service = (NodeType.SUBSCRIBER, "nd__chatter"), (NodeType.CLIENT, "nd__set")
-    await until(lambda: robot.registrants == {topic: {two.id}, service: {two.id}}, 20)
+    await until(lambda: robot.registrants == {topic: {two.id}, service: {two.id}})
     await asyncio.wait_for(heard(b"together"), 20)
     assert await two.call_service("/set", b"y", robot=1002) == b"done: y"
 
@@ -552,7 +552,7 @@ async def test_the_same_configured_ids(sites: Sites, caplog: pytest.LogCaptureFi
     assert [gateway.blocks for gateway in gateways] == [[3], [3]]
     await headsets[0].send(b"across", to=UNITY, ids=[769])
     await next_with(headsets[1], b"across")
-    await until(lambda: len(errors(caplog)) == 4, timeout_s=10)
+    await until(lambda: len(errors(caplog)) == 4)
     assert [message.split(":")[0] for message in errors(caplog)] == [
         "block 3 is also leased by session a2",
         "block 3 is also leased by session b2",
@@ -621,7 +621,7 @@ async def test_a_hundred_headsets_change_their_ids_at_once(sites: Sites) -> None
     for headset in moving:
         await headset.subscribe("/chatter", "std_msgs/String", agents=[1002])
     node = (NodeType.SUBSCRIBER, "nd__chatter")
-    await until(lambda: robot.registrants.get(node) == set(range(1, 101)), 20)
+    await until(lambda: robot.registrants.get(node) == set(range(1, 101)))
     # with 200 each it took 1.1 to 1.9 s on two busy cores
     await sites.right(await sites.meet(), [(1, 1002), *((UNITY, n) for n in [*range(1, 101), *range(256, 356)])])
     await until(lambda: {headset.id for headset in moving} == set(range(256, 356)))

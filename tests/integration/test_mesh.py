@@ -15,7 +15,7 @@ from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.mesh.outgoing import Outgoing
 from macs_zenoh.protocol.keyexpr import PING
 from tests.support.routers import Router
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 KEY = "macs/to/unity/0/1/unity/2"
 LARGE = Mesh.LARGE_BYTES + 1
@@ -129,6 +129,6 @@ async def test_a_zenoh_id_is_its_owners_secret(router: str) -> None:
                 keys = await watcher.tokens("macs/**")
             assert not [key for key in keys if own in key]
             assert all(agent.mesh.zid in key for key in keys)
-            assert await watcher.query(PING.of(zid=agent.mesh.zid), b"", timeout_s=5)
+            assert await watcher.query(PING.of(zid=agent.mesh.zid), b"", timeout_s=PATIENCE_S)
         await gateway.close()
         assert chosen.zid == "abc"

@@ -248,6 +248,6 @@ async def test_what_the_loop_puts_waits_for_itself(router: str) -> None:
         for number in range(count):
             mesh.put(KEY, b"%d" % number)
             mesh.make_room()
-        await until(lambda: len(echoed) == count, 30)
+        await until(lambda: len(echoed) == count)
         assert got == echoed == list(range(count))
         assert not mesh.drops["loop_behind"]

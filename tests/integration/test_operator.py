@@ -18,7 +18,7 @@ from macs_zenoh.errors import Refused
 from tests.integration.test_gateway import socket
 from tests.support.given import Connect, StartGateway
 from tests.support.programs import ROOT, ended, macs
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 MANY = 12
 
@@ -161,9 +161,9 @@ async def test_an_interrupted_stop_is_no_success(router: str, start_robot: Start
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
     )
-    await until(lambda: robot.calls, 20)
+    await until(lambda: robot.calls)
     process.send_signal(signal.SIGINT)
-    _, errors = await asyncio.wait_for(process.communicate(), 10)
+    _, errors = await asyncio.wait_for(process.communicate(), PATIENCE_S)
     assert process.returncode == 130
     assert "Task was destroyed" not in errors.decode()
 

@@ -14,7 +14,7 @@ from macs_zenoh.protocol.messages import Metadata, NodeType
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.serving import Call
 from tests.support.given import Connect, StartGateway
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 STOP = Metadata(node_type=NodeType.PUBLISHER, node_name="nd__emergency_stop", data_exchange_type="std_msgs/Bool")
 PRESS, RELEASE = b"\x00\x01\x00\x00\x01", b"\x00\x01\x00\x00\x00"
@@ -56,7 +56,7 @@ async def test_a_press_is_asked_for_as_well(
         call = asked.calls[0]
         assert (call.sender_type, call.sender_id, call.data) == ("unity", headset.id, b"true")
         assert call.metadata.node_name == STOP.node_name
-        message = await asyncio.wait_for(robot.receive(), 10)
+        message = await asyncio.wait_for(robot.receive(), PATIENCE_S)
         assert message.data == PRESS
 
 
@@ -72,9 +72,9 @@ async def test_nothing_else_is_asked_for(router: str, start_gateway: StartGatewa
             await headset.send_frame(frame)
         await headset.send_frame(said(b"", ids=(7,)))
         for expected in (RELEASE, PRESS, b""):
-            assert (await asyncio.wait_for(robot.receive(), 10)).data == expected
+            assert (await asyncio.wait_for(robot.receive(), PATIENCE_S)).data == expected
         await headset.send_frame(said(PRESS, ids=(7,)))
-        assert (await asyncio.wait_for(robot.receive(), 10)).data == PRESS
+        assert (await asyncio.wait_for(robot.receive(), PATIENCE_S)).data == PRESS
         await until(lambda: asked.calls)
         await asyncio.sleep(0.2)
         assert len(asked.calls) == 1

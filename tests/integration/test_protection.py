@@ -34,7 +34,7 @@ from macs_zenoh.protocol.wire import PROBE, encode_frame, encode_message
 from macs_zenoh.streams import Streams
 from tests.integration.test_gateway import Socket, socket
 from tests.support.given import Connect, StartGateway
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 TEXT = CDR + b"\x05\x00\x00\x00text\x00"
 
@@ -58,7 +58,7 @@ async def test_topic_data_for_a_node_of_another_type(start_gateway: StartGateway
         await publisher.advertise("/chatter", "std_msgs/String", agents=[robot.id])
         await robot.message()
         robot.writer.write(topic_data(robot, [publisher.id, subscriber.id], b"text"))
-        assert bytes((await asyncio.wait_for(subscription.__anext__(), 5)).data) == b"text"
+        assert bytes((await asyncio.wait_for(subscription.__anext__(), PATIENCE_S)).data) == b"text"
         connection = gateway.agents.find(2, publisher.id)
         assert connection.all_drops()["wrong_node_type"] == 1
 
@@ -179,12 +179,12 @@ async def test_topic_data_only_for_whom_registered_it(
         Streams(seven).publish("nd__chatter", data(8, "nd__chatter", b"forged"))
         Streams(seven).publish("nd__other", data(7, "nd__chatter", b"under another node's key"))
         Streams(seven).publish("nd__other", data(7, "nd__other", b"seven's"))
-        heard = await asyncio.wait_for(other.__anext__(), 5)
+        heard = await asyncio.wait_for(other.__anext__(), PATIENCE_S)
         assert bytes(heard.data) == b"seven's"
         Streams(eight).publish("nd__chatter", data(8, "nd__chatter", b"eight's"))
-        heard = await asyncio.wait_for(true.__anext__(), 5)
+        heard = await asyncio.wait_for(true.__anext__(), PATIENCE_S)
         assert (bytes(heard.data), heard.metadata.sender_agent_id) == (b"eight's", 8)
-        heard = await asyncio.wait_for(chatter.__anext__(), 5)
+        heard = await asyncio.wait_for(chatter.__anext__(), PATIENCE_S)
         assert (bytes(heard.data), heard.metadata.sender_agent_id) == (b"forged", 7)
         # of_eight on 7's /chatter; both under the other node's key; of_seven on 7's /other and on 8's /chatter
         assert gateway.drops == {"wrong_sender": 1, "not_registered": 5}
@@ -268,7 +268,7 @@ async def test_a_registration_for_somebody_else_is_refused(router: str, start_ga
             deadline = time.monotonic() + 5
             while True:
                 try:
-                    await mesh.query(key, frame, timeout_s=5)
+                    await mesh.query(key, frame, timeout_s=PATIENCE_S)
                     return
                 except NotServed:  # it is online a moment before it serves
                     assert time.monotonic() < deadline
@@ -319,9 +319,9 @@ async def test_an_agent_is_told_the_true_sender(router: str) -> None:
         robot.put(
             unicast_key(ROS, 9, ROS, 7), encode_frame(ROS, (9,), message=encode_message(forged.encode(), b"text"))
         )
-        message = await asyncio.wait_for(agent.receive(), 5)
+        message = await asyncio.wait_for(agent.receive(), PATIENCE_S)
         key, frame = call((ROS, 9), "look", (ROS, 7), b"", forged)
-        await robot.query(key, frame, timeout_s=5)
+        await robot.query(key, frame, timeout_s=PATIENCE_S)
         assert message.metadata == asked[0] == Metadata(ROS, 7, 5, "Greeting")
 
 
@@ -338,7 +338,7 @@ async def test_a_silent_agent_is_away_and_stays(
         away = [(UNITY, taken_off.id)]
 
         async def told() -> list[tuple[int, int]]:
-            return ping.decode(await mesh.query(PING.of(zid=gateway.mesh.zid), b"", timeout_s=5))[0].away
+            return ping.decode(await mesh.query(PING.of(zid=gateway.mesh.zid), b"", timeout_s=PATIENCE_S))[0].away
 
         await until(lambda: gateway.agents.find(UNITY, taken_off.id))
         deadline = time.monotonic() + 5

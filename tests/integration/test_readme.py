@@ -13,6 +13,7 @@ import pytest
 
 import macs_zenoh
 from tests.support.programs import ROOT, Program, free_port
+from tests.support.waiting import PATIENCE_S
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 LOCAL_ROUTER = "tcp/127.0.0.1:7447"
@@ -54,8 +55,8 @@ async def test_the_example_runs(tmp_path: Path) -> None:
         assert await headset.call("ros", 7, "battery") == b"87 %"
         for text, ids, groups in (("by id", [7], []), ("by group", [], [3])):
             headset.send(text.encode(), to="ros", ids=ids, groups=groups)
-            assert (await asyncio.wait_for(headset.receive(), 5)).data == b"got it"
-            assert (await asyncio.wait_for(process.stdout.readline(), 5)).decode() == f"unity 300 b'{text}'\n"
+            assert (await asyncio.wait_for(headset.receive(), PATIENCE_S)).data == b"got it"
+            assert (await asyncio.wait_for(process.stdout.readline(), PATIENCE_S)).decode() == f"unity 300 b'{text}'\n"
 
         assert await interrupted(process) == ""
         assert [agent.id for agent in headset.online()] == [300] or await left(headset)
@@ -94,8 +95,8 @@ async def interrupted(process: asyncio.subprocess.Process) -> str:
     """What a program says on stderr when Ctrl-C ends it."""
     process.send_signal(signal.SIGINT)
     assert process.stderr is not None
-    errors = await asyncio.wait_for(process.stderr.read(), 10)
-    assert await asyncio.wait_for(process.wait(), 10) == 0
+    errors = await asyncio.wait_for(process.stderr.read(), PATIENCE_S)
+    assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
     return errors.decode()
 
 
@@ -103,4 +104,4 @@ async def left(headset: macs_zenoh.Agent) -> bool:
     """Wait until robot 7 has left."""
     gone = asyncio.Event()
     headset.on_presence(lambda agent, online: gone.set() if agent.id == 7 and not online else None)
-    return await asyncio.wait_for(gone.wait(), 5)
+    return await asyncio.wait_for(gone.wait(), PATIENCE_S)

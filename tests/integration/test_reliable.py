@@ -35,7 +35,7 @@ from macs_zenoh.serving import Call
 from macs_zenoh.streams import Streams
 from tests.support.programs import free_port
 from tests.support.routers import Router
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
 
@@ -149,8 +149,8 @@ async def test_nothing_is_lost_while_both_routers_are_away(routers: Routers) -> 
             await until(lambda: kept.heard and plain.heard)
             await routers.outage(5.0)
             back = stream.sent
-            await until(lambda: kept.heard[-1] >= back and plain.heard[-1] >= back, 20)
-        await until(lambda: kept.heard[-1] == stream.sent - 1, 10)
+            await until(lambda: kept.heard[-1] >= back and plain.heard[-1] >= back)
+        await until(lambda: kept.heard[-1] == stream.sent - 1)
         assert kept.heard == list(range(kept.heard[0], stream.sent))
         assert kept.missed == []
         lost = plain.heard[-1] - plain.heard[0] + 1 - len(plain.heard)
@@ -169,7 +169,7 @@ async def test_what_the_source_has_no_more_is_counted(routers: Routers, caplog: 
         for _ in range(2):
             told = len(kept.missed)
             await routers.outage(1.5)
-            await until(lambda: len(kept.missed) > told, 20)  # noqa: B023 - awaited at once
+            await until(lambda: len(kept.missed) > told)  # noqa: B023 - awaited at once
         lost = kept.heard[-1] - kept.heard[0] + 1 - len(kept.heard)
         assert kept.heard == sorted(set(kept.heard))
         assert {key for key, _ in kept.missed} == {KEPT}
@@ -187,10 +187,10 @@ async def test_an_outage_during_recovery_costs_nothing(routers: Routers) -> None
         for _ in range(2):
             await routers.outage(1.5)
             heard = len(kept.heard)
-            await until(lambda: len(kept.heard) > heard, 20)  # noqa: B023 - awaited at once
+            await until(lambda: len(kept.heard) > heard)  # noqa: B023 - awaited at once
             await routers.outage(0.3)
         back = stream.sent
-        await until(lambda: kept.heard[-1] >= back, 20)
+        await until(lambda: kept.heard[-1] >= back)
         assert kept.heard == list(range(kept.heard[0], kept.heard[-1] + 1))
         assert kept.missed == []
 
@@ -218,7 +218,7 @@ async def test_replies_that_there_was_no_room_for_are_asked_for_again(
         dropped[0] = 0
         await routers.outage(0.5)
         back = stream.sent
-        await until(lambda: kept.heard[-1] >= back, 20)
+        await until(lambda: kept.heard[-1] >= back)
         assert dropped == [3]
         assert kept.heard == list(range(kept.heard[0], kept.heard[-1] + 1))
         assert kept.missed == []
@@ -233,7 +233,7 @@ async def test_the_last_message_before_silence_is_recovered(routers: Routers) ->
         for number in range(3):  # the first messages that this source puts at all
             source.put(KEPT, number.to_bytes(8, "big"), Traffic.STREAM)
         await routers.start()
-        await until(lambda: kept.heard == [0, 1, 2], 20)
+        await until(lambda: kept.heard == [0, 1, 2])
 
 
 async def test_who_subscribes_late_gets_what_comes_next(routers: Routers) -> None:
@@ -263,7 +263,7 @@ async def test_other_keys_are_not_kept(routers: Routers) -> None:
         source.put(command, b"old", Traffic.COMMAND)
         source.put(KEPT, b"kept", Traffic.STREAM)
         await routers.start()
-        await until(lambda: kept.heard, 20)
+        await until(lambda: kept.heard)
         assert commands.heard == []
 
 
@@ -326,7 +326,7 @@ async def test_a_headset_gets_every_message(routers: Routers) -> None:
             await until(lambda: heard)
             await routers.outage(5.0)
             outage_ends = heard[-1] + 5 * HZ
-            await until(lambda: heard[-1] > outage_ends, 20)
+            await until(lambda: heard[-1] > outage_ends)
             assert heard == list(range(heard[0], heard[-1] + 1))
             assert headset.connected
         finally:
@@ -353,7 +353,7 @@ async def test_a_reliable_type_reaches_everybody_afterwards(routers: Routers) ->
                 lambda message: heard.append((message.type, message.data)),
                 last_value=message_type == "planning",
             )
-            await a.wait_for("b", message_type, timeout_s=5)
+            await a.wait_for("b", message_type, timeout_s=PATIENCE_S)
         assert a.send("", "planning", b"0") is Outcome.SENT
         await until(lambda: heard == [("planning", b"0")])
         await routers.kill()
@@ -363,10 +363,10 @@ async def test_a_reliable_type_reaches_everybody_afterwards(routers: Routers) ->
         assert a.send("b", "planning", b"lost") is Outcome.NO_ROUTER
         await asyncio.sleep(1.0)
         await routers.start()
-        await until(lambda: len(heard) >= 5, 20)
-        await a.wait_for("b", "planning", timeout_s=10)
+        await until(lambda: len(heard) >= 5)
+        await a.wait_for("b", "planning", timeout_s=PATIENCE_S)
         a.send("", "planning", b"5")
-        await until(lambda: heard[-1] == ("planning", b"5"), 10)
+        await until(lambda: heard[-1] == ("planning", b"5"))
         assert heard == [("planning", str(n).encode()) for n in range(6)]
 
 
@@ -430,7 +430,7 @@ async def test_the_access_rules_let_missed_messages_be_asked_for(allowed: bool, 
             await asyncio.sleep(1.0)
             await router.start()
             back = stream.sent
-            await until(lambda: kept.heard[-1] >= back, 20)
+            await until(lambda: kept.heard[-1] >= back)
             missing = kept.heard[-1] - kept.heard[0] + 1 - len(kept.heard)
             assert (missing == 0) == allowed
             assert receiver.drops["missed"] == missing

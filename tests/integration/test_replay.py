@@ -43,7 +43,7 @@ from tests.replay import (
     split,
 )
 from tests.support.given import StartGateway
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 MARKER = "ReplayMarker"
 """Manager of a message that shows a headset that all before it was dealt with."""
@@ -216,7 +216,7 @@ class Stage:
             self.players[step.name].leave()
         elif isinstance(step, Ended):
             player = self.players[step.name]
-            await asyncio.wait_for(player.ended.wait(), 5)
+            await asyncio.wait_for(player.ended.wait(), PATIENCE_S)
         elif isinstance(step, Hush):
             self._hushed.add(step.name)
 

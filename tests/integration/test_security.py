@@ -36,7 +36,7 @@ from macs_zenoh.streams import Streams
 from tests.integration.test_reliable import Numbers, Stream
 from tests.support.programs import ROOT, Program, ended, free_port, macs
 from tests.support.routers import Router
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 NOW = dt.datetime.now(dt.timezone.utc)
 
@@ -259,7 +259,7 @@ async def until_answered(mesh: Mesh, key: str) -> None:
         while not await answered(mesh, key):
             await asyncio.sleep(0.02)
 
-    await asyncio.wait_for(ask(), 10)
+    await asyncio.wait_for(ask(), PATIENCE_S)
 
 
 TOKENS = [
@@ -364,10 +364,10 @@ async def test_a_stolen_gateway_certificate_is_no_robot(site: Site) -> None:
             thief.mesh.put_unasked("macs/to/unity/2/513/ros/7", b"forged")
             other.mesh.put_unasked("macs/to/unity/2/513/unity/514", b"forged")
             real.send(b"command", to="ros", ids=[7])
-            assert (await asyncio.wait_for(robot.receive(), 5)).data == b"command"
+            assert (await asyncio.wait_for(robot.receive(), PATIENCE_S)).data == b"command"
             Streams(robot).publish("nd__x", b"true")
             robot.send(b"true", to="unity", ids=[513])
-            assert (await asyncio.wait_for(headset.receive(), 5)).data == b"true"
+            assert (await asyncio.wait_for(headset.receive(), PATIENCE_S)).data == b"true"
             await until(lambda: stream)
             assert stream == [("macs/from/ros/7/nd__x", b"true")]
             assert not inbox
@@ -463,9 +463,9 @@ async def test_a_link_ends_with_its_certificate(site: Site) -> None:
     soon = dt.datetime.now(dt.timezone.utc) - dt.timedelta(days=1) + ends_in
     authority.issue(site.directory / "robot-7", None, short, soon, renew=True)
     async with site.session("robot-7") as mesh:
-        await until(lambda: not mesh.linked, 20)
+        await until(lambda: not mesh.linked)
         authority.issue(site.directory / "robot-7", None, site.policy, NOW, renew=True)
-        await until(lambda: mesh.linked, 10)
+        await until(lambda: mesh.linked)
 
 
 async def test_who_left_the_plan_may_nothing(tmp_path: Path) -> None:
@@ -492,9 +492,12 @@ async def test_who_left_the_plan_may_nothing(tmp_path: Path) -> None:
             assert await thief.tokens("macs/live/**") == ["macs/live/ros/7/3/a1"]  # its own session knows that
             headset.send(b"command", to="ros", ids=[7])
             headset.broadcast(b"to all")
-            assert [(await asyncio.wait_for(robot.receive(), 5)).data for _ in range(2)] == [b"command", b"to all"]
+            assert [(await asyncio.wait_for(robot.receive(), PATIENCE_S)).data for _ in range(2)] == [
+                b"command",
+                b"to all",
+            ]
             robot.send(b"back", to="unity", ids=[256])
-            assert (await asyncio.wait_for(headset.receive(), 5)).data == b"back"
+            assert (await asyncio.wait_for(headset.receive(), PATIENCE_S)).data == b"back"
             assert heard == [[], []]
             assert "macs/live/ros/7/3/a1" not in await anna.tokens("macs/live/**")
         token.close()
@@ -646,7 +649,7 @@ async def test_a_check_does_not_disturb_who_is_there(site: Site) -> None:
         headset.send(b"after", to="ros", ids=[7])
         robot.send(b"after", to="unity", ids=[511])
         for agent in (robot, headset):
-            assert (await asyncio.wait_for(agent.receive(), 5)).data == b"after"
+            assert (await asyncio.wait_for(agent.receive(), PATIENCE_S)).data == b"after"
             assert not agent.drops
         assert len(changes) == known
         assert not called
@@ -733,8 +736,11 @@ async def test_our_programs_work_with_the_generated_files(site: Site) -> None:
             await asyncio.sleep(0.02)
         await headset.send(b"command", to=1, ids=[7])
         await headset.send(b"to the group", to=1, groups=[3])
-        assert [(await asyncio.wait_for(robot.receive(), 5)).data for _ in range(2)] == [b"command", b"to the group"]
-        assert (await asyncio.wait_for(other.receive(), 5)).data == b"to the group"
+        assert [(await asyncio.wait_for(robot.receive(), PATIENCE_S)).data for _ in range(2)] == [
+            b"command",
+            b"to the group",
+        ]
+        assert (await asyncio.wait_for(other.receive(), PATIENCE_S)).data == b"to the group"
 
         topic = await headset.subscribe("/pose", "std_msgs/String", agents=[7])
         metadata = Metadata(1, 7, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__pose", "std_msgs/String")
@@ -749,9 +755,9 @@ async def test_our_programs_work_with_the_generated_files(site: Site) -> None:
 
         received: asyncio.Queue[awareness.Received] = asyncio.Queue()
         second.register("planning", received.put_nowait)
-        await drone.wait_for("drone8", "planning", timeout_s=5)
+        await drone.wait_for("drone8", "planning", timeout_s=PATIENCE_S)
         assert await drone.deliver("drone8", "planning", b"by name", deadline_s=5) is Outcome.DELIVERED
-        assert (await asyncio.wait_for(received.get(), 5)).data == b"by name"
+        assert (await asyncio.wait_for(received.get(), PATIENCE_S)).data == b"by name"
 
 
 async def test_what_was_missed_is_asked_for(tmp_path: Path) -> None:
@@ -778,7 +784,7 @@ async def test_what_was_missed_is_asked_for(tmp_path: Path) -> None:
         await router.start()
         back = stream.sent
         for got in (topic, messages):
-            await until(lambda got=got: got.heard[-1] >= back, 20)  # type: ignore[misc]
+            await until(lambda got=got: got.heard[-1] >= back)  # type: ignore[misc]
             assert got.heard == list(range(got.heard[0], got.heard[-1] + 1))
             assert not got.missed
 

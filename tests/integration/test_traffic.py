@@ -33,7 +33,7 @@ from tests.support.given import Connect, StartGateway
 from tests.support.links import counted
 from tests.support.programs import Program
 from tests.support.routers import Router
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 CAMERA = STREAM.of(type="ros", id=7, node="nd__camera_front")
 OTHER_CAMERA = STREAM.of(type="ros", id=7, node="nd__camera_back")
@@ -188,7 +188,7 @@ async def test_a_call_that_is_too_large_is_refused(router: str) -> None:
         robot.serve("ask", answer)
         await until(lambda: (1, 7) in headset.directory)
         for _ in range(10):
-            assert await headset.call("ros", 7, "ask", timeout_s=5) == b"yes"
+            assert await headset.call("ros", 7, "ask", timeout_s=PATIENCE_S) == b"yes"
         with pytest.raises(OutOfRange, match=r"macs/call/ros/7/ask/unity/300 is 1\d\d\d, allowed is 0\.\.1000"):
             await headset.call("ros", 7, "ask", bytes(1000), timeout_s=5)
         assert headset.mesh.drops == {"over_size": 1}
@@ -232,7 +232,7 @@ async def test_frames_of_a_headset_count_one_by_one(
                 got.append(int.from_bytes(message.data, "big"))
             return got
 
-        arrived, all_arrived = await asyncio.wait_for(asyncio.gather(numbers(limited), numbers(free)), 10)
+        arrived, all_arrived = await asyncio.wait_for(asyncio.gather(numbers(limited), numbers(free)), PATIENCE_S)
         assert arrived == sorted(set(arrived))
         assert 1 + 50 * BURST_S <= len(arrived) <= 1 + 50 * (time.monotonic() - begin + BURST_S)
         assert gateway.mesh.drops == {"over_rate": 500 - len(arrived)}
@@ -293,7 +293,7 @@ async def test_messages_by_name_are_limited(router: str) -> None:
     ):
         arrived: list[bytes] = []
         b.register("t", lambda message: arrived.append(message.data))
-        await a.wait_for("b", "t", timeout_s=5)
+        await a.wait_for("b", "t", timeout_s=PATIENCE_S)
         for number in range(100):
             a.send("b", "t", b"%d" % number)
         assert await a.deliver("b", "t", b"end", deadline_s=5) is Outcome.DELIVERED
@@ -314,7 +314,7 @@ async def test_the_last_words_of_a_gateway_tell_what_its_rules_dropped(router: s
             for _ in range(20):
                 await headset.send(b"x", to=1, ids=[7])
             await headset.send(b"end")
-            while (await asyncio.wait_for(robot.receive(), 5)).data != b"end":
+            while (await asyncio.wait_for(robot.receive(), PATIENCE_S)).data != b"end":
                 pass
         key = UNICAST.of(type=1, block=0, id=7, from_type=2, from_id=headset.id)
         await gateway.stop()

@@ -10,6 +10,7 @@ from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
 from tests.support.given import Connect, StartGateway
 from tests.support.links import counted
+from tests.support.waiting import PATIENCE_S
 
 IMAGE_BYTES = 100_000
 
@@ -46,7 +47,7 @@ async def test_one_copy_for_any_number_of_headsets(router: str, start_gateway: S
             for _ in range(10):
                 Streams(robot).publish("nd__image", image(count))
                 for stream in images[:count]:
-                    received = await asyncio.wait_for(stream.__anext__(), 5)
+                    received = await asyncio.wait_for(stream.__anext__(), PATIENCE_S)
                     assert len(received.data) == IMAGE_BYTES
             cost[count] = (link.up_bytes - before) / 10
         for count, per_message in cost.items():

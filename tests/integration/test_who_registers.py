@@ -120,7 +120,7 @@ async def test_who_vanishes_leaves_no_node(start_gateway: StartGateway) -> None:
                 headset.close()
             await until(lambda: len(near.agents) == 0)
         await asyncio.sleep(0.5)
-        await until(lambda: robot.nodes() == set(), 10)
+        await until(lambda: robot.nodes() == set())
 
 
 async def test_a_robot_that_leaves_a_group_loses_its_nodes(start_gateway: StartGateway) -> None:
@@ -209,14 +209,14 @@ async def test_too_much_is_refused(start_gateway: StartGateway) -> None:
         greedy.messages.clear()
         for number in range(NODES_EACH + 3):
             greedy.register(1, f"/t{number}", [robot.id])
-        await until(lambda: len(greedy.bodies(NodeRefused.manager)) == 3, 30)
+        await until(lambda: len(greedy.bodies(NodeRefused.manager)) == 3)
         assert f"each may have {NODES_EACH} interface nodes" in str(greedy.bodies(NodeRefused.manager)[0])
         neighbour.register(1, "/mine", [robot.id])
-        await until(lambda: (neighbour.id, "nd__mine") in robot.nodes(), 30)
+        await until(lambda: (neighbour.id, "nd__mine") in robot.nodes())
         spec = frames.NodeSpec(NodeType.SUBSCRIBER, "/t0", "std_msgs/String")
         greedy.writer.write(frames.deregistration(greedy.id, spec, [robot.id], []))
         greedy.register(1, "/one_more", [robot.id])
-        await until(lambda: (greedy.id, "nd__one_more") in robot.nodes(), 30)
+        await until(lambda: (greedy.id, "nd__one_more") in robot.nodes())
         connection = gateway.agents.find(UNITY, greedy.id)
         assert connection is not None
         assert connection.node_count == NODES_EACH
@@ -237,7 +237,7 @@ async def test_who_names_robots_without_end_is_refused(start_gateway: StartGatew
         await until(lambda: len(greedy.bodies(NodeRefused.manager)) == 2, 60)
         assert f"each may have {NAMED_EACH} robots and groups" in str(greedy.bodies(NodeRefused.manager)[0])
         neighbour.register(1, "/mine", [robot.id])
-        await until(lambda: (neighbour.id, "nd__mine") in robot.nodes(), 30)
+        await until(lambda: (neighbour.id, "nd__mine") in robot.nodes())
         key, connection = (UNITY, greedy.id), gateway.agents.find(UNITY, greedy.id)
         assert gateway._named.of(connection) == NAMED_EACH
     await until(lambda: gateway.agents.find(*key) is None)

@@ -59,7 +59,7 @@ async def hear(peer: Peer, topic: str = "/cmd_vel", depth: int = 1000) -> Heard:
 
 async def may_command(driver: Agent, robot: int, topic: str = "/cmd_vel", kind: str = "geometry_msgs/Twist") -> None:
     """Register as a publisher of a topic, once the robot is there."""
-    await until(lambda: (1, robot) in driver.directory, 20)
+    await until(lambda: (1, robot) in driver.directory)
     asked = AddNode(driver.type_number, driver.id, NodeType.PUBLISHER, node_name(topic), topic, kind)
     await driver.call("ros", robot, "add_node", encode_data(asked), timeout_s=20)
 

@@ -37,7 +37,7 @@ from macs_zenoh.protocol.messages import encode_data as encode
 from macs_zenoh.protocol.routing import call
 from macs_zenoh.protocol.wire import parse_frame
 from tests.support.ros_peer import Peer, adding, command, removing
-from tests.support.waiting import get, until
+from tests.support.waiting import PATIENCE_S, get, until
 
 ROBOT = 7
 
@@ -236,7 +236,7 @@ async def test_who_registers_and_is_not_there_is_forgotten(
     monkeypatch.setattr("bridge.ros.agent.ABSENT_S", 0.5)
     async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
         key, frame = call((1, ROBOT), "add_node", (2, 9), encode(adding("/chatter", registrant=9)), Metadata(2, 9))
-        await mesh.query(key, frame, timeout_s=5)
+        await mesh.query(key, frame, timeout_s=PATIENCE_S)
         assert len(robot.nodes) == 1, "its presence may come later"
         await until(lambda: len(robot.nodes) == 0)
 
@@ -290,14 +290,14 @@ async def test_the_robot_tells_actions_qos_and_changes(
         await asyncio.sleep(0.02)
     asking = Metadata(request_id=9, message_manager=FunctionalityRequest.manager)
     headset.send(b'{"follow": true}', to="ros", ids=[ROBOT], metadata=asking)
-    answer = await asyncio.wait_for(headset.receive(), 5)
+    answer = await asyncio.wait_for(headset.receive(), PATIENCE_S)
     assert (answer.metadata.request_id, answer.metadata.message_manager, answer.metadata.node_name) == (9, "", "")
     offered = decode_data(Offered, answer.data)
     assert offered.publishers == {"/scan": "std_msgs/msg/String"}
     assert offered.qos == {"/scan": TopicQos("best_effort", "volatile")}
     await peer.subscription(Twist, "/cmd_vel")
     while True:
-        change = await asyncio.wait_for(headset.receive(), 5)
+        change = await asyncio.wait_for(headset.receive(), PATIENCE_S)
         assert change.metadata.message_manager == FunctionalityRequest.manager
         if "/cmd_vel" in decode_data(Offered, change.data).subscribers:
             break
@@ -312,7 +312,7 @@ async def test_the_robot_shows_its_state(robot: RobotAgent, headset: Agent) -> N
         state["nodes"]
     )
     headset.send(b"", to="ros", ids=[ROBOT], metadata=Metadata(request_id=0, message_manager=STATUS))
-    answer = await asyncio.wait_for(headset.receive(), 5)
+    answer = await asyncio.wait_for(headset.receive(), PATIENCE_S)
     assert json.loads(answer.data)["ros_node"] == state["ros_node"]
 
 
@@ -333,6 +333,6 @@ async def test_control_is_asked_for_over_the_wire(robot: RobotAgent, headset: Ag
     ):
         asking = Metadata(request_id=number, message_manager="RobotControl")
         headset.send(data, to="ros", ids=[ROBOT], metadata=asking)
-        answer = await asyncio.wait_for(headset.receive(), 5)
+        answer = await asyncio.wait_for(headset.receive(), PATIENCE_S)
         assert answer.metadata.request_id == number
         assert reason in json.loads(answer.data)["reason"]

@@ -29,10 +29,9 @@ from macs_zenoh.protocol.keyexpr import UNICAST
 from macs_zenoh.protocol.messages import NodeType
 from macs_zenoh.protocol.wire import parse_frame
 from tests.support.ros_peer import Peer, set_bool
-from tests.support.waiting import get, until
+from tests.support.waiting import PATIENCE_S, get, until
 
 ROBOT = 7
-PATIENCE_S = 20
 
 
 @pytest.fixture

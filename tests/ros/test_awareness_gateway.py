@@ -30,7 +30,7 @@ from macs_zenoh.errors import ConfigError, UsageError
 from macs_zenoh.mesh import Mesh
 from tests.support.programs import ROOT, Program, free_port, macs
 from tests.support.ros_peer import Peer
-from tests.support.waiting import get, until
+from tests.support.waiting import PATIENCE_S, get, until
 
 StartGateway = Callable[..., Awaitable[Gateway]]
 
@@ -101,7 +101,7 @@ async def call(peer: Peer, kind: type[Any], service: str, request: Any) -> Any:
         )
 
     await peer.session.run(ask)
-    return await asyncio.wait_for(done, 10)
+    return await asyncio.wait_for(done, PATIENCE_S)
 
 
 async def register(peer: Peer, message_type: str) -> str:
@@ -245,7 +245,7 @@ async def test_a_name_that_is_taken_is_an_error(start: StartGateway, ground: Gro
     with pytest.raises(UsageError, match="'drone0' is already on the mesh"):
         await start("drone0", in_domain=domain + 101)
     assert first.node.state == "active"
-    await ground.owner.wait_for("drone0", timeout_s=5)
+    await ground.owner.wait_for("drone0", timeout_s=PATIENCE_S)
 
 
 async def test_ten_megabytes_arrive_whole(start: StartGateway, peer: Peer, ground: Ground) -> None:
@@ -254,7 +254,7 @@ async def test_ten_megabytes_arrive_whole(start: StartGateway, peer: Peer, groun
     ground.takes("big")
     received = await peer.subscription(LocalGenericMessage, await register(peer, "big"))
     out = await peer.publisher(LocalGenericMessage, "/gateway_out", matched=1)
-    await ground.owner.wait_for("drone0", "big", timeout_s=10)
+    await ground.owner.wait_for("drone0", "big", timeout_s=PATIENCE_S)
     data = bytes(range(256)) * 40_000
     out.publish(outgoing("ground", "big", data))
     assert (await get(ground.received, 30)).data == data
@@ -484,7 +484,7 @@ async def test_it_starts_before_its_router(domain: int) -> None:
             macs_zenoh.join("unity", connect=[endpoint]) as agent,
             awareness.join(agent, "ground") as owner,
         ):
-            await asyncio.wait_for(starting, 10)
+            await asyncio.wait_for(starting, PATIENCE_S)
             assert (await owner.deliver("drone0", "t", b"x", deadline_s=10)).value == "delivered"
             assert (await get(received)).agent == "ground"
             await asyncio.to_thread(peer.session.close)

@@ -67,7 +67,7 @@ async def test_fifty_modules_register_at_once(gateway: Program, client: GatewayC
         lambda: [client.register_module(String, f"type{n}", f"module{n}", lambda *_: None) for n in range(50)]
     )
     assert await peer.session.run(lambda: "still spinning") == "still spinning"
-    await until(lambda: all(module.topic for module in modules), 20)
+    await until(lambda: all(module.topic for module in modules))
     assert [module.topic for module in modules] == [f"/type{n}_in" for n in range(50)]
     assert client.get_subscriber_count() == 50
     await peer.session.run(client.clear)
@@ -135,7 +135,7 @@ async def test_a_module_misses_its_gateway(
     client: GatewayClient, domain: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A module without a gateway says so once, with the ROS domain in which it looks."""
-    await until(lambda: "no gateway offers" in caplog.text, 20)
+    await until(lambda: "no gateway offers" in caplog.text)
     (said,) = [record.getMessage() for record in caplog.records if "no gateway offers" in record.getMessage()]
     assert f"/register_module in ROS domain {domain}" in said
 

@@ -13,7 +13,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from tests.support.programs import ROOT, free_port
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 PAGE = (ROOT / "docs" / "awareness.md").read_text(encoding="utf-8")
 STAYS = ("macs router", "macs awareness", "python listener.py", "python planner.py")
@@ -62,7 +62,7 @@ class Reader:
             self._tasks += reading
             if "macs" in line:
                 before = len(self.shown)
-                await until(lambda: any(text.startswith("ready: ") for text in self.shown[before:]), 20)
+                await until(lambda: any(text.startswith("ready: ") for text in self.shown[before:]))
             return
         assert await asyncio.wait_for(process.wait(), 60) == 0, self.log
         await asyncio.gather(*reading)
@@ -77,7 +77,7 @@ class Reader:
         for process in reversed(self._running):
             if process.returncode is None:
                 process.terminate()
-            await asyncio.wait_for(process.wait(), 10)
+            await asyncio.wait_for(process.wait(), PATIENCE_S)
         for task in self._tasks:
             task.cancel()
 
@@ -124,7 +124,7 @@ async def test_the_page_from_top_to_bottom(tmp_path: Path, domain: int) -> None:
                     commands += 1
             elif language == "text":
                 for line in text.splitlines():
-                    await until(lambda line=line: line in somebody.shown, 20)
+                    await until(lambda line=line: line in somebody.shown)
         table = [line.split() for line in somebody.shown if "drone" in line and "ros" in line.split()[:1]]
         assert [(row[1], row[-1]) for row in table] == [("1", "drone0"), ("2", "drone1")]
         assert not [line for line in somebody.log if "Traceback" in line]

@@ -87,7 +87,7 @@ async def fleet(count: int, domain: int) -> AsyncIterator[Fleet]:
         await asyncio.gather(*(robot.takes("words") for robot in robots))
         for robot in robots:
             others = sorted(other.name for other in robots if other is not robot)
-            await until(lambda robot=robot, others=others: robot.client.reachable("words") == others, 20)
+            await until(lambda robot=robot, others=others: robot.client.reachable("words") == others)
         yield Fleet(endpoint, router, robots)
 
 
@@ -159,6 +159,6 @@ async def test_after_any_kill_they_talk_again(domain: int) -> None:
 
 async def talk_again(sender: Robot, receiver: Robot) -> None:
     """Wait until the sender sees the receiver take words, and send one."""
-    await until(lambda: sender.client.reachable("words") == [receiver.name], 30)
+    await until(lambda: sender.client.reachable("words") == [receiver.name])
     sender.client.send(String(data="again"), "words", to=receiver.name)
     assert await get(receiver.received) == ("again", sender.name)

@@ -21,7 +21,7 @@ from std_srvs.srv import SetBool
 from bridge.ros import graph
 from bridge.ros.demo import Camera, Unicycle
 from tests.support.ros_peer import Peer
-from tests.support.waiting import get
+from tests.support.waiting import PATIENCE_S, get
 
 
 def test_a_unicycle_drives_a_circle() -> None:
@@ -118,7 +118,7 @@ async def test_the_demo_robot_shows_drives_and_ends(
     }
     assert offered.services == {"/set_lights": "std_srvs/srv/SetBool"}
     demo.send_signal(end)
-    assert await asyncio.wait_for(demo.wait(), 5) == 0
+    assert await asyncio.wait_for(demo.wait(), PATIENCE_S) == 0
 
 
 async def _call(peer: Peer, kind: type[Any], name: str, request: Any) -> Any:
@@ -133,4 +133,4 @@ async def _call(peer: Peer, kind: type[Any], name: str, request: Any) -> Any:
         future.add_done_callback(lambda done: loop.call_soon_threadsafe(answered.set_result, done.result()))
 
     await peer.session.run(ask)
-    return await asyncio.wait_for(answered, 10)
+    return await asyncio.wait_for(answered, PATIENCE_S)

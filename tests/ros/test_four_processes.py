@@ -18,7 +18,7 @@ from bridge.headset.nodes import Incoming
 from macs_zenoh.protocol.messages import Functionality, decode_data
 from tests.support.programs import Program, free_port, macs
 from tests.support.ros_peer import Peer
-from tests.support.waiting import get
+from tests.support.waiting import PATIENCE_S, get
 
 
 @dataclass
@@ -86,7 +86,7 @@ async def test_both_get_the_same_topic(site: Site, peer: Peer) -> None:
     for subscription in subscriptions:
         heard: list[str] = []
         while len(heard) < len(expected):
-            message = await asyncio.wait_for(subscription.__anext__(), 5)
+            message = await asyncio.wait_for(subscription.__anext__(), PATIENCE_S)
             text = message.data[8:].rstrip(b"\0").decode()
             if text != "early":
                 heard.append(text)
@@ -137,7 +137,7 @@ async def test_a_killed_gateway_takes_only_its_own_headsets(site: Site, peer: Pe
     site.gateways[0].send_signal(signal.SIGKILL)
     await sees(second, robots=[1], headsets=[second.id])
     await first_of(subscription.__anext__(), lambda: publisher.publish(String(data="after")))
-    assert await asyncio.wait_for(first.wait_ended(), 5)
+    assert await asyncio.wait_for(first.wait_ended(), PATIENCE_S)
 
 
 async def first_of(coming: Awaitable[Incoming], act: Callable[[], None]) -> Incoming:

@@ -115,7 +115,7 @@ async def test_who_comes_and_goes_costs_few_subscriptions(nodes: InterfaceNodes,
         nodes.remove(removing("/map", registrant=6))
         most = max(most, await session.run(lambda: session.node.count_subscribers("/map")))
     await nodes.add(adding("/map", registrant=7))
-    await until(lambda: got.of(7) == {"map": 1}, 20)
+    await until(lambda: got.of(7) == {"map": 1})
     assert most <= 1 + Newcomers.AT_ONCE
     assert got.of(5) == {"map": 1}
 

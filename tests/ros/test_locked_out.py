@@ -53,7 +53,7 @@ async def test_who_is_locked_out_notices_and_who_is_cut_off_is_not() -> None:
         await until(lambda: not mesh.linked)
         await asyncio.sleep(0.5)
         link.mend()
-        await until(lambda: mesh.linked, 30)
+        await until(lambda: mesh.linked)
         await asyncio.sleep(0.5)
         assert not noticed.done()
         async with stolen(mesh, link, router):
@@ -70,7 +70,7 @@ async def test_a_robot_goes_on_under_another_id(domain: int, monkeypatch: pytest
         settings = Settings(mesh=MeshSettings(connect=[link.endpoint]), robot=RobotSettings(id=7))
         async with join("operator", id=5, settings=MeshSettings(connect=[router.endpoint])) as operator:
             running = asyncio.create_task(agent.run(settings, on_ready=came.append, stop=stop))
-            await until(lambda: came, 30)
+            await until(lambda: came)
             before = zenoh_id(came[0].mesh)
             await operator.call("ros", 7, "stop", b"true", timeout_s=20)
             async with stolen(came[0].mesh, link, router):

@@ -25,7 +25,7 @@ from macs_zenoh.protocol.messages import Metadata, NodeType, encode_data, node_n
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.support.programs import free_port
 from tests.support.ros_peer import Peer, adding
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 ROBOT = 7
 SET = "std_srvs/SetBool"
@@ -156,7 +156,7 @@ async def _works(robot: RobotAgent, headset: Agent, peer: Peer, heard: asyncio.Q
     asked = await peer.session.run(lambda: client.call_async(SetBool.Request()))
     answered = False
     while not (answered and asked.done()):
-        message = await asyncio.wait_for(headset.receive(), 10)
+        message = await asyncio.wait_for(headset.receive(), PATIENCE_S)
         metadata = message.metadata
         if metadata.node_type == NodeType.SERVICE:
             back = Metadata(2, 5, metadata.request_id, "", NodeType.SERVICE, "nd__ask", SET)

@@ -35,7 +35,7 @@ from macs_zenoh.protocol.routing import call, inbox, keys_of
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, parse_frame
 from tests.support.programs import free_port
 from tests.support.ros_peer import Peer, adding, drive, removing
-from tests.support.waiting import get, until
+from tests.support.waiting import PATIENCE_S, get, until
 
 ROBOT = 7
 OPERATOR, STRANGER = 5, 6
@@ -453,7 +453,7 @@ class Lodging:
 
     async def register(self, request: AddNode) -> None:
         key, frame = call((1, ROBOT), "add_node", (2, self.ID), encode_data(request), Metadata(2, self.ID), MACS)
-        await self.mesh.query(key, frame, timeout_s=5)
+        await self.mesh.query(key, frame, timeout_s=PATIENCE_S)
 
 
 @pytest.fixture

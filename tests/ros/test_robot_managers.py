@@ -15,6 +15,7 @@ from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.messages import Metadata
 from tests.support.programs import free_port
+from tests.support.waiting import PATIENCE_S
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -33,7 +34,7 @@ async def test_a_robot_answers_an_own_management_message(domain: int, monkeypatc
         metadata = Metadata(request_id=5, message_manager="ClockComparer")
         for data in (b"not json", b'{"sentAtS": "soon"}', b'{"sentAtS": -1}', b'{"sentAtS": 1760000000.25}'):
             asker.send(data, to="ros", ids=[1], metadata=metadata)
-        answer = await asyncio.wait_for(asker.receive(), 5)
+        answer = await asyncio.wait_for(asker.receive(), PATIENCE_S)
         assert answer.metadata.request_id == 5
         assert json.loads(answer.data)["sentAtS"] == 1760000000.25
         assert json.loads(answer.data)["asker"] == f"2/{asker.id}"

@@ -27,7 +27,7 @@ from bridge.headset.client import Headset
 from macs_zenoh.errors import Refused, Unreachable
 from tests.support.programs import ROOT, Program, ended, free_port, macs
 from tests.support.ros_peer import Peer
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 SET = "std_srvs/SetBool"
 
@@ -89,7 +89,7 @@ async def test_three_headsets_get_a_camera(site: Site, peer: Peer, how: str) -> 
     task = asyncio.create_task(publish())
     late = await site.headsets[2].subscribe("/camera", "sensor_msgs/Image", **where)
     for subscription in (*early, late):
-        message = await asyncio.wait_for(subscription.__anext__(), 10)
+        message = await asyncio.wait_for(subscription.__anext__(), PATIENCE_S)
         assert deserialize_message(message.data, Image) == image
     task.cancel()
 
@@ -135,9 +135,9 @@ async def test_a_headset_that_vanishes_in_a_call_ends_it(site: Site, peer: Peer)
     client = await peer.session.run(lambda: peer.session.node.create_client(SetBool, "/ask"))
     await until(client.service_is_ready)
     call = await peer.session.run(lambda: client.call_async(SetBool.Request()))
-    await asyncio.wait_for(asked.wait(), 5)
+    await asyncio.wait_for(asked.wait(), PATIENCE_S)
     await site.headset.abort()
-    await until(call.done, 3)
+    await until(call.done)
     assert "has left" in call.result().message
 
 
@@ -202,7 +202,7 @@ async def test_a_robot_that_restarts_streams_on(site: Site, peer: Peer, domain: 
             await asyncio.sleep(0.02)
 
     task = asyncio.create_task(publish())
-    await asyncio.wait_for(subscription.__anext__(), 10)
+    await asyncio.wait_for(subscription.__anext__(), PATIENCE_S)
     await site.robot.stop(signal.SIGKILL)
     await site.robot.start()
     restarted = published
@@ -230,10 +230,10 @@ async def test_who_holds_a_service_keeps_it_when_the_robot_restarts(
 
     async def who_answers() -> str:
         while True:
-            await until(client.service_is_ready, 20)
+            await until(client.service_is_ready)
             call = await peer.session.run(lambda: client.call_async(SetBool.Request(data=True)))
             with contextlib.suppress(AssertionError):  # it went to a server that is no more
-                await until(call.done, 5)
+                await until(call.done)
                 return str(call.result().message)
 
     async with AsyncExitStack() as stack:
@@ -285,7 +285,7 @@ async def test_existing_and_newer_headsets_read_a_latched_topic(site: Site, peer
     async with existing:
         for headset in (site.headsets[0], existing, site.headsets[1]):
             joints = await headset.subscribe("/joints", "sensor_msgs/JointState", agents=[1])
-            data = (await asyncio.wait_for(joints.__anext__(), 10)).data
+            data = (await asyncio.wait_for(joints.__anext__(), PATIENCE_S)).data
             if headset is existing:
                 assert data == unity_serializer.write(state)
             else:
@@ -293,7 +293,7 @@ async def test_existing_and_newer_headsets_read_a_latched_topic(site: Site, peer
         publisher.publish(state)
         for headset in (*site.headsets[:2], existing):
             (joints,) = headset.nodes
-            await asyncio.wait_for(joints.__anext__(), 10)  # type: ignore[attr-defined]
+            await asyncio.wait_for(joints.__anext__(), PATIENCE_S)  # type: ignore[attr-defined]
             assert joints.dropped == 0  # type: ignore[attr-defined]
 
 

@@ -21,7 +21,7 @@ from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.messages import encode_data
 from tests.support.ros_peer import Peer, adding, removing
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 ROBOT = 7
 
@@ -141,6 +141,6 @@ async def test_a_topic_above_its_rate_is_counted(headset: Agent, seen: Seen, pee
 
     for _ in range(100):
         fast.publish(String())
-    await asyncio.wait_for(all_accounted_for(), 10)
+    await asyncio.wait_for(all_accounted_for(), PATIENCE_S)
     assert seen.count("nd__fast") + await dropped() == 100
     assert await dropped() >= 50

@@ -160,6 +160,7 @@ async def driving(nodes: InterfaceNodes, peer: Peer, topic: str = "/cmd_vel") ->
     return received
 
 
+@pytest.mark.alone
 async def test_silence_publishes_the_stop_message_once(nodes: InterfaceNodes, peer: Peer) -> None:
     """When commands stop for the configured time, the configured message is on the topic within 100 ms, once."""
     received = await driving(nodes, peer)
@@ -184,6 +185,7 @@ async def test_silence_publishes_the_stop_message_once(nodes: InterfaceNodes, pe
     }
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("also", [[], [6]], ids=["last registrant", "others stay"])
 async def test_a_commander_that_leaves_stops_the_robot(nodes: InterfaceNodes, peer: Peer, also: list[int]) -> None:
     """The stop message comes when the commanding agent's presence ends, also when the publisher goes with it."""

@@ -107,7 +107,7 @@ def resident_mib(pid: int) -> int:
 
 async def drives(heard: Heard) -> None:
     since = time.monotonic()
-    await until(lambda: 0.5 in heard.since(since), 20)
+    await until(lambda: 0.5 in heard.since(since))
 
 
 @pytest.mark.parametrize("name", [*PUTS, *QUERIES])

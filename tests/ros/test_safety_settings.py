@@ -30,7 +30,7 @@ async def test_a_dead_man_that_does_not_fit_its_type_is_told_at_the_start(
     """The graph has the topic: the log names the field, and `macs doctor` is not content."""
     await peer.subscription(Twist, "/cmd_vel")
     async with site(domain, tmp_path, WRONG) as place, place.robot() as robot:
-        await until(lambda: any("Twist has no field linaer" in line for line in robot.log), 20)
+        await until(lambda: any("Twist has no field linaer" in line for line in robot.log))
         code, out, errors = await ended("doctor", "--json", "--quick", "-e", place.router.endpoint)
         assert code == 1, errors
         found = [finding for finding in json.loads(out)["findings"] if finding["id"] == "wrong_settings"]
@@ -40,7 +40,7 @@ async def test_a_dead_man_that_does_not_fit_its_type_is_told_at_the_start(
 async def test_two_agents_on_one_graph_are_found(domain: int, tmp_path: Path) -> None:
     """`macs doctor` names the graph that two robots share."""
     async with site(domain, tmp_path) as place, place.robot(1) as first, place.robot(2):
-        await until(lambda: any("works on this ROS graph too" in line for line in first.log), 20)
+        await until(lambda: any("works on this ROS graph too" in line for line in first.log))
         _, out, errors = await ended("doctor", "--json", "--quick", "-e", place.router.endpoint)
         found = [finding for finding in json.loads(out)["findings"] if finding["id"] == "shared_graph"]
         assert len(found) == 2, errors

@@ -37,7 +37,7 @@ from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import encode_frame, encode_message, parse_frame
 from tests.support.ros_peer import Peer, adding, command
 from tests.support.routers import Router
-from tests.support.waiting import get, until
+from tests.support.waiting import PATIENCE_S, get, until
 
 pytestmark = pytest.mark.timeout(600)  # the first of them compiles its messages, on a busy machine for minutes
 
@@ -296,5 +296,5 @@ async def test_a_service_without_fields_is_served(nodes: InterfaceNodes, sent: S
     assert unity_serializer.read(kind.Request, data) == kind.Request()
     answer = unity_serializer.write(calls_answer(kind))
     nodes.deliver(of_service("/do", NodeType.SERVICE, answer, metadata.request_id))
-    assert await asyncio.wait_for(answered, 10) == calls_answer(kind)
+    assert await asyncio.wait_for(answered, PATIENCE_S) == calls_answer(kind)
     assert not nodes.drops

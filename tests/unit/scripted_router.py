@@ -11,6 +11,7 @@ from typing import Any
 from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.messages import Metadata
 from macs_zenoh.protocol.wire import Frame, encode_message
+from tests.support.waiting import PATIENCE_S
 
 VECTORS = Path(__file__).parents[1] / "vectors" / "headset"
 HEARTBEAT = b'{"messageManager":"HeartbeatHandler"}'
@@ -87,7 +88,7 @@ class ScriptedRouter:
                 self._changed.clear()
                 await self._changed.wait()
 
-        await asyncio.wait_for(look(), 10)
+        await asyncio.wait_for(look(), PATIENCE_S)
 
     async def received(self, count: int) -> list[bytes]:
         """The first ``count`` frames after the configuration reply."""

@@ -16,6 +16,7 @@ from bridge.headset.nodes import ServiceRequest
 from macs_zenoh.errors import CallTimeout, TooManyDestinations, Unreachable, UsageError
 from macs_zenoh.protocol.messages import EXTENSIONS, Metadata, NodeType, node_name
 from macs_zenoh.protocol.wire import Frame, encode_message, parse_frame
+from tests.support.waiting import PATIENCE_S
 
 STRING = "std_msgs/String"
 SET_BOOL = "std_srvs/SetBool"
@@ -411,7 +412,7 @@ async def test_a_waiting_taker_loses_nothing(router: ScriptedRouter, headset: He
 
     taking = asyncio.create_task(take())
     router.send(b"".join(node_message(1, "/chatter", b"%d" % number) for number in range(500)))
-    await asyncio.wait_for(taking, 10)
+    await asyncio.wait_for(taking, PATIENCE_S)
     assert seen == list(range(500))
 
 
@@ -461,7 +462,7 @@ async def test_it_tells_when_the_router_ends_it(router: ScriptedRouter) -> None:
     call = asyncio.create_task(headset.call("/set", SET_BOOL, 1, b""))
     await router.received(3)
     router.close()
-    assert await asyncio.wait_for(headset.wait_ended(), 5) == "the router closed the connection"
+    assert await asyncio.wait_for(headset.wait_ended(), PATIENCE_S) == "the router closed the connection"
     assert [message async for message in chatter] == []
     with pytest.raises(Unreachable, match="closed the connection"):
         await call
@@ -476,7 +477,7 @@ async def test_it_tells_when_the_router_ends_it(router: ScriptedRouter) -> None:
 async def test_lost_framing_ends_it(router: ScriptedRouter, headset: Headset) -> None:
     """A size that cannot be true ends the connection, since the next message cannot be found."""
     router.send(b"\xff\xff\xff\xff")
-    assert "4294967303 bytes was declared" in await asyncio.wait_for(headset.wait_ended(), 5)
+    assert "4294967303 bytes was declared" in await asyncio.wait_for(headset.wait_ended(), PATIENCE_S)
 
 
 async def test_it_comes_back_and_registers_everything() -> None:
@@ -513,7 +514,7 @@ async def test_what_is_asked_for_while_away_is_done_later() -> None:
         headset._on_link = lambda link: None if link.up else lost.set()
         router._server.close()
         router.cut()
-        await asyncio.wait_for(lost.wait(), 5)
+        await asyncio.wait_for(lost.wait(), PATIENCE_S)
         assert headset.reconnecting
         await headset.subscribe("/chatter", STRING, agents=[1])
         with pytest.raises(Unreachable):
@@ -531,7 +532,7 @@ async def test_closing_while_away_ends_at_once(router: ScriptedRouter) -> None:
     headset = await Headset.connect("127.0.0.1", router.port, reconnect=True)
     router._server.close()
     router.cut()
-    await asyncio.wait_for(headset.close(), 5)
+    await asyncio.wait_for(headset.close(), PATIENCE_S)
     assert await headset.wait_ended() == "closed here"
 
 
@@ -545,4 +546,4 @@ async def test_closing_ends_what_swallows_a_cancellation(headset: Headset) -> No
 
     headset._tasks.append(asyncio.create_task(stubborn()))
     await asyncio.sleep(0)
-    await asyncio.wait_for(headset.close(), 10)
+    await asyncio.wait_for(headset.close(), PATIENCE_S)
