@@ -116,8 +116,9 @@ class Agent:
     ) -> None:
         """Send to agents of one type (``"ros"``, ``"unity"`` or its number), by id, by group or both.
 
-        Returns at once; `drain` waits. An agent named by id and by group gets one copy. Raises TooManyDestinations,
-        OutOfRange, UsageError, Closed.
+        Returns at once; `drain` waits. What is under way when a link is lost, this agent's or the receiver's, does not
+        arrive: where it must, `call` is answered. An agent named by id and by group gets one copy. Raises
+        TooManyDestinations, OutOfRange, UsageError, Closed.
         """
         if not ids and not groups:
             raise UsageError("send to whom? give ids or groups, or use broadcast")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
@@ -85,3 +86,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.alone)
         if item.nodeid.startswith(SOAK):
             item.add_marker(pytest.mark.soak)
+
+
+@pytest.fixture
+async def router() -> AsyncIterator[str]:
+    """A Zenoh router in this process; its endpoint."""
+    from tests.support.local import local_router  # most tests need no Zenoh
+
+    async with local_router() as endpoint:
+        yield endpoint

@@ -6,24 +6,16 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import AsyncExitStack
 
 import pytest
+from tests.support.local import patient
 
 from bridge.gateway import Gateway
 from bridge.headset.client import Headset
 from bridge.settings import GatewaySettings
-from macs_zenoh.config import MeshSettings, TrafficRule
+from macs_zenoh.config import TrafficRule
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.sections import changed
 from tests.support.given import Connect, StartGateway
-from tests.support.programs import free_port
 from tests.support.waiting import until  # noqa: F401 - until all that is under way takes it from there
-
-
-@pytest.fixture
-async def router() -> AsyncIterator[str]:
-    """A Zenoh router; its endpoint."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    async with await Mesh.open(MeshSettings(mode="router", listen=[endpoint])):
-        yield endpoint
 
 
 @pytest.fixture
@@ -32,7 +24,7 @@ async def start_gateway(router: str) -> AsyncIterator[StartGateway]:
     async with AsyncExitStack() as stack:
 
         async def start(endpoint: str = router, traffic: Sequence[TrafficRule] = (), **settings: object) -> Gateway:
-            opening = Mesh.open(MeshSettings(connect=[endpoint]), traffic=traffic)
+            opening = Mesh.open(patient(endpoint), traffic=traffic)
             mesh = await stack.enter_async_context(await opening)
             gateway = Gateway(mesh, changed(GatewaySettings(port=0, robots="any"), **settings))
             stack.push_async_callback(gateway.close)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from tests.support.local import patient
 
 import macs_zenoh
 from tests.support.waiting import until
@@ -64,8 +65,8 @@ async def test_a_drained_agent_has_sent_all(router: str) -> None:
     after each piece, more goes through than may wait at one time."""
     pieces, size = 6, 11 << 20  # together more than the 64 MiB that may wait
     async with (
-        macs_zenoh.join("ros", id=7, connect=[router]) as robot,
-        macs_zenoh.join("unity", id=300, connect=[router]) as headset,
+        macs_zenoh.join("ros", id=7, settings=patient(router)) as robot,
+        macs_zenoh.join("unity", id=300, settings=patient(router)) as headset,
     ):
         await until(lambda: len(headset.online()) == len(robot.online()) == 2)
         for number in range(pieces):
@@ -80,8 +81,8 @@ async def test_a_drained_agent_has_sent_all(router: str) -> None:
 async def test_drain_waits_for_what_was_sent_before(router: str) -> None:
     """While something large is under way, drain has not ended."""
     async with (
-        macs_zenoh.join("ros", id=7, connect=[router]) as robot,
-        macs_zenoh.join("unity", id=300, connect=[router]) as headset,
+        macs_zenoh.join("ros", id=7, settings=patient(router)) as robot,
+        macs_zenoh.join("unity", id=300, settings=patient(router)) as headset,
     ):
         await until(lambda: len(headset.online()) == len(robot.online()) == 2)
         headset.send(bytes(12 << 20), to="ros", ids=[7])

@@ -7,7 +7,6 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import sys
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -140,13 +139,9 @@ Start = Callable[..., Any]
 
 
 @pytest.fixture
-async def mesh_settings() -> AsyncIterator[MeshSettings]:
+def mesh_settings(router: str) -> MeshSettings:
     """How to reach a router that runs here."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    async with await Mesh.open(MeshSettings(mode="router", listen=[endpoint])):
-        yield MeshSettings(connect=[endpoint])
+    return MeshSettings(connect=[router])
 
 
 @contextlib.asynccontextmanager

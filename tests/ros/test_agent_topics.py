@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AsyncExitStack
@@ -32,16 +31,6 @@ from tests.support.ros_peer import Peer, set_bool
 from tests.support.waiting import PATIENCE_S, get, until
 
 ROBOT = 7
-
-
-@pytest.fixture
-async def router() -> AsyncIterator[str]:
-    """A Zenoh router; its endpoint."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    async with await Mesh.open(MeshSettings(mode="router", listen=[endpoint])):
-        yield endpoint
 
 
 def settings(router: str, **robot: object) -> Settings:

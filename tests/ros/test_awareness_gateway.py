@@ -27,20 +27,11 @@ from bridge.settings import AwarenessSettings, Settings
 from macs_zenoh import awareness
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, UsageError
-from macs_zenoh.mesh import Mesh
 from tests.support.programs import ROOT, Program, free_port, macs
 from tests.support.ros_peer import Peer
 from tests.support.waiting import PATIENCE_S, get, until
 
 StartGateway = Callable[..., Awaitable[Gateway]]
-
-
-@pytest.fixture
-async def router() -> AsyncIterator[str]:
-    """A Zenoh router; its endpoint."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    async with await Mesh.open(MeshSettings(mode="router", listen=[endpoint])):
-        yield endpoint
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Refused, Unreachable
 from macs_zenoh.protocol.messages import encode_data as encode
 from macs_zenoh.protocol.wire import parse_frame
-from tests.ros.test_agent import ROBOT, Streams, headset, robot, router  # noqa: F401 - fixtures
+from tests.ros.test_agent import ROBOT, Streams, headset, robot  # noqa: F401 - fixtures
 from tests.support.ros_peer import Peer, adding
 
 DOCS = Path(__file__).parents[2] / "docs"

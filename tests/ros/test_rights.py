@@ -33,7 +33,6 @@ from macs_zenoh.protocol.messages import ActionVerb, AddNode, CallFailure, Metad
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.routing import call, inbox, keys_of
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, parse_frame
-from tests.support.programs import free_port
 from tests.support.ros_peer import Peer, adding, drive, removing
 from tests.support.waiting import PATIENCE_S, get, until
 
@@ -454,14 +453,6 @@ class Lodging:
     async def register(self, request: AddNode) -> None:
         key, frame = call((1, ROBOT), "add_node", (2, self.ID), encode_data(request), Metadata(2, self.ID), MACS)
         await self.mesh.query(key, frame, timeout_s=PATIENCE_S)
-
-
-@pytest.fixture
-async def router() -> AsyncIterator[str]:
-    """A Zenoh router; its endpoint."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    async with await Mesh.open(MeshSettings(mode="router", listen=[endpoint])):
-        yield endpoint
 
 
 async def test_nothing_of_an_agent_is_its_successors(router: str, domain: int, peer: Peer) -> None:

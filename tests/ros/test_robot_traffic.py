@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 from collections.abc import AsyncIterator, Callable
 
 import pytest
@@ -17,7 +16,6 @@ from bridge.ros.agent import open_robot
 from bridge.settings import RobotSettings, Settings, TopicRule
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings, TrafficRule
-from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.messages import encode_data
 from tests.support.ros_peer import Peer, adding, removing
@@ -70,15 +68,6 @@ class Seen:
 
         await until(again)
         return next(priority for key, priority in self.samples if key.endswith("/" + node))
-
-
-@pytest.fixture
-async def router() -> AsyncIterator[str]:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    async with await Mesh.open(MeshSettings(mode="router", listen=[endpoint])):
-        yield endpoint
 
 
 @pytest.fixture
