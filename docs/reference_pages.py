@@ -47,16 +47,14 @@ MADE_FROM = {
 """Sources that pages link to for what is made from them here: such links also work where the repository is read."""
 
 
+GENERATED = ("cli.md", "settings.md", "api.md", "counter_index.md", *COPIED.values())
+
+
 def pages() -> dict[str, str]:
     """Every generated page, by its file name."""
     copies = {name: (ROOT / path).read_text(encoding="utf-8") for path, name in COPIED.items()}
-    return {
-        "cli.md": command_line(),
-        "settings.md": settings(),
-        "api.md": api(),
-        "counter_index.md": counter_index(),
-        **copies,
-    }
+    made = (command_line(), settings(), api(), counter_index(), *copies.values())
+    return dict(zip(GENERATED, made, strict=True))
 
 
 def repository() -> str:

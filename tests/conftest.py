@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -39,6 +40,11 @@ SOAK = (
     "tests/ros/test_interfaces.py",
 )
 """What takes minutes, and seldom finds what others do not: marked ``soak``, run by ``make test-all`` and CI."""
+
+# Hundreds of processes are started, which must not compile all of our modules each: environments made for containers
+# often forbid to keep what was compiled.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # Timings never decide a test: a busy machine is no counterexample.
 settings.register_profile("macs", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -6,7 +6,6 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import AsyncExitStack
 
 import pytest
-from tests.support.local import patient
 
 from bridge.gateway import Gateway
 from bridge.headset.client import Headset
@@ -15,6 +14,7 @@ from macs_zenoh.config import TrafficRule
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.sections import changed
 from tests.support.given import Connect, StartGateway
+from tests.support.local import patient
 from tests.support.waiting import until  # noqa: F401 - until all that is under way takes it from there
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from tests.support.local import patient
 
 import macs_zenoh
+from tests.support.local import patient
 from tests.support.waiting import until
 
 

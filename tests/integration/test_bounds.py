@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from functools import cache
 
 import pytest
 
@@ -27,8 +29,16 @@ from tests.integration.test_limits import answers, memory_bytes, site
 from tests.support.given import Connect, StartGateway
 from tests.support.waiting import until
 
-MANY_KEYS = b"{%s}" % ",".join(f'"key{n}":0' for n in range(2_200_000)).encode()
-LISTS = b'{"messageManager":"OnlineAgentsGetter","x":[%s0]}' % (b"[]," * (10 << 20))
+
+@cache
+def many_keys() -> bytes:
+    """30 MB of JSON, made when a test needs them."""
+    return b"{%s}" % ",".join(f'"key{n}":0' for n in range(2_200_000)).encode()
+
+
+def many_lists() -> bytes:
+    """As many bytes of JSON in 10 million lists."""
+    return b'{"messageManager":"OnlineAgentsGetter","x":[%s0]}' % (b"[]," * (10 << 20))
 
 
 def registration(name: str, group: int = 0, robots: tuple[int, ...] = (), body: bytes | None = None) -> bytes:
@@ -70,12 +80,12 @@ class Raw:
         ]
 
 
-COSTLY = {
-    "metadata of 2.2 million keys": encode_frame(2, [1], message=encode_message(MANY_KEYS)),
-    "management data of 2.2 million keys": encode_frame(management=MANY_KEYS),
-    "management data of 10 million lists": encode_frame(management=LISTS),
-    "a registration's node of 2.2 million keys": registration("nd_x", robots=(1,), body=MANY_KEYS),
-    "metadata beside management data": encode_frame(management=b"{}", message=encode_message(MANY_KEYS)),
+COSTLY: dict[str, Callable[[], bytes]] = {
+    "metadata of 2.2 million keys": lambda: encode_frame(2, [1], message=encode_message(many_keys())),
+    "management data of 2.2 million keys": lambda: encode_frame(management=many_keys()),
+    "management data of 10 million lists": lambda: encode_frame(management=many_lists()),
+    "a registration's node of 2.2 million keys": lambda: registration("nd_x", robots=(1,), body=many_keys()),
+    "metadata beside management data": lambda: encode_frame(management=b"{}", message=encode_message(many_keys())),
 }
 
 
@@ -87,7 +97,7 @@ async def test_a_costly_frame_costs_only_itself(what: str) -> None:
         attacker = Raw(gateway.port)
         await answers(neighbour)
         before = memory_bytes(gateway.pid)
-        await attacker.send(COSTLY[what])
+        await attacker.send(COSTLY[what]())
         await attacker.send(
             encode_frame(2, [neighbour.id], message=encode_message(Metadata(2, 0, 1, "Hello").encode()))
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import re
 from pathlib import Path, PurePosixPath
 
@@ -14,13 +15,15 @@ import macs_zenoh
 from bridge.cli import VERBS, build_parser
 
 DOCS = Path(__file__).parents[2] / "docs"
-GENERATED = reference_pages.pages()
-PAGES = {path.stem for path in DOCS.glob("*.md")} | {f"generated/{name.removesuffix('.md')}" for name in GENERATED}
+COPIES = {f"generated/{name.removesuffix('.md')}" for name in reference_pages.GENERATED}
+PAGES = {path.stem for path in DOCS.glob("*.md")} | COPIES
+
+generated = functools.cache(reference_pages.pages)
 
 
 def text_of(name: str) -> str:
-    generated = GENERATED.get(f"{name.removeprefix('generated/')}.md")
-    return generated if generated is not None else (DOCS / f"{name}.md").read_text(encoding="utf-8")
+    made = generated().get(f"{name.removeprefix('generated/')}.md")
+    return made if made is not None else (DOCS / f"{name}.md").read_text(encoding="utf-8")
 
 
 def test_every_page_is_on_one_shelf() -> None:
@@ -58,17 +61,17 @@ def test_a_file_of_the_repository_is_linked_where_it_is_kept() -> None:
 def test_the_settings_page_has_every_setting() -> None:
     """Each field of each section, with a sentence of what it means."""
     for struct in reference_pages.sections():
-        part = GENERATED["settings.md"].partition(f"\n## `{'[' * (1 + ('rule' in struct.section))}")[2]
+        part = generated()["settings.md"].partition(f"\n## `{'[' * (1 + ('rule' in struct.section))}")[2]
         assert part
         meanings = reference_pages.field_docstrings(struct)
         for field in msgspec.structs.fields(struct):
-            assert f"\n`{field.name}`\n: *" in GENERATED["settings.md"], field.name
+            assert f"\n`{field.name}`\n: *" in generated()["settings.md"], field.name
             assert len(meanings.get(field.name, "")) > 5, f"{struct.__name__}.{field.name} has no docstring"
 
 
 def test_the_command_page_has_every_verb() -> None:
     """Each verb, and each verb of a verb, has its help."""
-    headings = set(re.findall(r"^##+ (.+)$", GENERATED["cli.md"], re.MULTILINE))
+    headings = set(re.findall(r"^##+ (.+)$", generated()["cli.md"], re.MULTILINE))
     assert headings >= {f"macs {verb}" for verb in VERBS}
     (verbs,) = (each for each in build_parser()._actions if isinstance(each, argparse._SubParsersAction))
     for name, parser in verbs.choices.items():
@@ -79,7 +82,7 @@ def test_the_command_page_has_every_verb() -> None:
 
 def test_the_library_page_has_every_public_name() -> None:
     """What ``macs_zenoh`` exports is there, and says what it is."""
-    assert set(re.findall(r":: macs_zenoh\.(\w+)$", GENERATED["api.md"], re.MULTILINE)) == set(
+    assert set(re.findall(r":: macs_zenoh\.(\w+)$", generated()["api.md"], re.MULTILINE)) == set(
         reference_pages.public_names()
     )
     assert [name for name in reference_pages.public_names() if not getattr(macs_zenoh, name).__doc__] == []
@@ -87,7 +90,7 @@ def test_the_library_page_has_every_public_name() -> None:
 
 def test_the_index_of_counters_says_where() -> None:
     """Each counter is there with a module that counts it."""
-    rows = re.findall(r"^\| `(\w+)` \| \[", GENERATED["counter_index.md"], re.MULTILINE)
+    rows = re.findall(r"^\| `(\w+)` \| \[", generated()["counter_index.md"], re.MULTILINE)
     assert rows == sorted(reference_pages.where_counted(), key=str.lower)
     assert len(rows) > 40
 
