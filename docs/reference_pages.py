@@ -281,7 +281,7 @@ def _members(value: Any) -> list[str]:
 # Counters
 
 COUNTERS = {"drops", "_drops", "counters", "_counters"}
-COUNTING = {"note", "_no", "_lose", "_count", "drop"}
+COUNTING = {"note", "once", "_no", "_lose", "_count", "drop"}
 """Functions whose first argument is the name of a counter, where it is a text."""
 
 

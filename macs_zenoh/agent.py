@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
@@ -23,6 +23,7 @@ from .config import MeshSettings, TrafficRule
 from .errors import CallTimeout, Closed, OutOfRange, Unreachable, UsageError, WireError
 from .handles import Callbacks, Handle
 from .identity import Identity
+from .losses import Losses
 from .mesh import Aged, Mesh, Sample, Subscription, Traffic
 from .nodes import ANSWER_S, Nodes
 from .presence import Presence
@@ -67,7 +68,7 @@ class Agent:
         self.type_number = agent_type
         self.group = group
         self.id = 0
-        self.drops: Counter[str] = Counter()
+        self.drops = Losses(log)
         self._presence = Presence(mesh, self._presence_changed, lambda contested: self._identity.contested(contested))
         self._identity = Identity(mesh, self._presence, agent_type, group, listen=self._listen, on_id=self._id_changed)
         self._presses = Presses(mesh, self._presence.directory)
@@ -243,9 +244,7 @@ class Agent:
         return self.mesh.subscribe_guarded(key, judged, self._guard)
 
     def _bad_frame(self, key: str, error: WireError) -> None:
-        self.drops["bad_frame"] += 1
-        if self.drops["bad_frame"] == 1:
-            log.warning("a frame on %s cannot be used: %s (logged once, counted as bad_frame)", key, error)
+        self.drops.once("bad_frame", "a frame on %s cannot be used: %s", key, error)
 
     # -- call and serve ------------------------------------------------------------------------------------------
 

@@ -18,7 +18,6 @@ import asyncio
 import logging
 import threading
 import time
-from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager
 from typing import NamedTuple
@@ -27,6 +26,7 @@ from .agent import Agent
 from .claims import settle, stale_until
 from .errors import Refused, Unreachable, UsageError, WireError
 from .handles import Callbacks, Handle
+from .losses import Losses
 from .mesh import Mesh, Sample, Subscription, Token, Traffic
 from .protocol import named
 from .protocol.agent_id import AgentId
@@ -87,8 +87,6 @@ class Awareness:
 
     KEYS = 4096
     """Keys that are remembered rather than built for each message."""
-    WARNINGS = 1000
-    """Different things that are worth a line in the log; what they are about comes from others."""
 
     def __init__(
         self,
@@ -108,7 +106,7 @@ class Awareness:
         self.agent_id = agent_id
         self.max_bytes = max_bytes
         self.names = Names()
-        self.counters: Counter[str] = Counter()
+        self.counters = Losses(log)
         self._lock = threading.Lock()
         self._keys: dict[tuple[str, str], str] = {}
         self._rates = RateLimits(max_hz or {})
@@ -121,7 +119,7 @@ class Awareness:
         self._token_of_name = Token()
         self._per_type: dict[str, list[Subscription]] = {}
         self._asking: set[str] = set()
-        self._warned: set[tuple[str, str]] = set()
+        self._rivals: set[str] = set()
         self._on_change: Callbacks[Callable[[str], None]] = Callbacks()
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -339,10 +337,7 @@ class Awareness:
         return True
 
     def _lose(self, counter: str, about: str, text: str) -> None:
-        self.counters[counter] += 1
-        if (counter, about) not in self._warned and len(self._warned) < self.WARNINGS:
-            self._warned.add((counter, about))
-            log.warning("%s; more of this is counted, not logged", text)
+        self.counters.once(counter, "%s", text, about=about)
 
     # -- last values ---------------------------------------------------------------------------------------------
 
@@ -446,10 +441,10 @@ class Awareness:
         That happens only where two parts of a mesh have met again: who joins sees the name that is there.
         """
         for other in self.names.claimants(self.name):
-            if other != self.mesh.zid and ("name_taken_twice", other) not in self._warned:
-                self._warned.add(("name_taken_twice", other))
-                self.counters["name_taken_twice"] += 1
-                log.error("session %s is called %r as well; both get its messages. Rename one", other, self.name)
+            if other != self.mesh.zid and other not in self._rivals:
+                self._rivals.add(other)
+                text = "session %s is called %r as well; both get its messages. Rename one"
+                self.counters.once("name_taken_twice", text, other, self.name, about=other, level=logging.ERROR)
 
     async def _change_before(self, deadline: float) -> bool:
         """Wait for a token to come or go; False when the deadline was earlier."""

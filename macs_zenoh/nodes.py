@@ -328,15 +328,12 @@ class Nodes:
         assert isinstance(user, TopicSubscription)
         for message in messages:
             if not user.put(message):
-                self.agent.drops["topic_full"] += 1
-                if user.dropped == 1:
-                    text = "%s: taken too slowly, the oldest of %d is dropped (logged once, counted as topic_full)"
-                    log.warning(text, user.topic, user.depth)
+                self.agent.drops.note(
+                    "topic_full", user.topic, f"taken too slowly, the oldest of {user.depth} is dropped"
+                )
 
     def _bad_frame(self, key: str, error: WireError) -> None:
-        self.agent.drops["bad_frame"] += 1
-        if self.agent.drops["bad_frame"] == 1:
-            log.warning("a frame on %s cannot be used: %s (logged once, counted as bad_frame)", key, error)
+        self.agent.drops.once("bad_frame", "a frame on %s cannot be used: %s", key, error)
 
     def take(self, message: Message) -> bool:
         """A message to this agent: whether it was an answer to what is used here."""

@@ -23,6 +23,7 @@ from bridge.ros.session import RosSession
 from bridge.settings import Settings
 from macs_zenoh.awareness import Received
 from macs_zenoh.errors import ConfigError, MacsError
+from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.named import Copies, Outcome
 
 log = logging.getLogger("macs.awareness")
@@ -49,10 +50,9 @@ class Gateway:
         self.session: RosSession
         self._loop = asyncio.get_running_loop()
         self._link = MeshLink(settings, self._from_mesh, self._outcome, self._refused, self._agents_changed)
-        self._counters: Counter[str] = Counter()
+        self._counters = Losses(log)
         self._reported: dict[str, int] = {}
         self._copies = Copies()
-        self._warned: set[tuple[str, ...]] = set()
         self._pending_bytes = 0
         self._types: frozenset[str] = frozenset()
         self._link_task: asyncio.Task[None] | None = None
@@ -217,12 +217,12 @@ class Gateway:
         elif self.node.deliver(sender, message_type, data):
             self._counters["delivered_here"] += 1
         else:
-            self._counters["unregistered"] += 1
-            self._warn(f"nobody here has registered {message_type!r}; {sender} sent one", "unregistered", message_type)
+            text = "nobody here has registered %r; %s sent one"
+            self._counters.once("unregistered", text, message_type, sender, about=message_type)
 
     def _refused(self, receiver: str, message_type: str, error: MacsError) -> None:
-        self._counters["invalid"] += 1
-        self._warn(f"a module's message was not sent: {error}", "invalid", receiver, message_type)
+        about = f"{message_type} to {receiver}"
+        self._counters.once("invalid", "a module's message was not sent: %s", error, about=about)
         self.node.say_undelivered(receiver, message_type, str(error))
 
     def _outcome(self, receiver: str, message_type: str, outcome: Outcome) -> None:
@@ -230,13 +230,10 @@ class Gateway:
             return
         if self.on_topic and not receiver:
             return  # on the plain topic it may have reached somebody
-        self._warn(f"{message_type!r} to {receiver or 'all'!r}: {outcome.value}", outcome.name, receiver, message_type)
+        about = f"{message_type!r} to {receiver or 'all'!r}"
+        # the link has counted it
+        self._counters.once(outcome.counter, "%s: %s", about, outcome.value, about=about, count=0)
         self.node.say_undelivered(receiver, message_type, outcome.value)
-
-    def _warn(self, text: str, *about: str) -> None:
-        if about not in self._warned and len(self._warned) < 1000:
-            self._warned.add(about)
-            log.warning("%s; more of this is counted, not logged", text)
 
     def _agents_changed(self) -> None:
         self.node.say_agents(json.dumps(self._link.others(), ensure_ascii=False))

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from typing import Protocol, cast
 
+from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.addresses import joined, of_peer
 from macs_zenoh.protocol.budget import Toll
 from macs_zenoh.protocol.decoders import FrameDecoder
@@ -129,7 +130,7 @@ class Connection(asyncio.BufferedProtocol):
         self.pace: Pace
         self.greeted = False
         self.host = self.address = "?"
-        self.drops: Counter[str] = Counter()
+        self.drops = Losses(log)
         self._outbox = Outbox(outbox_bytes)
         self._memory = memory
         self._write_timeout_s = write_timeout_s
@@ -137,7 +138,6 @@ class Connection(asyncio.BufferedProtocol):
         self._writer = Writer(self._outbox)
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
-        self._complained: set[str] = set()
         self._nodes: dict[str, set[int]] = {}
         self._depths: dict[str, tuple[int, bool]] = {}
         """How many messages of a topic may wait, and whether new ones are dropped rather than old ones, by node."""
@@ -511,13 +511,11 @@ class Connection(asyncio.BufferedProtocol):
 
     def complain(self, name: str, problem: str, count: int = 1) -> None:
         """Count what was dropped; the first of a kind is logged."""
-        self.drops[name] += count
-        self._warn_once(name, problem)
+        self.drops.once(name, "%s: %s", self, problem, count=count)
 
     def _warn_once(self, name: str, problem: str) -> None:
-        if name not in self._complained:
-            self._complained.add(name)
-            log.warning("%s: %s (logged once, counted as %s)", self, problem, name)
+        """Log the first of what is counted elsewhere."""
+        self.drops.once(name, "%s: %s", self, problem, count=0)
 
     def close(self, reason: str) -> None:
         """Send what is gathered, then FIN."""

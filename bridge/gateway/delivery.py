@@ -7,11 +7,11 @@ and sizes that do not add up. So every sample is checked here again, whoever put
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from macs_zenoh.errors import WireError
+from macs_zenoh.losses import Losses
 from macs_zenoh.mesh import Payload, Sample
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import Directory
@@ -95,7 +95,7 @@ class Delivery:
     def __init__(
         self, agents: Agents, directory: Directory, layout: Layout, stead: Stead, judged: JudgedFrames, afar: Afar
     ) -> None:
-        self.drops: Counter[str] = Counter()
+        self.drops = Losses(log)
         self._agents = agents
         self._directory = directory
         self._stead = stead
@@ -354,10 +354,8 @@ class Delivery:
         if verdict.name == "wrong_node_type":
             connection.complain(verdict.name, verdict.why, frame.count)
             return
-        if not self.drops["not_registered"]:
-            problem = "%s lists %s as a receiver of %s, registered nowhere (logged once, counted as not_registered)"
-            log.warning(problem, _who(metadata), connection, metadata.node_name[:80])
-        self.drops["not_registered"] += frame.count
+        problem, node = "%s lists %s as a receiver of %s, registered nowhere", metadata.node_name[:80]
+        self.drops.once("not_registered", problem, _who(metadata), connection, node, count=frame.count)
 
     def _find(self, key: str) -> tuple[Connection, AgentKey] | None:
         """Who of ours a frame is for, and who sent it."""
@@ -487,16 +485,11 @@ class Delivery:
         return frame.with_metadata(true if readable else metadata.encode()), metadata
 
     def _wrong_sender(self, key: str, named: tuple[int | None, int | None], count: int) -> None:
-        if not self.drops["wrong_sender"]:
-            who = "nobody" if None in named else AgentId(named[0] or 0, named[1] or 0)
-            problem = "a frame on %s names %s as its sender: put right (logged once, counted as wrong_sender)"
-            log.warning(problem, key, who)
-        self.drops["wrong_sender"] += count
+        who = "nobody" if None in named else AgentId(named[0] or 0, named[1] or 0)
+        self.drops.once("wrong_sender", "a frame on %s names %s as its sender: put right", key, who, count=count)
 
     def _bad(self, key: str, error: WireError) -> None:
-        self.drops["bad_frame"] += 1
-        if self.drops["bad_frame"] == 1:
-            log.warning("a frame on %s cannot be used: %s (logged once, counted as bad_frame)", key, error)
+        self.drops.once("bad_frame", "a frame on %s cannot be used: %s", key, error)
 
 
 def _fits(frame: Frame, metadata: Metadata) -> bool:

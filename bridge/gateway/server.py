@@ -18,6 +18,7 @@ from msgspec import structs
 from bridge.listening import bound, for_others
 from bridge.settings import GatewaySettings
 from macs_zenoh.errors import Refused, Unreachable, UsageError
+from macs_zenoh.losses import Losses
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Subscription
 from macs_zenoh.presence import Presence
@@ -106,7 +107,7 @@ class Gateway:
         self.port = 0
         self.agents = Agents()
         self._presence = Presence(mesh, self._tell, lambda contested: self._renumbering.contested(contested))
-        self._drops: Counter[str] = Counter()
+        self._drops = Losses(log)
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
         self._limits = Limits(
             max_frame_bytes=settings.max_frame_bytes,
@@ -206,10 +207,8 @@ class Gateway:
 
     def _turned_away(self, whom: str) -> None:
         """There was no descriptor for a connection."""
-        self._drops["no_descriptors"] += 1
-        if self._drops["no_descriptors"] == 1:
-            problem = "%s: turned away, for there are no descriptors left (ulimit -n; logged once, counted as %s)"
-            log.error(problem, whom, "no_descriptors")
+        problem = "%s: turned away, for there are no descriptors left (ulimit -n)"
+        self._drops.once("no_descriptors", problem, whom, level=logging.ERROR)
 
     @property
     def address(self) -> str:
@@ -266,9 +265,7 @@ class Gateway:
         refusal = self._admission.judge(connection.host)
         if refusal is not None:
             name, why = refusal
-            self._drops[name] += 1
-            if self._drops[name] == 1:
-                log.warning("%s is refused: %s (logged once, counted as %s)", connection.address, why, name)
+            self._drops.once(name, "%s is refused: %s", connection.address, why)
             return False
         self._admission.enter(connection.host)
         self._waiting.enter(connection)
@@ -312,9 +309,7 @@ class Gateway:
         """There was no id for a connection in time. It cannot be told: agents give up when anything comes before their
         id, and they are waiting for that."""
         self._waiting.leave(connection)
-        self._drops["no_id"] += 1
-        if self._drops["no_id"] == 1:
-            log.warning("%s leaves: there is no id for it (logged once, counted as no_id)", connection.address)
+        self._drops.once("no_id", "%s leaves: there is no id for it", connection.address)
         connection.abort()
 
     def _block_leased(self, block: int) -> None:
@@ -333,10 +328,8 @@ class Gateway:
             self._waiting.leave(connection)
             return
         if connection.peer.dials_a_router:
-            self._drops["zenoh_program"] += 1
-            if self._drops["zenoh_program"] == 1:
-                what = "%s is a Zenoh program: it wants a router, and this is a gateway (logged once, counted as %s)"
-                log.warning(what, connection.address, "zenoh_program")
+            what = "%s is a Zenoh program: it wants a router, and this is a gateway"
+            self._drops.once("zenoh_program", what, connection.address)
         self._forwarding.leave(connection)
         self._online_reply = b""
         self._drops += connection.all_drops()

@@ -6,7 +6,6 @@ import asyncio
 import logging
 import re
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -23,6 +22,7 @@ from bridge.ros.session import RosSession
 from bridge.ros.types import InterfaceName
 from macs_zenoh.config import Priority
 from macs_zenoh.errors import HeldByAnother, Refused
+from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.keyexpr import type_name, type_number
 from macs_zenoh.protocol.messages import ROS, AddNode, Metadata, NodeType, RemoveNode, encode_data
@@ -48,7 +48,7 @@ class Registrant(AgentId):
         return cls(type_number(message.sender_type), message.sender_id)
 
 
-class Drops(Counter[str]):
+class Drops(Losses):
     """What was lost, by name.
 
     ``no_node`` data for a node that is not registered; ``held_full`` data before its registration, more than is kept;
@@ -60,19 +60,8 @@ class Drops(Counter[str]):
     above its allowance; ``too_old`` commands that have waited on their way.
     """
 
-    LOGGED = 1000
-    """Names come from the network, so what is remembered of them is bounded."""
-
     def __init__(self) -> None:
-        super().__init__()
-        self._logged: set[tuple[str, str]] = set()
-
-    def note(self, name: str, about: str, text: str, count: int = 1) -> None:
-        """Count a loss; log it the first time it concerns ``about``."""
-        self[name] += count
-        if (name, about) not in self._logged and len(self._logged) < self.LOGGED:
-            self._logged.add((name, about))
-            log.warning("%s: %s (logged once, counted as %s)", about, text, name)
+        super().__init__(log)
 
 
 @dataclass(eq=False)

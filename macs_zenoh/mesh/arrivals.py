@@ -12,6 +12,7 @@ from typing import Any
 
 import zenoh
 
+from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.guard import Gate
 
 from .declared import Aged, AtOnce, OnAged, OnBatch, OnNumbered, Payload, Sample
@@ -73,7 +74,7 @@ class Arrivals:
         self,
         loop: asyncio.AbstractEventLoop,
         wake: Callable[[Callable[[], None]], None],
-        drops: Counter[str],
+        drops: Losses,
         loopback: Loopback,
     ) -> None:
         self._drops = drops
@@ -309,11 +310,9 @@ class Arrivals:
             try:
                 on_batch(samples)
                 return asked or self._handled is not None
-            except Exception:
-                self._drops["failed_sample"] += 1
-                if self._drops["failed_sample"] == 1:
-                    where = self._handled[0] if self._handled else "no key"
-                    log.exception("a sample on %s failed (logged once, counted as failed_sample)", where)
+            except Exception:  # noqa: BLE001 - it is logged
+                where = self._handled[0] if self._handled else "no key"
+                self._drops.once("failed_sample", "a sample on %s failed", where, level=logging.ERROR, exc_info=True)
                 if self._handled is None:
                     return asked
                 asked = True
@@ -347,10 +346,8 @@ class Arrivals:
 
     def _behind(self, name: str) -> None:
         """Count a sample for which there was no room."""
-        self._drops[name] += 1
-        if self._drops[name] == 1:
-            what = "topic data comes" if name == "topics_behind" else "messages come"
-            log.warning("%s faster than this program handles it: dropped (logged once, counted as %s)", what, name)
+        what = "topic data comes" if name == "topics_behind" else "messages come"
+        self._drops.once(name, "%s faster than this program handles it: dropped", what)
 
     def _takes_room_for(self, size: int) -> bool:
         """The same without waiting, for any payload."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -17,6 +16,7 @@ import zenoh
 from macs_zenoh.config import MeshSettings, Priority, TrafficRule
 from macs_zenoh.errors import ConfigError, Unreachable
 from macs_zenoh.handles import Callbacks, Handle
+from macs_zenoh.losses import Losses
 from macs_zenoh.protocol import ping
 from macs_zenoh.protocol.directory import published
 from macs_zenoh.protocol.guard import Gate
@@ -65,7 +65,7 @@ class Mesh:
         backlog_bytes: int = 64 << 20,
     ) -> None:
         self.settings = settings
-        self.drops: Counter[str] = Counter()
+        self.drops = Losses(log)
         self.policer = Policer(traffic, self.drops)
         own = str(session.zid())
         self.id_is_chosen = id_is_chosen(settings)
@@ -77,7 +77,6 @@ class Mesh:
         end_on_panics(self._loop)
         self._loopback = Loopback()
         self._arrivals = Arrivals(self._loop, self._from_thread, self.drops, self._loopback)
-        self._missed: set[str] = set()
         self._recovered: set[Recovered] = set()
         self._needs_router = settings.mode == "client"
         self.linked = not self._needs_router
@@ -345,11 +344,8 @@ class Mesh:
         return Subscription(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
     def _lost(self, on_miss: OnMiss | None, key: str, count: int) -> None:
-        self.drops["missed"] += count
-        if key not in self._missed and len(self._missed) < self.PUBLISHERS:
-            self._missed.add(key)
-            text = "%s: %d lost, which the source has no more, or does not send again (logged once, counted as missed)"
-            log.warning(text, key, count)
+        text = f"{count} lost, which the source has no more, or does not send again"
+        self.drops.note("missed", key, text, count)
         if on_miss is not None:
             on_miss(key, count)
 
