@@ -8,6 +8,9 @@ once the stop wins (`safety.EmergencyStop.adopt`).
 On the stop's own topic any ROS node can stop the robot, as a button does: true. Its false releases nothing, that is a
 right of agents on the mesh. The node need not stay: one that publishes and ends has stopped the robot.
 
+Whatever quality of service it offers: ROS brings a subscription that asks for more than a publisher offers nothing at
+all, so there is one that asks for what was said before, one for all that is said, and one for what comes.
+
 What agents publish there themselves is no button's. An agent knows its own messages by the time at which they were
 published. Of other agents on the graph it only knows that they are there: as long as the topic has more publishers
 than the graph has agents, a true can be a button's; if not, it is one when no agent has said why within a moment.
@@ -25,7 +28,7 @@ from typing import Any
 
 import msgspec
 from msgspec import Struct
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
 from bridge.ros.interface import Robot, ros_errors
@@ -43,6 +46,12 @@ EXPLAINED_S = 0.1
 """How long before or after a message on the topic of the stop another agent may say that it was its own."""
 UNREAD = 256
 """More messages of our own do not wait to be read."""
+ASKED = (
+    QoSProfile(depth=KNOWN, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+    QoSProfile(depth=KNOWN),
+    QoSProfile(depth=KNOWN, reliability=ReliabilityPolicy.BEST_EFFORT),
+)
+"""What is asked of publishers on the topic of the stop: what they hold; reliable; anything."""
 
 
 PRESSED = b"\x01"
@@ -84,6 +93,8 @@ class SharedStop:
         self._agents: dict[str, int] = {}
         self._own: deque[list[float]] = deque(maxlen=UNREAD)
         """From when to when each of our own messages was published, in ns since the epoch."""
+        self._heard: deque[int] = deque(maxlen=UNREAD)
+        """When presses were published that have been heard: each comes by several subscriptions."""
         self._stopped_at = -math.inf
         """When another agent said last that the robot is stopped."""
         self._text: Any = None
@@ -98,7 +109,7 @@ class SharedStop:
             self._publisher = session.node.create_publisher(self._text, self._topic + AGENTS, latched)
             self._subscriptions = [
                 session.intake.subscribe(self._text, self._topic + AGENTS, self._told, _latched(KNOWN)),
-                session.intake.subscribe(self._kind, self._topic, self._pressed, _latched(KNOWN)),
+                *(session.intake.subscribe(self._kind, self._topic, self._said, asked) for asked in ASKED),
             ]
 
     def close(self) -> None:
@@ -169,9 +180,11 @@ class SharedStop:
                 state.robot,
             )
 
-    def _pressed(self, cdr: bytes, info: Mapping[str, Any]) -> None:
-        if bytes(cdr[4:5]) != PRESSED or self._is_own(info["source_timestamp"]):
+    def _said(self, cdr: bytes, info: Mapping[str, Any]) -> None:
+        published_ns = info["source_timestamp"]
+        if bytes(cdr[4:5]) != PRESSED or self._is_own(published_ns) or published_ns in self._heard:
             return
+        self._heard.append(published_ns)
         count = self._robot.session.node.count_publishers
         agents = count(self._topic + AGENTS)
         if agents <= 1:

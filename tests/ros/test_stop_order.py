@@ -6,11 +6,12 @@ import asyncio
 import threading
 import time
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from typing import Any
 
 import pytest
 from geometry_msgs.msg import Twist
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool, String
 from test_agent import ROBOT, headset, robot, router  # noqa: F401 - fixtures
 
@@ -98,6 +99,30 @@ async def test_a_press_during_our_own_release_counts(nodes: InterfaceNodes, stop
     stop._publisher = stop._publisher._publisher
     await until(lambda: nodes.robot.stop.stopped)
     assert nodes.robot.stop.pressed == [A_NODE]
+
+
+BUTTONS = {
+    "latched": LATCHED,
+    "as nodes do by default": QoSProfile(depth=10),
+    "best effort": QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT),
+}
+
+
+@pytest.mark.parametrize("button", BUTTONS)
+async def test_a_button_stops_whatever_it_offers(
+    button: str, nodes: InterfaceNodes, stop: StopNode, peer: Peer
+) -> None:
+    """Each press counts, once: after a release nothing of it comes back, and the next one stops again."""
+    publisher = await peer.publisher(Bool, TOPIC, BUTTONS[button], matched=1)
+    for times in (1, 2, 3):
+        while nodes.robot.stop.times < times:  # one way may lose it
+            publisher.publish(Bool(data=True))
+            with suppress(AssertionError):
+                await until(lambda times=times: nodes.robot.stop.times == times, 2)
+        assert nodes.robot.stop.pressed == [A_NODE]
+        stop.release("operator/5")
+        await asyncio.sleep(0.3)
+        assert not nodes.robot.stop.stopped
 
 
 async def test_a_node_that_fails_stops_no_others_stop(nodes: InterfaceNodes, stop: StopNode, peer: Peer) -> None:
