@@ -23,6 +23,8 @@ class Figure:
     unit: str
     at_least: float | None = None
     at_most: float | None = None
+    column: str = ""
+    """Lines of one name and several columns stand side by side on a page."""
 
     @property
     def value(self) -> float:
@@ -64,6 +66,7 @@ class Figure:
         """The line for programs."""
         return {
             "name": self.name,
+            "column": self.column,
             "unit": self.unit,
             "value": self.value,
             "against": self.against,
@@ -90,11 +93,37 @@ def table(figures: Sequence[Figure]) -> str:
     )
 
 
+def markdown(figures: Sequence[Figure]) -> str:
+    """The same as tables of a page."""
+    plain = [figure for figure in figures if not figure.column]
+    beside = [figure for figure in figures if figure.column]
+    return "\n\n".join([*([_plain(plain)] if plain else []), *([_side_by_side(beside)] if beside else [])])
+
+
+def _side_by_side(figures: Sequence[Figure]) -> str:
+    columns = list(dict.fromkeys(figure.column for figure in figures))
+    cells = {(figure.name, figure.column): f"{_number(figure.value)} {figure.unit}" for figure in figures}
+    rows = [["", *columns], ["---", *("---:" for _ in columns)]]
+    for name in dict.fromkeys(figure.name for figure in figures):
+        rows.append([name, *(cells.get((name, column), "") for column in columns)])
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
+def _plain(figures: Sequence[Figure]) -> str:
+    rows = [("figure", "value", "against", "ratio", "rounds", "goal"), ("---", "---:", "---", "---:", "---", "---")]
+    for figure in figures:
+        name, value, baseline, against, unit, ratio, rounds, target, verdict = _row(figure)
+        rows.append(
+            (name, f"{value} {unit}", f"{baseline} {against}", ratio, rounds.strip("()"), f"{target} {verdict}")
+        )
+    return "\n".join("| " + " | ".join(cell.strip() for cell in row) + " |" for row in rows)
+
+
 def _row(figure: Figure) -> tuple[str, ...]:
     low, high = figure.spread
     verdict = {None: "", True: "ok", False: "MISSED"}[figure.met]
     return (
-        figure.name,
+        f"{figure.column}, {figure.name}" if figure.column else figure.name,
         _number(figure.value),
         _number(figure.reference),
         figure.against,

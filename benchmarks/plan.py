@@ -27,6 +27,8 @@ class Plan:
     delivered: int = 0
     lost: int = 0
     lost_where: list[str] = field(default_factory=list)
+    peers: dict[str, str] = field(default_factory=dict)
+    """Where other programs listen, by their names."""
 
     def count(self, size: int, fan_out: int = 1) -> int:
         """How many messages of a size make one measurement: about half a second, at least 8."""

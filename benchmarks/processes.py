@@ -63,6 +63,18 @@ class Program:
         """Its process id."""
         return self._process.pid
 
+    @property
+    def used_s(self) -> float:
+        """CPU time that it has taken so far, in user and kernel."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    @property
+    def memory_mb(self) -> float:
+        """What it has resident."""
+        pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
     def line(self, timeout_s: float = START_S) -> str:
         """The next line of its output. Raises ProgramFailed when there is none in time."""
         try:
@@ -82,9 +94,9 @@ class Program:
         except BrokenPipeError:
             raise ProgramFailed(f"{self.name} has ended\n{self.log_tail()}") from None
 
-    def answer(self) -> Answer:
-        """A worker's next result. Raises ProgramFailed when it has none within ``RUN_S``."""
-        answer: Answer = json.loads(self.line(RUN_S))
+    def answer(self, takes_s: float = 0.0) -> Answer:
+        """A worker's next result. Raises ProgramFailed when it has none within ``RUN_S`` beyond what it takes."""
+        answer: Answer = json.loads(self.line(takes_s + RUN_S))
         return answer
 
     def ask(self, do: str, **arguments: object) -> Answer:
@@ -124,6 +136,7 @@ class Stage:
 
     def __init__(self, profile_into: Path | None = None) -> None:
         self.programs: list[Program] = []
+        self._said: list[str] = []
         self._profile_into = profile_into
         self._gateways = 0
 
@@ -133,19 +146,19 @@ class Stage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """End all that runs."""
         while self.programs:
             program = self.programs.pop()
             program.stop()
+            self._said += _warnings(program)
             program.log.close()
 
     def warnings(self) -> list[str]:
         """What the programs of ours had to say about losses and disconnects."""
-        return [
-            line
-            for program in self.programs
-            for line in program.log_tail(1000).splitlines()
-            if re.search(r"\b[WE] macs\.|lost in all", line)
-        ]
+        return [*self._said, *(line for program in self.programs for line in _warnings(program))]
 
     def router(self) -> int:
         """Start ``macs router``; returns its port on 127.0.0.1."""
@@ -176,6 +189,10 @@ class Stage:
         program = Program(name, *arguments)
         self.programs.append(program)
         return program
+
+
+def _warnings(program: Program) -> list[str]:
+    return [line for line in program.log_tail(1000).splitlines() if re.search(r"\b[WE] macs\.|lost in all", line)]
 
 
 def free_port() -> int:

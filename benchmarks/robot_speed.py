@@ -77,7 +77,7 @@ class Site:
 
     def run(self, path: str, size: int, hz: float, seconds: float) -> dict[str, Any]:
         """Send on a path at a rate: how many were sent and arrived, and the latencies there."""
-        sender, receiver, topic = self._ends(path)
+        sender, receiver, topic = self.ends(path)
         count = max(10, int(hz * seconds))
         with self._cores_awake():
             receiver.tell("collect", count=count, quiet_s=QUIET_S + size / 1e6)
@@ -85,7 +85,8 @@ class Site:
             answer = receiver.answer()
         return {**answer, "sent": count, "lost": count - answer["got"], "hz": count / max(took["took_s"], 1e-9)}
 
-    def _ends(self, path: str) -> tuple[Program, Program, str]:
+    def ends(self, path: str) -> tuple[Program, Program, str]:
+        """Who sends and who receives on a path, and its topic."""
         return {
             "plain": (self.publisher, self.subscriber, "/plain"),
             "to headset": (self.publisher, self.headset, "/robot"),
@@ -146,16 +147,9 @@ def highest_rate(site: Site, path: str, seconds: float) -> float:
 def idle(agent: Program) -> dict[str, float]:
     """What the agent needs while nothing is sent: share of one core, MB resident."""
 
-    def used_s() -> float:
-        with open(f"/proc/{agent.pid}/stat", encoding="ascii") as stat:  # noqa: PTH123
-            fields = stat.read().rpartition(") ")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-    before = used_s()
+    before = agent.used_s
     time.sleep(IDLE_S)
-    with open(f"/proc/{agent.pid}/statm", encoding="ascii") as statm:  # noqa: PTH123
-        pages = int(statm.read().split()[1])
-    return {"cpu_percent": 100 * (used_s() - before) / IDLE_S, "mb": pages * os.sysconf("SC_PAGE_SIZE") / 1e6}
+    return {"cpu_percent": 100 * (agent.used_s - before) / IDLE_S, "mb": agent.memory_mb}
 
 
 # -- cases ---------------------------------------------------------------------------------------------------------

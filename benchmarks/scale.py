@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 from .figures import Figure
 from .plan import Case, Plan
@@ -36,19 +34,19 @@ def scale(stage: Stage, plan: Plan) -> Iterator[Figure]:
 def _round(stage: Stage, robots: Program, gateway: Program, port: int, number: int) -> dict[str, float]:
     """Microseconds of CPU that the gateway took for each headset."""
     robots.ask("forget")
-    began = _used_s(gateway)
+    began = gateway.used_s
     crowd, _ = stage.worker("headset", port, number, 0)
     _wait(robots, "headsets", number)
-    joined = _used_s(gateway)
+    joined = gateway.used_s
     costs = {"join": joined - began}
     if number != JOINS:
         crowd.ask("register", robots=ROBOTS)
         _wait(robots, "registered", number * ROBOTS)
-        costs["register"] = _used_s(gateway) - joined
-    before = _used_s(gateway)
+        costs["register"] = gateway.used_s - joined
+    before = gateway.used_s
     crowd.stop()
     _wait(robots, "headsets", 0)
-    costs["leave"] = _used_s(gateway) - before
+    costs["leave"] = gateway.used_s - before
     return {what: used_s * 1e6 / number for what, used_s in costs.items()}
 
 
@@ -59,12 +57,6 @@ def _wait(robots: Program, what: str, number: int) -> None:
             raise ProgramFailed(f"{now} of {number} {what}\n{robots.log_tail()}")
         time.sleep(0.02)
     time.sleep(REST_S)
-
-
-def _used_s(program: Program) -> float:
-    """CPU time that a program has taken so far, in user and kernel."""
-    fields = Path(f"/proc/{program.pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 CASES: dict[str, Case] = {"scale": scale}

@@ -89,7 +89,11 @@ class Arrivals:
         self._handled: tuple[Any, ...] | None = None
         """The sample that is being handled."""
         self._large_bytes = 0
+        """Of large payloads: how much other threads have put here in all."""
         self._large_lock = threading.Lock()
+        """For that alone: what the loop's thread has put and taken out it counts by itself."""
+        self._looped_large_bytes = 0
+        self._taken_large_bytes = 0
         self._turn = threading.Lock()
         self._handing_over = False
         """Whether the loop has the turn."""
@@ -239,7 +243,7 @@ class Arrivals:
         there for others calls this after each put, and goes on when there is room. Nothing within a handler."""
         if self._handing_over:
             return
-        if self.looped > self.LOOPED or (self.looped and self._large_bytes > self.LIMIT_BYTES // 4):
+        if self.looped > self.LOOPED or (self.looped and self._large_waiting > self.LIMIT_BYTES // 4):
             self._deliver_now()
 
     def _deliver(self) -> None:
@@ -280,8 +284,7 @@ class Arrivals:
             self.looped -= looped
             size = len(sample[1])
             if size > self.LARGE_BYTES:
-                with self._large_lock:
-                    self._large_bytes -= size
+                self._taken_large_bytes += size
             self._handled = sample
             yield sample
             unwatched -= size + self.SAMPLE_BYTES
@@ -334,15 +337,22 @@ class Arrivals:
         """Take room for a large payload; for the loop's own thread there is as much again."""
         most = self.LIMIT_BYTES - size
         if looped:
-            room = self._large_bytes <= most + self.LIMIT_BYTES
-        else:
-            room = self._patiently(lambda: self._large_bytes == 0 or self._large_bytes <= most)
-        if not room:
+            if self._large_waiting > most + self.LIMIT_BYTES:
+                self._behind("loop_behind")
+                return False
+            self._looped_large_bytes += size
+            return True
+        if not self._patiently(lambda: not self._large_waiting or self._large_waiting <= most):
             self._behind("loop_behind")
             return False
         with self._large_lock:
             self._large_bytes += size
         return True
+
+    @property
+    def _large_waiting(self) -> int:
+        """How much of large payloads waits."""
+        return self._large_bytes + self._looped_large_bytes - self._taken_large_bytes
 
     def _behind(self, name: str) -> None:
         """Count a sample for which there was no room."""
@@ -354,7 +364,7 @@ class Arrivals:
         if size <= self.LARGE_BYTES:
             return True
         with self._large_lock:
-            if self._large_bytes and self._large_bytes + size > self.LIMIT_BYTES:
+            if self._large_waiting and self._large_waiting + size > self.LIMIT_BYTES:
                 return False
             self._large_bytes += size
         return True

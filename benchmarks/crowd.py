@@ -1,0 +1,133 @@
+"""Many headsets and many robots on one gateway, with everything at once: what each message takes, and what is lost."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from .figures import Figure
+from .plan import Case, Plan
+from .processes import ProgramFailed, Stage
+
+SIZES = ((10, 5), (100, 20), (1000, 50))
+SMALLEST = "{} x {}".format(*SIZES[0])
+SECONDS = 20.0
+"""How long each size is measured."""
+MIXED = (20, 5)
+MIXED_S = 600.0
+REST_S = 0.5
+LATENCIES = ("p50_ms", "p99_ms")
+
+
+class Crowd:
+    """A gateway with headsets, and robots on its router. ``joined_s`` is how long headsets took to be seen."""
+
+    def __init__(self, stage: Stage, headsets: int, robots: int) -> None:
+        self._number = headsets
+        router = stage.router()
+        self.gateway_port = stage.gateway(router)
+        self.gateway = next(program for program in stage.programs if program.name == "gateway")
+        self.robots, _ = stage.worker("crowd_ends", "robots", router, robots)
+        self.headsets, _ = stage.worker("crowd_ends", "headsets", self.gateway_port, headsets)
+        self.joined = self._counted("join", headsets=headsets)
+        registered = self.headsets.ask("register", robots=robots)["registered"]
+        self._wait(registered=registered)
+
+    def leave(self) -> Cost:
+        """All headsets go."""
+        return self._counted("leave", headsets=0)
+
+    def run(self, seconds: float, *, mixed: bool = False) -> tuple[dict[str, Any], float]:
+        """Everybody sends for so long: what was due and what came, by kind, and the gateway's CPU in per cent."""
+        time.sleep(REST_S)
+        began, used = time.monotonic(), self.gateway.used_s
+        until = began + seconds
+        self.robots.tell("run", until=until)
+        self.headsets.tell("run", until=until, mixed=mixed)
+        while time.monotonic() < until:
+            time.sleep(0.1)
+        percent = 100 * (self.gateway.used_s - used) / (time.monotonic() - began)
+        there, here = self.robots.answer(seconds), self.headsets.answer(seconds)
+        due = {**there["due"], **here["sent"]}
+        came = {**there["times"], **here["times"]}
+        return {kind: {"due": due[kind], "got": 0, "late": 0, **came.get(kind, {})} for kind in due}, percent
+
+    def _counted(self, do: str, **wanted: int) -> Cost:
+        began, used = time.monotonic(), self.gateway.used_s
+        self.headsets.ask(do)
+        took_s = self._wait(**wanted) - began
+        time.sleep(REST_S)  # what follows it
+        return Cost(took_s * 1e3 / self._number, (self.gateway.used_s - used) * 1e3 / self._number)
+
+    def _wait(self, **wanted: int) -> float:
+        """Until robots see so many; when that was."""
+        deadline = time.monotonic() + 60
+        while True:
+            there, now = self.robots.ask("count"), time.monotonic()
+            if all(there[what] == number for what, number in wanted.items()):
+                return now
+            if now > deadline:
+                raise ProgramFailed(f"{there} instead of {wanted}\n{self.robots.log_tail()}")
+            time.sleep(0.01)
+
+
+class Cost(NamedTuple):
+    """Of each headset, in ms."""
+
+    took_ms: float
+    cpu_ms: float
+
+
+def crowd(stage: Stage, plan: Plan) -> Iterator[Figure]:
+    """Headsets x robots: pose 100 Hz 100 B, images 30 Hz 64 KiB, commands 50 Hz together: latency, loss, CPU, MB."""
+    first: dict[str, float] = {}
+    for headsets, robots in SIZES:
+        for name, value, unit in _measured(Crowd(stage, headsets, robots), plan):
+            base = first.setdefault(name, value)
+            yield Figure(name, [value], [base], SMALLEST, unit, column=f"{headsets} x {robots}")
+        stage.clear()
+
+
+def _measured(crowd: Crowd, plan: Plan) -> Iterator[tuple[str, float, str]]:
+    kinds, percent = crowd.run(SECONDS * plan.scale)
+    for kind, found in sorted(kinds.items()):
+        plan.arrived(f"crowd, {kind}", found["due"], found["got"])
+        for latency in LATENCIES:
+            yield f"{kind} {latency.removesuffix('_ms')}", found.get(latency, math.inf), "ms"
+        yield f"{kind} lost", found["due"] - found["got"], f"of {found['due']}"
+        yield f"{kind} out of order", found["late"], "messages"
+    yield "gateway, CPU", percent, "% of a core"
+    yield "gateway, memory", crowd.gateway.memory_mb, "MB"
+    yield "join", crowd.joined.took_ms, "ms each"
+    yield "join, CPU", crowd.joined.cpu_ms, "ms each"
+    left = crowd.leave()
+    yield "leave", left.took_ms, "ms each"
+    yield "leave, CPU", left.cpu_ms, "ms each"
+
+
+def mixed(stage: Stage, plan: Plan) -> Iterator[Figure]:
+    """Ten minutes of topics, images, commands, requests, group messages, joins and departures; is memory flat?"""
+    headsets, robots = MIXED
+    crowd = Crowd(stage, headsets, robots)
+    seconds = MIXED_S * plan.scale
+    parts = 5
+    crowd.run(min(10.0, seconds / parts), mixed=True)  # what is allocated once
+    before = crowd.gateway.memory_mb
+    for part in range(1, parts + 1):
+        kinds, percent = crowd.run(seconds / parts, mixed=True)
+        for kind, found in sorted(kinds.items()):
+            plan.arrived(f"mixed, {kind}, part {part}", found["due"], found["got"])
+        command = kinds["command"]
+        name = f"mixed, {part} of {parts}"
+        yield Figure(f"{name}, commands p99", [command["p99_ms"]], [3.0], "limit", "ms", at_most=1.0)
+        yield Figure(f"{name}, commands p50", [command["p50_ms"]], [3.0], "limit", "ms")
+        yield Figure(
+            f"{name}, gateway, memory", [crowd.gateway.memory_mb], [before], "at the start", "MB", at_most=1.05
+        )
+        yield Figure(f"{name}, gateway, CPU", [percent], [100.0], "a core", "%")
+
+
+CASES: dict[str, Case] = {"crowd": crowd, "mixed": mixed}
+"""What needs no ROS, but minutes."""
