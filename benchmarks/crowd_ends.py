@@ -97,6 +97,7 @@ class Robot:
         agent.serve("add_node", self._add)
         agent.serve("remove_node", self._remove)
         agent.on_message(self._take)
+        agent.on_presence(self._presence)
 
     async def _add(self, call: macs_zenoh.Call) -> bytes:
         node = decode_data(AddNode, call.data)
@@ -107,6 +108,11 @@ class Robot:
         node = decode_data(RemoveNode, call.data)
         self.registrants[node.node_name].discard(node.registrant_agent_id)
         return b""
+
+    def _presence(self, agent: macs_zenoh.AgentInfo, online: bool) -> None:
+        if agent.type == UNITY and not online:
+            for registrants in self.registrants.values():
+                registrants.discard(agent.id)
 
     def _take(self, message: macs_zenoh.Message) -> None:
         if message.data[:1] == b"{":
