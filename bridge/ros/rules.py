@@ -1,14 +1,8 @@
-"""What a robot's settings say about a topic, service or action, by its full name. Pure.
-
-As in a shell, wildcards do not reach what is hidden: a level that begins with ``_``, as ROS hides its own, is matched
-only by a pattern that spells the ``_``.
-"""
+"""What a robot's settings say about a topic, service or action, by its full name. Pure."""
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Iterable
-from functools import lru_cache
 
 from msgspec import structs
 
@@ -16,25 +10,9 @@ from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.keyexpr import block_of, type_name
 from macs_zenoh.protocol.messages import UNITY
+from macs_zenoh.protocol.name_patterns import matches
 
 DEFAULT_HOLD_S = 3.0
-
-
-@lru_cache(maxsize=4096)
-def matches(pattern: str, name: str) -> bool:
-    """Whether a full name fits a pattern: ``*`` within one level, ``**`` any number of levels, also none."""
-    return _matches(pattern.split("/"), name.split("/"))
-
-
-def _matches(pattern: list[str], name: list[str]) -> bool:
-    if not pattern:
-        return not name
-    head, rest = pattern[0], pattern[1:]
-    if head == "**":
-        return _matches(rest, name) or (bool(name) and not name[0].startswith("_") and _matches(pattern, name[1:]))
-    if not name or (name[0].startswith("_") and not head.startswith("_")):
-        return False
-    return fnmatch.fnmatchcase(name[0], head) and _matches(rest, name[1:])
 
 
 class Rules:

@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from macs_zenoh.config import Priority
 from macs_zenoh.protocol.guard import STOP_TOPIC
+from macs_zenoh.protocol.name_patterns import PATTERN
 from macs_zenoh.sections import AgentId, Bytes, GroupId, Seconds, Section, in_words
 
 from .agents import AgentPattern, names_agents
@@ -16,7 +17,7 @@ from .agents import AgentPattern, names_agents
 NamePattern = Annotated[
     str,
     Meta(
-        pattern=r"^(/[A-Za-z0-9_*]+)+$",
+        pattern=PATTERN,
         max_length=256,
         extra=in_words("a full name that begins with /, as /camera/image, /camera/* or /camera/**"),
     ),

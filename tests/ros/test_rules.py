@@ -9,25 +9,9 @@ from geometry_msgs.msg import Twist
 from std_srvs.srv import SetBool
 
 from bridge.ros import fields
-from bridge.ros.rules import Rules, matches, names_agent
+from bridge.ros.rules import Rules, names_agent
 from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
-
-
-@pytest.mark.parametrize(
-    ("pattern", "fits", "not_fits"),
-    [
-        ("/cmd_vel", ["/cmd_vel"], ["/cmd_vel2", "/a/cmd_vel", "/"]),
-        ("/camera/*", ["/camera/image"], ["/camera", "/camera/image/compressed", "/camera/_hidden"]),
-        ("/camera/**", ["/camera", "/camera/image", "/camera/image/compressed"], ["/cameras", "/camera/_a/b"]),
-        ("/**", ["/a", "/a/b/c"], ["/_a", "/a/_b", "/a/_b/c"]),
-        ("/**/image_*", ["/image_raw", "/a/b/image_raw"], ["/a/image", "/image_raw/x"]),
-        ("/**/_action/**", ["/turn/_action/status"], ["/turn/status"]),
-    ],
-)
-def test_patterns(pattern: str, fits: list[str], not_fits: list[str]) -> None:
-    """One star stays in a level, two cross levels, and neither reaches hidden names."""
-    assert [name for name in [*fits, *not_fits] if matches(pattern, name)] == fits
 
 
 def test_the_first_rule_that_gives_a_setting_counts() -> None:
