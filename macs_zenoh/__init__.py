@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from .errors import HeldByAnother as HeldByAnother
     from .errors import MacsError as MacsError
     from .errors import MissingExtra as MissingExtra
+    from .errors import NotAdmitted as NotAdmitted
     from .errors import NotAllowed as NotAllowed
+    from .errors import NotPermitted as NotPermitted
     from .errors import NotServed as NotServed
     from .errors import OutOfRange as OutOfRange
     from .errors import Refused as Refused
@@ -74,7 +76,9 @@ _WHERE = {
         "HeldByAnother",
         "MacsError",
         "MissingExtra",
+        "NotAdmitted",
         "NotAllowed",
+        "NotPermitted",
         "NotServed",
         "OutOfRange",
         "Refused",

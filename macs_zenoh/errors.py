@@ -11,6 +11,8 @@
     │   ├── BadField
     │   ├── UnknownManager
     │   ├── NotAllowed
+    │   │   └── NotPermitted
+    │   ├── NotAdmitted
     │   └── TooFast
     ├── UsageError                our caller
     │   ├── TooManyDestinations
@@ -95,6 +97,17 @@ class UnknownManager(WireError):
 
 class NotAllowed(WireError):
     """A peer asked for something that its place on the mesh does not permit."""
+
+
+class NotPermitted(NotAllowed):
+    """A token does not give the right to what its agent sent."""
+
+
+class NotAdmitted(WireError):
+    """A peer showed no token that holds where one is wanted. It says no more than that, whatever was wrong."""
+
+    def __init__(self) -> None:
+        super().__init__("no valid token")
 
 
 class TooFast(WireError):

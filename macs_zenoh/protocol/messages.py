@@ -159,7 +159,8 @@ class Configuration(Management, frozen=True):
     """Agent → router: the answer to Welcome. ``request_id`` echoes it; robots add what they offer.
 
     ``extensions`` is the version of our extensions that the agent understands. Without it, it is an existing program:
-    its gateway sends it only what those are known to survive. Existing routers ignore the key.
+    its gateway sends it only what those are known to survive. ``token`` says what the agent may (docs/security.md).
+    Existing routers ignore both keys.
     """
 
     manager: ClassVar[str] = "AgentclientConfigurer"
@@ -169,6 +170,7 @@ class Configuration(Management, frozen=True):
     request_id: RequestId = 0
     functionality: Functionality | None = None
     extensions: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0
+    token: str | None = None
 
 
 class Heartbeat(Management, frozen=True):
@@ -282,6 +284,20 @@ class NodeRefused(Management, frozen=True):
     node_name: str
     tos_name: str
     reason: str
+
+
+class AccessRefused(Management, frozen=True):
+    """Gateway → agent, ours: what its token, or the lack of one, does not permit. Existing programs ignore it.
+
+    ``kind`` is ``no_token``: no valid token was shown where one is wanted, and the connection ends; ``not_permitted``:
+    a message was not passed on; ``changed``: the token has other rights now; ``ended``: it holds no longer, and the
+    connection ends. ``reason`` is for a person. ``request_id`` is that of the message.
+    """
+
+    manager: ClassVar[str] = "AccessRefused"
+    kind: str
+    reason: str
+    request_id: RequestId = 0
 
 
 class DataRefused(Struct, frozen=True, rename="camel"):

@@ -13,14 +13,14 @@ Frames that come before the configuration are held until it is there, because he
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from enum import Enum
 from typing import NamedTuple
 
 from msgspec import Struct, structs
 
-from ..errors import BadField, BadJson, NotAllowed, TooFast, UnknownManager, WireError
+from ..errors import BadField, BadJson, NotAdmitted, NotAllowed, NotPermitted, TooFast, UnknownManager, WireError
 from . import greetings
 from .credit import Credit
 from .decoders import FrameDecoder
@@ -30,6 +30,7 @@ from .limits import (
     MANAGEMENT_BYTES,
     NAME_BYTES,
     NODE_AGENTS,
+    NODES_EACH,
     PARTIAL_BYTES_PER_S,
     PARTIAL_WINDOW_S,
     REASON_CHARACTERS,
@@ -38,6 +39,7 @@ from .messages import (
     NO_CUSTOM,
     OPERATOR,
     ROS,
+    UNITY,
     AddNode,
     Configuration,
     Custom,
@@ -56,6 +58,7 @@ from .messages import (
     decode_management,
     encode_data,
 )
+from .rights import OPEN, Grant, Rights
 from .wire import MACS, MAX_FRAME_BYTES, Frame, Frames, Layout, encode_message
 
 
@@ -145,6 +148,26 @@ class RegistrationRefused(NamedTuple):
     refused: NodeRefused
 
 
+class Forbidden(NamedTuple):
+    """A message was not let pass by the rights of the agent's token, for it to be told; a `Rejected` is beside it."""
+
+    metadata: Metadata
+    robots: tuple[int, ...]
+    """Whom it named, if these were robots."""
+    reason: str
+
+
+class NotLetIn(NamedTuple):
+    """The agent showed no valid token where one is wanted, for it to be told; a `Left` follows."""
+
+
+class Withdrawn(NamedTuple):
+    """Registrations that the rights of the agent's token, as they are now, do not permit any more."""
+
+    nodes: list[tuple[AddNode, str]]
+    """Each with the reason."""
+
+
 class Rejected(NamedTuple):
     """A frame was not accepted. The connection goes on unless a `Left` follows."""
 
@@ -157,7 +180,27 @@ class Left(NamedTuple):
     reason: str
 
 
-Event = Joined | Sent | Streamed | Registering | AskedOnline | Asked | RegistrationRefused | Rejected | Left
+Event = (
+    Joined
+    | Sent
+    | Streamed
+    | Registering
+    | AskedOnline
+    | Asked
+    | RegistrationRefused
+    | Forbidden
+    | NotLetIn
+    | Withdrawn
+    | Rejected
+    | Left
+)
+
+Admit = Callable[[str | None], Grant | None]
+"""What somebody gets who shows this token, or none; None: it is not let in."""
+
+STRANGER_FRAME_BYTES = CONFIGURATION_BYTES + MANAGEMENT_BYTES
+STRANGER_HELD_BYTES = 64 << 10
+"""What a frame may have, and what may wait, of somebody who has yet to show a token: less than of an agent."""
 
 
 class TcpAgent:
@@ -169,6 +212,8 @@ class TcpAgent:
     TOPICS = 128
     TOPIC_BYTES = 1024
     """So many lists of a topic's registrants are remembered, if they are not longer."""
+    PERMITTED = 1024
+    """So many kinds of frames are remembered as permitted, or not, by the rights of a token."""
 
     def __init__(
         self,
@@ -182,9 +227,20 @@ class TcpAgent:
         scratch: bytearray | None = None,
         credit: Credit | None = None,
         closed_groups: Collection[int] = (),
+        admit: Admit | None = None,
+        stranger: bool = False,
     ) -> None:
-        """``credit`` is what an earlier connection left, if there was one; ``closed_groups`` are not to be chosen."""
+        """``credit`` is what an earlier connection left, if there was one; ``closed_groups`` are not to be chosen.
+        ``admit`` judges the token in the first configuration; without it whoever comes is let in. ``stranger``: a
+        token is wanted, and until it is shown less may be said."""
         self._closed_groups = closed_groups
+        self._admit = admit
+        self.grant: Grant = OPEN
+        self._rights: Rights | None = None
+        self._permitted: dict[tuple[bytes, int, str, str], str | None] = {}
+        """Of an agent with a token: why what goes there, and is that, may not go on."""
+        self._registered: dict[tuple[int, str], Registering] = {}
+        """Of an agent with a token: what it registered, by node type and name, and where."""
         self.agent_id = agent_id
         self.former_ids: set[int] = set()
         self.connection_number = connection_number
@@ -204,6 +260,9 @@ class TcpAgent:
         self.credit = credit or Credit(limits.frames_per_s, now)
         self._layout = layout
         self._decoder = FrameDecoder(limits.max_frame_bytes, layout, scratch)
+        if stranger:
+            self._decoder.max_frame_bytes = min(limits.max_frame_bytes, STRANGER_FRAME_BYTES)
+            self._limits = limits._replace(held_bytes=min(limits.held_bytes, STRANGER_HELD_BYTES))
         self._held: deque[Frames] = deque()
         self._held_bytes = 0
         self._connected_at = now
@@ -248,19 +307,23 @@ class TcpAgent:
             return []
         self._heard_at = now
         events: list[Event] = []
-        decoder, limited = self._decoder, self._limits.frames_per_s
+        decoder, limited, shared = self._decoder, self._limits.frames_per_s, self.grant.credit
         for frame in decoder.advance(size):
             if isinstance(frame, WireError):
                 self._reject(frame, 1, events)
                 continue
             try:
-                if limited and not self._covered(frame, now):
+                if (limited and not self._covered(frame, now)) or (
+                    shared is not None and not shared.take(frame.count, now)
+                ):
                     self._too_fast(frame, events)
                 elif self.state is ONLINE and not frame.has_management:
                     events.append(self._sent(frame))
                     continue
                 else:
                     self._frame(frame, events)
+            except NotPermitted as error:
+                self._forbid(error, frame, events)
             except WireError as error:
                 self._reject(error, frame.count, events)
             if self._gone():
@@ -334,6 +397,17 @@ class TcpAgent:
         error.__traceback__ = error.__cause__ = error.__context__ = None
         events.append(Rejected(error))
 
+    def _forbid(self, error: NotPermitted, frame: Frames, events: list[Event]) -> None:
+        told = bool(events) and isinstance(events[-1], RegistrationRefused)
+        self._reject(error, frame.count, events)
+        if told:
+            return
+        metadata, header = Metadata(), frame.header
+        with suppress(WireError):
+            metadata = Metadata.decode(frame.metadata)
+        robots = header.ids if header.agent_type == ROS and not frame.has_management else ()
+        events.append(Forbidden(metadata, robots, str(error)))
+
     def _covered(self, frame: Frames, now: float) -> bool:
         """Whether the rate limit lets a frame pass: every one counts but the one that configures the agent."""
         if self.state is GREETED and frame.has_management and isinstance(self._management(frame), Configuration):
@@ -343,7 +417,7 @@ class TcpAgent:
     def _too_fast(self, frame: Frames, events: list[Event]) -> None:
         """A frame beyond the rate limit is dropped, but who leaves may say so. A registration is answered, which a
         topic's data cannot be."""
-        error = TooFast(self._limits.frames_per_s)
+        error = TooFast(self._limits.frames_per_s or (self._rights.frames_per_s if self._rights else 0))
         if frame.has_management:
             with suppress(BadJson, BadField, UnknownManager):
                 management = self._management(frame)
@@ -416,16 +490,24 @@ class TcpAgent:
             raise NotAllowed("operators come over Zenoh, where a router can check who they are")
         if self.state is ONLINE and kind != self.agent_type:
             raise NotAllowed(f"a configured agent of type {self.agent_type} cannot become type {kind}")
+        if self.state is GREETED and not self._let_in(configuration, events):
+            return
         same = configuration.extensions == self.extensions
         if group in self._closed_groups:
             self._reject(NotAllowed(f"group {group} is not to be chosen from there (gateway.groups)"), 1, events)
+            group = 0
+        if self._rights is not None and not self._rights.may_be_in(group):
+            error = NotPermitted(f"group {group} is not among the groups of this token")
+            self._reject(error, 1, events)
+            events.append(Forbidden(Metadata(), (), str(error)))
             group = 0
         self.extensions = configuration.extensions
         self.functionality = configuration.functionality or self.functionality
         if self.state is ONLINE and group == self.group and same:
             return
         self.state = ONLINE
-        self._decoder.runs = not self._limits.frames_per_s  # a rate limit is for each frame
+        # a rate limit is for each frame
+        self._decoder.runs = not self._limits.frames_per_s and self.grant.credit is None
         if kind != self.agent_type:
             self._judge = Judge(kind, self.agent_id)
         self.agent_type, self.group = kind, group
@@ -435,8 +517,40 @@ class TcpAgent:
             self._held_bytes -= len(frame.data)
             try:
                 self._frame(frame, events)
+            except NotPermitted as error:
+                self._forbid(error, frame, events)
             except WireError as error:
                 self._reject(error, 1, events)
+
+    def _let_in(self, configuration: Configuration, events: list[Event]) -> bool:
+        """Judge the token that an agent shows, or does not show."""
+        if self._admit is None:
+            return True
+        grant = self._admit(configuration.token)
+        rights = grant.rights if grant is not None else None
+        is_robot = configuration.agent_type != UNITY
+        if grant is None or (is_robot and rights is not None and not rights.has("robot")):
+            self._reject(NotAdmitted(), 1, events)
+            events += [NotLetIn(), self._leave("it has no valid token")]
+            return False
+        self.grant, self._rights = grant, grant.rights
+        self._decoder.max_frame_bytes = self._limits.max_frame_bytes
+        return True
+
+    def rights_change(self, grant: Grant) -> list[Event]:
+        """The agent's token has other rights from now on. What is not permitted any more ends."""
+        self.grant, self._rights = grant, grant.rights
+        self._permitted.clear()
+        self._decoder.runs = not self._limits.frames_per_s and grant.credit is None
+        withdrawn: list[tuple[AddNode, str]] = []
+        for key, registering in list(self._registered.items()):
+            node, why = registering.node, None
+            if grant.rights is not None:
+                why = grant.rights.of_registration(node, registering.robot_ids, registering.groups)
+            if why is not None and isinstance(node, AddNode):
+                del self._registered[key]
+                withdrawn.append((node, why))
+        return [Withdrawn(withdrawn)] if withdrawn else []
 
     def _go_offline(self, message: GoOffline, events: list[Event]) -> None:
         if message.agent_id not in {0, self.agent_id, *self.former_ids}:
@@ -445,6 +559,8 @@ class TcpAgent:
 
     def _manage(self, management: Management | Custom, frame: Frame) -> Event:
         if isinstance(management, Custom):
+            if self._rights is not None and not self._rights.has("ask"):
+                raise NotPermitted("this token does not give the right to ask")
             return Asked(management.manager, management.data, self._decode(frame).request_id)
         if isinstance(management, OnlineRequest):
             return AskedOnline(self._decode(frame).request_id)
@@ -469,15 +585,64 @@ class TcpAgent:
         if (node.registrant_agent_type, node.registrant_agent_id) != (self.agent_type, self.agent_id):
             self.corrected += 1
             node = structs.replace(node, registrant_agent_type=self.agent_type, registrant_agent_id=self.agent_id)
-        return Registering(node, registration.registrar_agent_ids, registration.registrar_group_ids)
+        registering = Registering(node, registration.registrar_agent_ids, registration.registrar_group_ids)
+        if self._rights is not None:
+            self._permit_registration(registering, self._rights)
+        return registering
+
+    def _permit_registration(self, registering: Registering, rights: Rights) -> None:
+        node, robots, groups = registering
+        why = rights.of_registration(node, robots, groups)
+        if why is not None:
+            raise NotPermitted(why)
+        key = node.node_type, node.node_name
+        self._permitted.clear()
+        before = self._registered.get(key)
+        if not isinstance(node, AddNode):
+            if before is not None:
+                left = before._replace(
+                    robot_ids=[robot for robot in before.robot_ids if robot not in robots],
+                    groups=[group for group in before.groups if group not in groups],
+                )
+                self._registered[key] = left
+                if not left.robot_ids and not left.groups:
+                    del self._registered[key]
+            return
+        if before is not None and isinstance(before.node, AddNode) and before.node.tos_name == node.tos_name:
+            robots = sorted({*before.robot_ids, *robots})
+            groups = sorted({*before.groups, *groups})
+        elif len(self._registered) >= NODES_EACH:
+            raise NotPermitted(f"each may have {NODES_EACH} interface nodes")
+        self._registered[key] = Registering(node, robots, groups)
+
+    def _permit(self, frame: Frames, metadata: Metadata, rights: Rights) -> None:
+        """Whether a frame for others may go on: judged once for each destination and node. Raises NotPermitted."""
+        about = frame.destination, metadata.node_type, metadata.node_name, metadata.message_manager
+        try:
+            why = self._permitted[about]
+        except KeyError:
+            registered = self._registered.get((metadata.node_type, metadata.node_name))
+            name = registered.node.tos_name if registered and isinstance(registered.node, AddNode) else None
+            why = rights.of_frame(frame.header, metadata, name)
+            if len(self._permitted) >= self.PERMITTED:
+                self._permitted.clear()
+            self._permitted[about] = why
+        if why is not None:
+            raise NotPermitted(why)
 
     def _stream(self, stream: StreamData, frame: Frame) -> Streamed:
         if self.agent_type != ROS:
             raise NotAllowed("only a robot sends topic data")
-        sent = self._sent(frame)
+        sent = self._judged(frame)
         return Streamed(sent.frame, sent.metadata, sent.readable, stream.targets())
 
     def _sent(self, frame: Frames) -> Sent:
+        sent = self._judged(frame)
+        if self._rights is not None:
+            self._permit(sent.frame, sent.metadata, self._rights)
+        return sent
+
+    def _judged(self, frame: Frames) -> Sent:
         raw = frame.metadata
         if not raw:
             raise BadField("metadata", "a message for other agents needs metadata")

@@ -73,10 +73,13 @@ NAMES_OF_FIELDS = {
 """Section 4 of the protocol page."""
 
 
-OURS = {"InterfaceNodeRefused": {"robotId", "nodeType", "nodeName", "tosName", "reason"}}
+OURS = {
+    "InterfaceNodeRefused": {"robotId", "nodeType", "nodeName", "tosName", "reason"},
+    "AccessRefused": {"kind", "reason", "requestId"},
+}
 """What existing programs do not have."""
 
-OUR_KEYS = {"AgentclientConfigurer": {"extensions"}, "InterfaceNodeAdder": {"unityCdr"}}
+OUR_KEYS = {"AgentclientConfigurer": {"extensions", "token"}, "InterfaceNodeAdder": {"unityCdr"}}
 """Keys that existing programs do not write, and existing routers ignore."""
 
 DEEP = 2000
