@@ -6,6 +6,10 @@ import ipaddress
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+STRANGERS_IN_ALL = 1024
+STRANGERS_PER_ADDRESS = 256
+"""Connections that have yet to show a token, where one is wanted: each has an id, which agents need."""
+
 
 class Admission:
     """The limits on connections: ``allow`` lists networks (CIDR, empty = everybody), ``groups`` who
@@ -18,26 +22,40 @@ class Admission:
         max_per_address: int,
         groups: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
-        self._allow = _networks(allow)
-        self._groups = {int(group): _networks(networks) for group, networks in (groups or {}).items()}
+        self._allow = networks(allow)
+        self._groups = {int(group): networks(listed) for group, listed in (groups or {}).items()}
         self._max_connections = max_connections
         self._max_per_address = max_per_address
         self._inside: Counter[str] = Counter()
+        self._strangers: Counter[str] = Counter()
 
-    def judge(self, address: str) -> tuple[str, str] | None:
-        """Why a connection from this address is refused: the name of its counter, and a sentence; None lets it in."""
-        if self._allow and not _is_in(address, self._allow):
+    def judge(self, address: str, *, stranger: bool = False) -> tuple[str, str] | None:
+        """Why a connection from this address is refused: the name of its counter, and a sentence; None lets it in.
+        ``stranger``: it has yet to show a token."""
+        if self._allow and not is_in(address, self._allow):
             return "address_not_allowed", "its address is not in gateway.allow"
         if self._inside.total() >= self._max_connections:
             return "too_many_connections", f"{self._max_connections} are connected (gateway.max_connections)"
         if self._inside[address] >= self._max_per_address:
             limit = f"{self._max_per_address} are connected from there (gateway.max_connections_per_address)"
             return "too_many_from_address", limit
+        if stranger and (
+            self._strangers[address] >= STRANGERS_PER_ADDRESS or self._strangers.total() >= STRANGERS_IN_ALL
+        ):
+            return "too_many_unknown", f"{self._strangers[address]} from there have yet to show a token"
         return None
 
-    def enter(self, address: str) -> None:
+    def enter(self, address: str, *, stranger: bool = False) -> None:
         """A connection from this address was let in."""
         self._inside[address] += 1
+        if stranger:
+            self._strangers[address] += 1
+
+    def known(self, address: str) -> None:
+        """One from this address is no stranger any more."""
+        self._strangers[address] -= 1
+        if self._strangers[address] <= 0:
+            del self._strangers[address]
 
     def leave(self, address: str) -> None:
         """It has ended."""
@@ -47,21 +65,23 @@ class Admission:
 
     def closed_groups(self, address: str) -> frozenset[int]:
         """The groups that an agent with this address may not choose."""
-        return frozenset(group for group, networks in self._groups.items() if not _is_in(address, networks))
+        return frozenset(group for group, within in self._groups.items() if not is_in(address, within))
 
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
-def _networks(texts: Sequence[str]) -> list[Network]:
+def networks(texts: Sequence[str]) -> list[Network]:
+    """Networks as settings name them."""
     return [ipaddress.ip_network(text, strict=False) for text in texts]
 
 
-def _is_in(address: str, networks: Sequence[Network]) -> bool:
+def is_in(address: str, within: Sequence[Network]) -> bool:
+    """Whether an address is in one of these networks."""
     try:
         host = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:
         return False
     if isinstance(host, ipaddress.IPv6Address) and host.ipv4_mapped is not None:
         host = host.ipv4_mapped
-    return any(host in network for network in networks if network.version == host.version)
+    return any(host in network for network in within if network.version == host.version)

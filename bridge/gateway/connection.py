@@ -12,7 +12,7 @@ import sys
 import termios
 import time
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Hashable, Sequence
 from typing import Protocol, cast
 
 from macs_zenoh.losses import Losses
@@ -31,6 +31,7 @@ from macs_zenoh.protocol.tcp_agent import Event, Joined, Left, Rejected, Sent, S
 from macs_zenoh.protocol.wire import Header, encode_message
 
 from .backpressure import Backpressure
+from .door import OPEN_TO_ALL, Entrance
 from .memory import Memory
 from .writer import BUFFER_BYTES, Writer
 
@@ -51,6 +52,10 @@ LAST_NODES = 4096
 
 VERDICTS = 1024
 """How many metadata are remembered per connection as already judged."""
+
+TELL_S = 1.0
+"""How often an agent is told the same of what it may not do, while it goes on."""
+TOLD = 256
 
 USUAL_DEPTH = (10, False)
 """What waits of a topic whose registration is not known any more."""
@@ -119,6 +124,7 @@ class Connection(asyncio.BufferedProtocol):
     def __init__(
         self,
         owner: Owner,
+        entrance: Entrance = OPEN_TO_ALL,
         *,
         memory: Memory,
         outbox_bytes: int,
@@ -126,6 +132,11 @@ class Connection(asyncio.BufferedProtocol):
         robot_packages: Collection[str] = (),
     ) -> None:
         self.owner = owner
+        self.entrance = entrance
+        self.stranger = False
+        """Whether a token is wanted of its agent, and it has shown none yet."""
+        self.shown_token: str | None = None
+        """What was shown before the first frame, where that is possible."""
         self.peer: TcpAgent
         self.pace: Pace
         self.greeted = False
@@ -138,6 +149,8 @@ class Connection(asyncio.BufferedProtocol):
         self._writer = Writer(self._outbox)
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
+        self._told: dict[Hashable, float] = {}
+        """What the agent was told of its rights, and when."""
         self._nodes: dict[str, set[int]] = {}
         self._depths: dict[str, tuple[int, bool]] = {}
         """How many messages of a topic may wait, and whether new ones are dropped rather than old ones, by node."""
@@ -508,6 +521,16 @@ class Connection(asyncio.BufferedProtocol):
         self.close("its frame does not end, and others need the room")
 
     # -- life ----------------------------------------------------------------------------------------------------
+
+    def may_tell(self, about: Hashable) -> bool:
+        """Whether the agent should be told of something again: at once, and then once in a while."""
+        now = self._loop.time()
+        if now < self._told.get(about, -math.inf) + TELL_S:
+            return False
+        if len(self._told) >= TOLD:
+            self._told.clear()
+        self._told[about] = now
+        return True
 
     def complain(self, name: str, problem: str, count: int = 1) -> None:
         """Count what was dropped; the first of a kind is logged."""

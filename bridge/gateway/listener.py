@@ -10,7 +10,11 @@ import asyncio
 import logging
 import resource
 import socket
+import ssl
+import sys
+from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 log = logging.getLogger("macs.gateway")
 
@@ -20,6 +24,13 @@ AT_ONCE = 64
 
 PAUSE_S = 0.2
 """So long nobody is accepted when the system has no room: who connects meanwhile waits."""
+
+GREETING = 512
+GREETING_PER_ADDRESS = 128
+"""So many may be in the middle of TLS's greeting: they are no connections yet, which others count."""
+
+SHUTDOWN_S = 2.0
+"""How long the other end has to answer TLS's goodbye."""
 
 KEPT = 64
 """Descriptors that connections do not get; of few, an eighth."""
@@ -32,15 +43,23 @@ def descriptors() -> int:
 
 
 class Listener:
-    """One listening socket. ``on_turned_away(address)`` hears of whom there was no descriptor for."""
+    """One listening socket. ``on_turned_away(address)`` hears of whom there was no descriptor for, or, over TLS, no
+    place."""
 
     def __init__(
         self,
         listening: socket.socket,
         protocol: Callable[[], asyncio.BaseProtocol],
         on_turned_away: Callable[[str], None],
+        *,
+        context: ssl.SSLContext | None = None,
+        handshake_s: float = 10.0,
     ) -> None:
-        """Raises OSError when somebody else listens there."""
+        """``context`` is for TLS, whose greeting may take ``handshake_s``. Raises OSError when somebody else listens
+        there."""
+        self._context = context
+        self._handshake_s = handshake_s
+        self._greeting: Counter[str] = Counter()
         self._listening = listening
         self._protocol = protocol
         self._on_turned_away = on_turned_away
@@ -78,14 +97,32 @@ class Listener:
                 accepted.close()
                 self._on_turned_away(str(address[0]))
                 continue
+            host = str(address[0])
+            if self._context is not None and not self._has_place(host):
+                accepted.close()
+                self._on_turned_away(host)
+                continue
+            self._greeting[host] += 1
             accepted.setblocking(False)
-            task: asyncio.Task[object] = self._loop.create_task(self._connected(accepted))
+            task: asyncio.Task[object] = self._loop.create_task(self._connected(accepted, host))
             self._accepting.add(task)
             task.add_done_callback(self._accepting.discard)
 
-    async def _connected(self, accepted: socket.socket) -> None:
+    def _has_place(self, host: str) -> bool:
+        return self._greeting.total() < GREETING and self._greeting[host] < GREETING_PER_ADDRESS
+
+    async def _connected(self, accepted: socket.socket, host: str) -> None:
+        tls: dict[str, Any] = {}
+        if self._context is not None:
+            tls = {"ssl": self._context, "ssl_handshake_timeout": self._handshake_s}
+            if sys.version_info >= (3, 11):
+                tls["ssl_shutdown_timeout"] = SHUTDOWN_S
         try:
-            await self._loop.connect_accepted_socket(self._protocol, accepted)
-        except OSError as error:  # it is gone already
+            await self._loop.connect_accepted_socket(self._protocol, accepted, **tls)
+        except (OSError, asyncio.TimeoutError) as error:  # it is gone already, or does not speak TLS
             log.debug("a connection ended at once: %s", error)
             accepted.close()
+        finally:
+            self._greeting[host] -= 1
+            if self._greeting[host] <= 0:
+                del self._greeting[host]

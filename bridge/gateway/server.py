@@ -15,9 +15,10 @@ from contextlib import suppress
 
 from msgspec import structs
 
-from bridge.listening import bound, for_others
+from bridge.listening import for_others
 from bridge.settings import GatewaySettings
-from macs_zenoh.errors import Refused, Unreachable, UsageError
+from bridge.tokens.store import path_of
+from macs_zenoh.errors import Refused, UsageError
 from macs_zenoh.losses import Losses
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Subscription
@@ -39,8 +40,10 @@ from macs_zenoh.protocol.limits import (
 from macs_zenoh.protocol.messages import (
     ROS,
     UNITY,
+    AccessRefused,
     AddNode,
     AgentsGone,
+    DataRefused,
     GoneAgent,
     Metadata,
     NodeRefused,
@@ -50,16 +53,20 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.rate_limit import Pace
 from macs_zenoh.protocol.registrations import AgentKey
+from macs_zenoh.protocol.rights import Grant
 from macs_zenoh.protocol.tcp_agent import (
     Asked,
     AskedOnline,
     Event,
+    Forbidden,
     Joined,
     Limits,
+    NotLetIn,
     Registering,
     RegistrationRefused,
     Streamed,
     TcpAgent,
+    Withdrawn,
 )
 from macs_zenoh.protocol.wire import Layout, encode_message
 from macs_zenoh.registration_calls import RobotCalls, StreamChanges
@@ -70,10 +77,11 @@ from .agents import Agents, Group
 from .connection import Connection
 from .declarations import AgentDeclarations
 from .delivery import Delivery, Stream
+from .door import Door, Entrance, entrances
 from .forwarding import Forwarding
 from .judged import JudgedFrames
 from .leases import Leases
-from .listener import BACKLOG, Listener, descriptors
+from .listeners import Listeners
 from .memory import Memory
 from .renumbering import Renumbering
 from .robot_ids import RobotIds
@@ -82,8 +90,6 @@ from .waiting import NAMED_S, WaitingRoom
 
 log = logging.getLogger("macs.gateway")
 
-OTHER_DESCRIPTORS = 64
-"""What a gateway has open besides its connections, of which each takes up to two."""
 FLUSH_S = 1.0
 
 CALM_S = 0.25
@@ -129,7 +135,13 @@ class Gateway:
         self._numbers = 0
         self._waiting = WaitingRoom(settings.handshake_timeout_s, self._no_id)
         self._subscriptions: dict[str, Subscription] = {}
-        self._listeners: list[Listener | asyncio.AbstractServer] = []
+        self._door = Door(
+            path_of(settings.tokens_file),
+            on_changed=self._rights_changed,
+            on_ended=self._token_ended,
+            on_look=lambda: self.listeners.look(),
+        )
+        self.listeners = Listeners(settings, entrances(settings), self._door, self._connection, self._turned_away)
         self.directory = self._presence.directory
         """Who is online."""
         self._robot_ids = RobotIds(settings.robots)
@@ -186,22 +198,9 @@ class Gateway:
         self._subscribe(BROADCAST.every(), self._delivery.broadcast)
         self._subscriptions["ping"] = self.mesh.answer_pings()
         self._subscriptions["slow"] = self._forwarding.afar.listen()
-        sockets = bound(self.settings.host, self.settings.port, shared=self.settings.reuse_port)
-        self.port = sockets[0].getsockname()[1]
-        room = (descriptors() - OTHER_DESCRIPTORS - BACKLOG) // 2
-        if room < self.settings.max_connections:
-            problem = "gateway.max_connections is %d, and at most %d connections have room: few files may be open"
-            log.warning(problem, self.settings.max_connections, max(0, room + BACKLOG // 2))
-        for listening in sockets:
-            try:
-                if room < self.settings.max_connections:
-                    self._listeners.append(Listener(listening, self._connection, self._turned_away))
-                else:  # quicker, and silent where there are no descriptors
-                    create = asyncio.get_running_loop().create_server
-                    self._listeners.append(await create(self._connection, sock=listening, backlog=BACKLOG))
-            except OSError as error:  # two gateways can hold a port, and one of them can listen
-                why = f"cannot listen there: {error.strerror or error}"
-                raise Unreachable(self.address, why) from error
+        await self.listeners.open()
+        self.port = self.listeners.port
+        self._door.start()
         self.mesh.address = joined(for_others(self.settings.host), self.port)
         log.info("listening on %s", self.address)
 
@@ -226,8 +225,8 @@ class Gateway:
 
     async def close(self) -> None:
         """Stop accepting, tell the mesh, send what waits for ``FLUSH_S`` at most, leave."""
-        for listener in self._listeners:
-            listener.close()
+        self.listeners.close()
+        self._door.close()
         self._renumbering.close()
         self._robots.close()
         connections = [*self.agents.connections(), *self._waiting]
@@ -239,6 +238,7 @@ class Gateway:
                 await within(self._all_closed.wait(), FLUSH_S)
             for connection in connections:
                 connection.abort()
+        await self.listeners.end()
         self._forwarding.close()
         self._leases.close()
         self._declarations.close()
@@ -250,10 +250,11 @@ class Gateway:
 
     # -- connections ---------------------------------------------------------------------------------------------
 
-    def _connection(self) -> Connection:
+    def _connection(self, entrance: Entrance) -> Connection:
         settings = self.settings
         return Connection(
             self,
+            entrance,
             memory=self._memory,
             outbox_bytes=settings.outbox_bytes,
             write_timeout_s=settings.write_timeout_s,
@@ -262,12 +263,13 @@ class Gateway:
 
     def opened(self, connection: Connection) -> bool:
         """Let a connection in, or not. It is greeted at once, or as soon as there is an id for it."""
-        refusal = self._admission.judge(connection.host)
+        connection.stranger = connection.entrance.wants_token(connection.host)
+        refusal = self._admission.judge(connection.host, stranger=connection.stranger)
         if refusal is not None:
             name, why = refusal
             self._drops.once(name, "%s is refused: %s", connection.address, why)
             return False
-        self._admission.enter(connection.host)
+        self._admission.enter(connection.host, stranger=connection.stranger)
         self._waiting.enter(connection)
         self._greet_waiting()
         return True
@@ -294,6 +296,8 @@ class Gateway:
                 layout=self._layout,
                 scratch=self._scratch,
                 closed_groups=self._admission.closed_groups(connection.host),
+                admit=self._door.admit(connection),
+                stranger=connection.stranger,
             )
             self.agents.enter(agent_id, connection)
             self._forwarding.enter(connection)
@@ -324,6 +328,8 @@ class Gateway:
     def closed(self, connection: Connection) -> None:
         """Forget a connection; its presence ends at once."""
         self._admission.leave(connection.host)
+        self._known(connection)
+        self._door.leave(connection)
         if not connection.greeted:
             self._waiting.leave(connection)
             return
@@ -347,6 +353,12 @@ class Gateway:
         if not self.agents:
             self._all_closed.set()
         self._greet_waiting()
+
+    def _known(self, connection: Connection) -> None:
+        """A connection is no stranger any more."""
+        if connection.stranger:
+            connection.stranger = False
+            self._admission.known(connection.host)
 
     def _group_emptied(self, group: Group | None) -> None:
         """Nobody of ours is in this group any more."""
@@ -378,6 +390,12 @@ class Gateway:
             connection.charge()
         elif isinstance(event, RegistrationRefused):
             self._tell_refusal(connection.key, event.refused)
+        elif isinstance(event, Forbidden):
+            self._tell_forbidden(connection, event)
+        elif isinstance(event, NotLetIn):
+            self._tell_access(connection, AccessRefused("no_token", "a valid token is wanted here"))
+        elif isinstance(event, Withdrawn):
+            self._withdraw(connection, event)
         elif isinstance(event, AskedOnline):
             self._answer_online(connection, event.request_id)
             connection.charge()
@@ -434,6 +452,48 @@ class Gateway:
         if connection is not None and self.settings.tell_refusals:
             self._reply(connection, Metadata(message_manager=NodeRefused.manager), encode_data(refused))
 
+    # -- what a token does not permit ------------------------------------------------------------------------------
+
+    def _tell_access(self, connection: Connection, refused: AccessRefused) -> None:
+        self._reply(connection, Metadata(message_manager=AccessRefused.manager), encode_data(refused))
+
+    def _tell_forbidden(self, connection: Connection, event: Forbidden) -> None:
+        """A message was not let pass: say so, in the way that robots say it to who knows that."""
+        about, kind = event.metadata, "not_permitted"
+        if not connection.may_tell(
+            (about.node_type, about.node_name, about.message_manager, event.robots, event.reason)
+        ):
+            return
+        if not (about.node_name and connection.peer.extensions):
+            self._tell_access(connection, AccessRefused(kind, event.reason, about.request_id))
+            return
+        for robot in event.robots or (0,):
+            refused = DataRefused(robot, about.node_type, about.node_name, about.node_name, kind, event.reason)
+            self._reply(connection, Metadata(message_manager=DataRefused.manager), encode_data(refused))
+
+    def _withdraw(self, connection: Connection, event: Withdrawn) -> None:
+        """Registrations are not permitted any more."""
+        for node, why in event.nodes:
+            self._robots.take_back_all(connection.key, node.node_type, node.node_name)
+            connection.unregistered(node.node_name, node.node_type)
+            refused = NodeRefused(0, node.node_type, node.node_name, node.tos_name, why)
+            self._tell_refusal(connection.key, refused)
+        self._nodes.set(connection, connection.host, connection.node_count)
+        self._named.set(connection, connection.host, self._robots.named(connection.key))
+
+    def _rights_changed(self, connection: Connection, grant: Grant) -> None:
+        """A token has other rights: they hold at once."""
+        log.info("%s has other rights: its token %s has changed", connection, grant.name)
+        events = connection.peer.rights_change(grant)
+        self._tell_access(connection, AccessRefused("changed", "the rights of this token have changed"))
+        for event in events:
+            self.handle(connection, event)
+
+    def _token_ended(self, connection: Connection) -> None:
+        """A token holds no longer, and so do the connections of who came in by it."""
+        self._tell_access(connection, AccessRefused("ended", "this token holds no longer"))
+        connection.close("its token holds no longer")
+
     def _reply(self, connection: Connection, metadata: Metadata, data: bytes) -> None:
         connection.send_call(encode_message(metadata.encode(), data))
 
@@ -441,12 +501,14 @@ class Gateway:
         if self.agents.find(*connection.key) is connection:
             self._regroup(connection)
             return
+        self._known(connection)
         if event.agent_type != UNITY and not self._admit(connection):
             return
         self._declarations.declare(connection)
         self._enter_group(connection)
         self._renumbering.joined(connection)
-        log.info("%s is online%s", connection, f" in group {event.group}" if event.group else "")
+        by = f" with token {connection.peer.grant.name}" if connection.peer.grant.name else ""
+        log.info("%s is online%s%s", connection, f" in group {event.group}" if event.group else "", by)
 
     def _admit(self, connection: Connection) -> bool:
         """Give an agent that is no headset an id that it may have; it is not told, and does not mind. False: there is

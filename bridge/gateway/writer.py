@@ -48,8 +48,10 @@ class Writer:
     # -- past the loop -------------------------------------------------------------------------------------------
 
     def open_direct(self) -> None:
-        """Let threads write past the loop, if a descriptor is left: else topics take the usual way."""
-        if self._direct is None and not self._transport.is_closing():
+        """Let threads write past the loop, if a descriptor is left and what is written goes out as it is, which
+        it does not over TLS and WebSocket: else topics take the usual way."""
+        plain = not any(map(self._transport.get_extra_info, ("sslcontext", "websocket")))
+        if plain and self._direct is None and not self._transport.is_closing():
             with suppress(OSError):
                 self._direct = DirectWriter(self._transport.get_extra_info("socket"))
 

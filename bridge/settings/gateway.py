@@ -13,6 +13,9 @@ from macs_zenoh.sections import AgentId, Bytes, GroupId, Port, Seconds, Section
 
 from .agents import names_agents
 
+WithoutToken = Literal["nobody", "everybody"] | list[str]
+"""Networks are named as in 192.168.1.0/24."""
+
 
 class GatewaySettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The TCP gateway: where headsets connect, and what one of them may cost."""
@@ -20,10 +23,34 @@ class GatewaySettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=
     section: ClassVar[str] = "gateway"
 
     host: str = "127.0.0.1"
-    """Address to listen on. The protocol has no authentication, so the network is opened on purpose: 0.0.0.0, or ::
+    """Address to listen on. Existing programs have no password, so the network is opened on purpose: 0.0.0.0, or ::
     for IPv6 as well. With or without brackets."""
     port: Port = 7000
     """TCP port to listen on. 0: any free one."""
+    tls_port: Port | None = None
+    """TCP port for the same over TLS, with `certificate` and `key`. 0: any free one. Unset: none."""
+    web_port: Port | None = None
+    """Port for HTTP and WebSocket, with the extra ``web``; over TLS when there is a `certificate`, unless ``web_host``
+    is this machine alone. 0: any free one. Unset: none."""
+    web_host: str | None = None
+    """Address of the web port. Unset: as ``host``."""
+    certificate: str | None = None
+    """File (PEM) with the certificate that the TLS port and the web port show, and those that it hangs on."""
+    key: str | None = None
+    """File (PEM) with its key."""
+    web_origins: list[str] = []
+    """Origins of web pages that may connect besides the gateway's own, as in https://hall.example.org."""
+    web_names: list[str] = []
+    """Names of this gateway, as in hall.example.org, by which browsers may call its web port besides by address."""
+    tokens_file: str | None = None
+    """File of tokens that `macs token` keeps. Unset: ``$MACS_TOKENS``, else ~/.config/macs/tokens.json."""
+    plain_without_token: WithoutToken = "everybody"  # noqa: S105 - no password
+    """Who may come to ``port`` without a token: nobody, everybody, or the networks named. A token that is shown counts
+    in any case, and must be valid."""
+    tls_without_token: WithoutToken | None = None
+    """The same for ``tls_port``. Unset: nobody, or everybody where that is this machine alone."""
+    web_without_token: WithoutToken | None = None
+    """The same for ``web_port``."""
     allow: list[str] = []
     """Networks whose addresses may connect, as in 192.168.1.0/24. Empty: everybody who reaches the port."""
     max_connections: Annotated[int, Meta(ge=1, le=65_535)] = 4096
@@ -74,10 +101,22 @@ class GatewaySettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=
             msgspec.structs.force_setattr(self, "host", addresses.bare(self.host))
         except ValueError as error:
             raise self._wrong("host", str(error)) from None
+        try:
+            if self.web_host is not None:
+                msgspec.structs.force_setattr(self, "web_host", addresses.bare(self.web_host))
+        except ValueError as error:
+            raise self._wrong("web_host", str(error)) from None
+        if (self.certificate is None) != (self.key is None):
+            raise self._wrong("certificate", "needs a key, and a key needs a certificate")
+        if self.tls_port is not None and self.certificate is None:
+            raise self._wrong("tls_port", "needs a certificate and its key")
         for group in self.groups:
             if not names_agents(f"group/{group}"):
                 raise self._wrong(f"groups.{group}", "is no group: 1 to 255")
-        for where, networks in [("allow", self.allow), *((f"groups.{g}", of) for g, of in self.groups.items())]:
+        lists = [("allow", self.allow), *((f"groups.{g}", of) for g, of in self.groups.items())]
+        for field in ("plain_without_token", "tls_without_token", "web_without_token"):
+            lists += [(field, of)] if isinstance(of := getattr(self, field), list) else []
+        for where, networks in lists:
             for network in networks:
                 try:
                     ipaddress.ip_network(network, strict=False)

@@ -1,0 +1,443 @@
+"""The web port: HTTP for a login and for pairing, and WebSocket, whose binary messages are pieces of the byte stream.
+
+aiohttp speaks HTTP and WebSocket. What it does not bound is bounded here: how long a request may take to come, how
+many may be at it, and how many pings are answered. What is written goes past aiohttp, as whole WebSocket messages,
+into the transport below it: a task for each message would cost more than the message.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import socket
+import ssl
+import struct
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import suppress
+from typing import Any, cast
+
+from aiohttp import WSCloseCode, WSMsgType, web
+
+from bridge.settings import GatewaySettings
+from macs_zenoh.protocol.addresses import of_peer
+from macs_zenoh.protocol.credit import Credit
+from macs_zenoh.protocol.origins import host_problem, origin_problem
+from macs_zenoh.protocol.websocket import MESSAGE_BYTES, SUBPROTOCOL, TOKEN_SUBPROTOCOL, WEBSOCKET_PATH
+
+from .admission import is_in, networks
+from .connection import Connection
+from .door import Door, Entrance
+from .listener import Listener
+
+log = logging.getLogger("macs.gateway")
+
+COOKIE = "macs_token"
+
+REQUEST_S = 10.0
+"""How long a request may take to come, and a connection may wait for its next one."""
+BODY_BYTES = 4 << 10
+HTTP_IN_ALL = 512
+HTTP_PER_ADDRESS = 128
+"""Connections that are no WebSocket, or not yet one."""
+PINGS_PER_S = 10.0
+"""Pings and empty messages; who sends more is closed."""
+CLOSE_S = 2.0
+COOKIE_S = 30 * 24 * 3600
+
+WRONG = {"error": "a valid token is wanted here"}
+"""Whatever was wrong with it."""
+
+Answer = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class WebPort:
+    """The HTTP server of a gateway, on sockets that somebody else has bound."""
+
+    def __init__(
+        self,
+        settings: GatewaySettings,
+        entrance: Entrance,
+        door: Door,
+        connect: Callable[[Entrance], Connection],
+        on_turned_away: Callable[[str], None],
+        context: ssl.SSLContext | None,
+    ) -> None:
+        self._settings = settings
+        self._entrance = entrance
+        self._door = door
+        self._connect = connect
+        self._on_turned_away = on_turned_away
+        self._context = context
+        self._allow = networks(settings.allow)
+        own = socket.gethostname().lower()
+        self._names = frozenset({*(name.lower() for name in settings.web_names), own, f"{own}.local"})
+        self._at_http: Counter[str] = Counter()
+        self._listeners: list[Listener] = []
+        app = web.Application(client_max_size=BODY_BYTES, middlewares=[self._middle()])
+        app.router.add_get("/", self._hello)
+        app.router.add_get(WEBSOCKET_PATH, self._websocket)
+        app.router.add_post("/login", self._login)
+        app.router.add_post("/pair", self._pair)
+        self._runner = web.AppRunner(
+            app, handle_signals=False, access_log=None, keepalive_timeout=REQUEST_S, shutdown_timeout=0.1
+        )
+
+    async def open(self, sockets: Sequence[socket.socket]) -> None:
+        """Listen. Raises OSError."""
+        await self._runner.setup()
+        for listening in sockets:
+            self._listeners.append(
+                Listener(listening, self._outer, self._on_turned_away, context=self._context, handshake_s=REQUEST_S)
+            )
+
+    def close(self) -> None:
+        """Accept nobody any more."""
+        for listener in self._listeners:
+            listener.close()
+
+    async def end(self) -> None:
+        """After all connections have been closed: end what is left."""
+        await self._runner.cleanup()
+
+    # -- connections ---------------------------------------------------------------------------------------------
+
+    def _outer(self) -> _Outer:
+        server = self._runner.server
+        assert server is not None
+        return _Outer(cast("asyncio.Protocol", server()), self)
+
+    def enter(self, host: str) -> bool:
+        """Whether one more HTTP connection of this address is let in."""
+        if self._allow and not is_in(host, self._allow):
+            return False
+        if self._at_http[host] >= HTTP_PER_ADDRESS or self._at_http.total() >= HTTP_IN_ALL:
+            self._on_turned_away(host)
+            return False
+        self._at_http[host] += 1
+        return True
+
+    def leave(self, host: str) -> None:
+        """One is no HTTP connection any more."""
+        self._at_http[host] -= 1
+        if self._at_http[host] <= 0:
+            del self._at_http[host]
+
+    # -- requests ------------------------------------------------------------------------------------------------
+
+    def _middle(self) -> Any:
+        @web.middleware
+        async def middle(request: web.Request, handler: Answer) -> web.StreamResponse:
+            outer = _outer_of(request)
+            host = request.headers.get("Host", "")
+            origin = request.headers.get("Origin")
+            problem = host_problem(host, self._names) or origin_problem(origin, host, self._settings.web_origins)
+            if problem is not None:
+                log.warning("%s: a web request is refused: %s", outer.host, problem)
+                return web.json_response({"error": problem}, status=403)
+            try:
+                response = await handler(request)
+            finally:
+                outer.wait()
+            if not response.prepared:
+                response.headers["Cache-Control"] = "no-store"
+                response.headers["X-Content-Type-Options"] = "nosniff"
+            return response
+
+        return middle
+
+    async def _hello(self, request: web.Request) -> web.StreamResponse:
+        return web.Response(text=f"A macs gateway. Programs open a WebSocket at {WEBSOCKET_PATH}.\n")
+
+    async def _login(self, request: web.Request) -> web.StreamResponse:
+        """A token for a cookie, which pages cannot read."""
+        token = await _said(request, "token")
+        if self._door.find(token) is None:
+            return self._wrong(request)
+        response = web.json_response({"ok": True})
+        response.set_cookie(
+            COOKIE,
+            token or "",
+            httponly=True,
+            samesite="Strict",
+            secure=self._context is not None,
+            path="/",
+            max_age=COOKIE_S,
+        )
+        return response
+
+    async def _pair(self, request: web.Request) -> web.StreamResponse:
+        """A code that somebody was shown for a token, once."""
+        code = await _said(request, "code")
+        token = await self._door.exchange(code) if code is not None else None
+        if token is None:
+            return self._wrong(request)
+        return web.json_response({"token": token})
+
+    def _wrong(self, request: web.Request) -> web.Response:
+        self._door.failed(self._entrance, _outer_of(request).host)
+        return web.json_response(WRONG, status=401)
+
+    async def _websocket(self, request: web.Request) -> web.StreamResponse:
+        offered = [each.strip() for each in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
+        shown = next((each[len(TOKEN_SUBPROTOCOL) :] for each in offered if each.startswith(TOKEN_SUBPROTOCOL)), None)
+        shown = request.cookies.get(COOKIE) if shown is None else shown
+        if shown is not None and self._door.find(shown) is None:
+            return self._wrong(request)
+        socket = web.WebSocketResponse(
+            protocols=(SUBPROTOCOL,), timeout=CLOSE_S, autoping=False, compress=False, max_msg_size=MESSAGE_BYTES + 1
+        )
+        if not socket.can_prepare(request):
+            return web.json_response(
+                {"error": "a WebSocket is wanted here"}, status=426, headers={"Upgrade": "websocket"}
+            )
+        await socket.prepare(request)
+        outer = _outer_of(request)
+        connection = self._connect(self._entrance)
+        connection.shown_token = shown
+        stream = WebSocketTransport(socket, outer.transport, connection)
+        outer.upgraded(stream)
+        stream.begin()
+        try:
+            await stream.read()
+        finally:
+            stream.lost(None)
+        return socket
+
+
+def _outer_of(request: web.Request) -> _Outer:
+    transport = request.transport
+    if transport is None:
+        raise web.HTTPBadRequest  # it is gone
+    return cast("_Outer", transport.get_protocol())
+
+
+async def _said(request: web.Request, name: str) -> str | None:
+    """A text in the JSON object that a request brings; None for whatever else it brings."""
+    with suppress(ValueError, UnicodeDecodeError, RecursionError, web.HTTPRequestEntityTooLarge):
+        body = json.loads(await request.read())
+        if isinstance(body, dict) and isinstance(body.get(name), str):
+            return str(body[name])
+    return None
+
+
+class _Outer(asyncio.Protocol):
+    """What a socket of the web port talks to: aiohttp's protocol, within limits of time that it does not have."""
+
+    def __init__(self, inner: asyncio.Protocol, port: WebPort) -> None:
+        self._inner = inner
+        self._port = port
+        self.transport: asyncio.Transport
+        self.host = "?"
+        self._stream: WebSocketTransport | None = None
+        self._counted = False
+        self._timer: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast(asyncio.Transport, transport)
+        name = transport.get_extra_info("peername")
+        self.host = of_peer(str(name[0])) if name else "?"
+        if not self._port.enter(self.host):
+            self.transport.abort()
+            return
+        self._counted = True
+        self.wait()
+        self._inner.connection_made(transport)
+
+    def data_received(self, data: bytes) -> None:
+        if self._counted or self._stream is not None:
+            self._inner.data_received(data)
+
+    def eof_received(self) -> bool | None:
+        return self._inner.eof_received() if self._counted or self._stream is not None else None
+
+    def pause_writing(self) -> None:
+        self._inner.pause_writing()
+        if self._stream is not None:
+            self._stream.connection.pause_writing()
+
+    def resume_writing(self) -> None:
+        self._inner.resume_writing()
+        if self._stream is not None:
+            self._stream.connection.resume_writing()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._stop_waiting()
+        entered = self._counted or self._stream is not None
+        self._leave()
+        if entered:
+            self._inner.connection_lost(exc)
+        if self._stream is not None:
+            self._stream.lost(exc)
+
+    def wait(self) -> None:
+        """For a whole request and its answer, from now on."""
+        self._stop_waiting()
+        if self._stream is None and not self.transport.is_closing():
+            self._timer = asyncio.get_running_loop().call_later(REQUEST_S, self._late)
+
+    def upgraded(self, stream: WebSocketTransport) -> None:
+        """From now on this is an agent's connection, which others count."""
+        self._stream = stream
+        self._stop_waiting()
+        self._leave()
+
+    def _stop_waiting(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _leave(self) -> None:
+        if self._counted:
+            self._counted = False
+            self._port.leave(self.host)
+
+    def _late(self) -> None:
+        self._timer = None
+        self.transport.abort()
+
+
+class WebSocketTransport(asyncio.Transport):
+    """A WebSocket as a `Connection` sees it: a transport of bytes."""
+
+    def __init__(self, socket: web.WebSocketResponse, below: asyncio.Transport, connection: Connection) -> None:
+        super().__init__()
+        self.connection = connection
+        self._socket = socket
+        self._below = below
+        self._closing: asyncio.Task[bool] | None = None
+        self._lost = False
+        self._may_read = asyncio.Event()
+        self._may_read.set()
+        self._spare = Credit(PINGS_PER_S, time.monotonic())
+
+    def begin(self) -> None:
+        """The connection is there."""
+        self.connection.connection_made(self)
+
+    def lost(self, exc: Exception | None) -> None:
+        """It has ended."""
+        if not self._lost:
+            self._lost = True
+            self._may_read.set()
+            self.connection.connection_lost(exc)
+
+    async def read(self) -> None:
+        """Give the connection what comes, until the end."""
+        while not self._lost:
+            await self._may_read.wait()
+            message = await self._socket.receive()
+            if message.type is WSMsgType.BINARY:
+                await self._feed(message.data)
+            elif message.type in (WSMsgType.PING, WSMsgType.PONG):
+                if not self._spares():
+                    return
+                if message.type is WSMsgType.PING:
+                    with suppress(ConnectionError):
+                        await self._socket.pong(message.data)
+            elif message.type is WSMsgType.TEXT:
+                await self._end(WSCloseCode.UNSUPPORTED_DATA, "it sends text, which nothing here understands")
+                return
+            elif message.type is WSMsgType.ERROR:
+                self.connection.complain("bad_websocket", f"what it sends is no WebSocket: {message.data}")
+                return
+            else:  # closed, by us or by the other end
+                return
+
+    async def _feed(self, data: bytes) -> None:
+        connection, view = self.connection, memoryview(data)
+        if not len(view):
+            self._spares()
+        while len(view) and not self.is_closing() and not self._lost:
+            if not self._may_read.is_set():
+                await self._may_read.wait()
+                continue
+            space = connection.get_buffer(-1)
+            size = min(len(space), len(view))
+            space[:size] = view[:size]
+            del space  # a view that is kept would keep a frame from growing
+            connection.buffer_updated(size)
+            view = view[size:]
+
+    def _spares(self) -> bool:
+        """Whether it has not sent too much that says nothing; who has is gone."""
+        if self._spare.take(1, time.monotonic()):
+            return True
+        self.connection.complain("too_many_pings", f"more than {PINGS_PER_S:g} pings or empty messages a second")
+        self.abort()
+        return False
+
+    async def _end(self, code: WSCloseCode, why: str) -> None:
+        self.connection.complain("not_binary", why)
+        with suppress(ConnectionError):
+            await self._socket.close(code=code)
+
+    # -- a transport ---------------------------------------------------------------------------------------------
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        """As the transport below; ``websocket`` is true."""
+        return True if name == "websocket" else self._below.get_extra_info(name, default)
+
+    def is_closing(self) -> bool:
+        return self._closing is not None or self._lost or self._below.is_closing()
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        self.writelines([data])
+
+    def writelines(self, list_of_data: Any) -> None:
+        """Whole WebSocket messages. aiohttp writes its own, which are pongs and the last one, whole as well."""
+        if not self.is_closing():
+            self._below.writelines(list(_messages(list_of_data)))
+
+    def get_write_buffer_size(self) -> int:
+        return self._below.get_write_buffer_size()
+
+    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+        self._below.set_write_buffer_limits(high, low)
+
+    def pause_reading(self) -> None:
+        self._may_read.clear()
+
+    def resume_reading(self) -> None:
+        self._may_read.set()
+
+    def close(self) -> None:
+        """Say goodbye behind what was written."""
+        if not self.is_closing():
+            self._may_read.set()
+            self._closing = asyncio.get_running_loop().create_task(self._socket.close(code=WSCloseCode.OK))
+
+    def abort(self) -> None:
+        self._below.abort()
+
+
+Piece = bytes | bytearray | memoryview
+
+
+def _messages(chunks: Sequence[Piece]) -> Iterator[Piece]:
+    """Binary messages of at most MESSAGE_BYTES, each behind its header, as a server sends them: not masked."""
+    pieces: list[Piece] = []
+    size = 0
+    for chunk in chunks:
+        for begin in range(0, len(chunk), MESSAGE_BYTES):
+            piece = chunk if len(chunk) <= MESSAGE_BYTES else memoryview(chunk)[begin : begin + MESSAGE_BYTES]
+            if size + len(piece) > MESSAGE_BYTES:
+                yield _header(size)
+                yield from pieces
+                pieces, size = [], 0
+            pieces.append(piece)
+            size += len(piece)
+    if size:
+        yield _header(size)
+        yield from pieces
+
+
+def _header(size: int) -> bytes:
+    """Of a binary message that is one WebSocket frame (RFC 6455, 5.2)."""
+    if size < 126:
+        return struct.pack("!BB", 0x82, size)
+    if size < 1 << 16:
+        return struct.pack("!BBH", 0x82, 126, size)
+    return struct.pack("!BBQ", 0x82, 127, size)
