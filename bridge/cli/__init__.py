@@ -31,6 +31,7 @@ from bridge.cli import (
     running,
     security,
     stop,
+    token,
     up,
 )
 from macs_zenoh.errors import ConfigError, MacsError, UsageError
@@ -49,6 +50,7 @@ VERBS = {
     "doctor": doctor,
     "security": security,
     "conformance": conformance,
+    "token": token,
     "init": init,
     "keys": keys,
     "interfaces": interfaces,

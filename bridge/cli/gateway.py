@@ -7,6 +7,7 @@ examples:
   macs gateway --host 0.0.0.0                              headsets from the network
   macs gateway --workers 4                                 four processes behind one port
   macs gateway --robots 1,2                                existing robot programs too, as robots 1 and 2
+  macs gateway --host 0.0.0.0 --without-token nobody       headsets with a token (macs token create)
   macs gateway --port 7001 -e tcp/10.0.0.1:7447 -e tcp/10.0.0.2:7447   two routers, for fail-over
 
 what it prints:
@@ -20,6 +21,7 @@ import logging
 import resource
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
 
 from bridge import memory
 from bridge.cli import options, running
@@ -27,8 +29,11 @@ from bridge.cli.supervisor import Child, stop_in_order
 from bridge.listening import bound
 from bridge.settings import GatewaySettings, Settings
 from macs_zenoh.errors import UsageError
-from macs_zenoh.protocol.addresses import is_local, joined
+from macs_zenoh.protocol.addresses import is_local, joined, reachable
 from macs_zenoh.sections import changed
+
+if TYPE_CHECKING:
+    from bridge.gateway import Gateway
 
 log = logging.getLogger("macs.gateway")
 
@@ -43,6 +48,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--host", help="address to listen on (default: 127.0.0.1; 0.0.0.0 for the network, :: with IPv6)"
     )
     parser.add_argument("--port", type=int, help="TCP port (default: 7000; 0 for any free one)")
+    parser.add_argument("--tls-port", type=int, help="port for the same over TLS; needs --certificate and --key")
+    parser.add_argument("--certificate", metavar="FILE", help="certificate (PEM) of the TLS port and of the web port")
+    parser.add_argument("--key", metavar="FILE", help="its key (PEM)")
+    parser.add_argument("--web-port", type=int, help="port for HTTP and WebSocket (default: none; 0 for any free one)")
+    parser.add_argument("--web-host", help="address of the web port (default: as --host)")
+    parser.add_argument("--tokens", metavar="FILE", help="file of tokens (default: as `macs token`)")
+    parser.add_argument(
+        "--without-token",
+        metavar="WHO",
+        help="who may come without a token to any port: nobody, everybody, or networks as 10.0.3.0/24,10.0.4.0/24"
+        " (default: everybody to the plain port; to the others nobody, unless only this machine reaches them)",
+    )
     parser.add_argument(
         "--allow", metavar="NETWORK", action="append", help="who may connect, as 192.168.1.0/24; repeat for more"
     )
@@ -64,12 +81,25 @@ def _robots(text: str) -> list[int] | str:
     return text if text == "any" else [int(each) for each in text.split(",")]
 
 
+def _without_token(who: str | None) -> dict[str, str | list[str] | None]:
+    """For all ports alike; a settings file can say it of each."""
+    said = who if who in (None, "nobody", "everybody") else who.split(",")
+    return {f"{port}_without_token": said for port in ("plain", "tls", "web")}
+
+
 def run(args: argparse.Namespace) -> int:
     settings = options.settings(args)
     listen_on = changed(
         settings.gateway,
         host=args.host,
         port=args.port if args.be_worker_on_port is None else args.be_worker_on_port,
+        tls_port=args.tls_port,
+        web_port=args.web_port,
+        web_host=args.web_host,
+        certificate=args.certificate,
+        key=args.key,
+        tokens_file=args.tokens,
+        **_without_token(args.without_token),
         allow=args.allow,
         block=args.block,
         robots=args.robots,
@@ -128,6 +158,14 @@ def _raise_descriptor_limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
+def _other_ports(gateway: Gateway) -> str:
+    """The ports besides the plain one, for who reads what is printed."""
+    ports = gateway.listeners
+    tls = f", TLS on port {ports.tls_port}" if ports.tls_port else ""
+    secure = "s" if ports.web_context is not None else ""
+    return tls + (f", http{secure}://{joined(reachable(ports.web_host), ports.web_port)}" if ports.web_port else "")
+
+
 async def _serve(settings: Settings) -> int:
     from bridge.doctor.first import told_while_waiting
     from bridge.gateway import Gateway
@@ -145,12 +183,20 @@ async def _serve(settings: Settings) -> int:
             gateway = Gateway(mesh, listening, own)
             try:
                 await gateway.start()
-                if not listening.allow and not is_local(listening.host):
+                open_to_all = listening.plain_without_token == "everybody"  # noqa: S105 - no password
+                if not listening.allow and not is_local(listening.host) and open_to_all:
                     log.warning(
-                        "%s is open: whoever reaches it is a headset; --allow says which networks", gateway.address
+                        "%s is open: whoever reaches it is a headset; --allow says which networks, and"
+                        " --without-token nobody that a token is wanted (macs token)",
+                        gateway.address,
                     )
-                running.say_ready(f"gateway on {gateway.address}")
+                running.say_ready(f"gateway on {gateway.address}{_other_ports(gateway)}")
                 await locked_out(mesh)
-                listening = changed(listening, port=gateway.port)  # headsets that come back look for it there
+                listening = changed(  # headsets that come back look for it there
+                    listening,
+                    port=gateway.port,
+                    tls_port=gateway.listeners.tls_port or None,
+                    web_port=gateway.listeners.web_port or None,
+                )
             finally:
                 await gateway.close()

@@ -21,6 +21,7 @@ what it prints:
 from __future__ import annotations
 
 import argparse
+import os
 from typing import Any
 
 from bridge.cli import output
@@ -32,8 +33,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from bridge.headset import verbs  # light: no asyncio, no rosbags
 
     parser.add_argument(
-        "target", metavar="HOST[:PORT]", type=verbs.parse_target, help="a gateway (default port: 7000)"
+        "target",
+        metavar="HOST[:PORT]",
+        type=verbs.parse_target,
+        help="a gateway (default port: 7000), or ws://HOST:PORT",
     )
+    parser.add_argument(
+        "--token",
+        metavar="TOKEN",
+        default=os.environ.get("MACS_TOKEN") or None,
+        help="what the gateway wants to see (macs token); better in $MACS_TOKEN, since others see a command line",
+    )
+    parser.add_argument("--tls", action="store_true", help="over TLS, to the gateway's TLS port")
+    parser.add_argument("--ca", metavar="FILE", help="over TLS, and trust the certificates of this authority (PEM)")
     parser.add_argument("--group", type=verbs.group_id, default=0, metavar="G", help="be in this group, 1..255")
     parser.add_argument("--reconnect", action="store_true", help="when the connection ends make a new one")
     parser.add_argument(

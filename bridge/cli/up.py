@@ -38,6 +38,7 @@ from bridge.settings import GatewaySettings, RobotSettings, Settings
 from macs_zenoh.errors import MacsError, Unreachable, UsageError
 from macs_zenoh.protocol import endpoints
 from macs_zenoh.protocol.addresses import EVERYWHERE, joined, reachable
+from macs_zenoh.protocol.websocket import WEBSOCKET_PATH
 from macs_zenoh.sections import changed
 from macs_zenoh.timeouts import within
 
@@ -47,6 +48,9 @@ SUMMARY = "all of it on this machine: router, gateway, robot"
 
 DEFAULT_ROBOT = 1
 ROUTER_PORT = 7447
+WEB_PORT = 7080
+WEB_HOST = "127.0.0.1"
+"""Of the web port unless settings say otherwise: who comes there needs no token, and browsers call it secure."""
 DEMO_BLOCK = 1
 """Of ids for those who connect over TCP: none of them gets the demo robot's, should it be a robot, too."""
 READY_S = 20.0
@@ -79,6 +83,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--port", type=int, help="TCP port for headsets (default: 7000; 0: a free one)")
     parser.add_argument("--router-port", type=int, help=f"port of the router (default: {ROUTER_PORT}; 0: free)")
+    parser.add_argument(
+        "--web-port",
+        type=int,
+        help=f"port for HTTP and WebSocket (default: {WEB_PORT}, or a free one where that is taken)",
+    )
     parser.add_argument("--id", type=int, help=f"id of the robot (default: {DEFAULT_ROBOT})")
     parser.add_argument("--group", type=int, help="group of the robot (default: none)")
     parser.add_argument(
@@ -129,6 +138,8 @@ class Plan:
     def gateway_child(self) -> Child:
         block = [] if self.gateway.block is None else ["--block", str(self.gateway.block)]
         where = ["--host", self.gateway.host, "--port", str(self.gateway.port)]
+        if self.gateway.web_port is not None and self.gateway.web_host is not None:
+            where += ["--web-host", self.gateway.web_host, "--web-port", str(self.gateway.web_port)]
         return self._child("gateway", [*self._mesh(), *where, *block])
 
     def robot_children(self) -> list[Child]:
@@ -163,6 +174,7 @@ def make_plan(args: argparse.Namespace, settings: Settings) -> Plan:
         chosen = gateway.port != GatewaySettings().port
         port = _port(gateway.host, gateway.port, "choose another one with --port", apart, chosen=chosen)
         router_port = None if routers else _router_port(gateway.host, args.router_port, apart)
+        gateway = _with_web_port(gateway, args.web_port, apart)
     except BaseException:
         if apart is not None:
             apart.close()
@@ -177,6 +189,20 @@ def make_plan(args: argparse.Namespace, settings: Settings) -> Plan:
         once=args.once,
         verbose=args.verbose,
     )
+
+
+def _with_web_port(gateway: GatewaySettings, wanted: int | None, apart: Apart | None) -> GatewaySettings:
+    """The web port: where it is said to be, or at the usual place if there is a web server and room."""
+    host = gateway.web_host or WEB_HOST
+    chosen = wanted if wanted is not None else gateway.web_port
+    if chosen is not None:
+        port = _port(host, chosen, "choose another one with --web-port", apart, chosen=True)
+    elif importlib.util.find_spec("aiohttp") is None:
+        log.info("no web port: pip install 'macs-zenoh[web]'")
+        return gateway
+    else:
+        port = _free(host, WEB_PORT) or _port(host, 0, "choose another one with --web-port", apart, chosen=False)
+    return changed(gateway, web_host=host, web_port=port)
 
 
 def _router_port(host: str, wanted: int | None, apart: Apart | None) -> int:
@@ -293,12 +319,18 @@ def what_next(plan: Plan) -> str:
         f"  receive a topic    macs headset {target} sub {topic}",
         f"  drive              macs headset {target} pub /cmd_vel geometry_msgs/Twist {DRIVE}",
         f"A Unity headset connects to {where}.",
+        *([_web_line(plan)] if plan.gateway.web_port is not None else []),
     ]
     if not seen_from_outside:
         lines.append("To let headsets and robots in from the network, start with --host 0.0.0.0.")
     if plan.apart is not None:
         lines.append(f"Its ROS side: {plan.apart.shown} ros2 topic list")
     return "\n".join(lines)
+
+
+def _web_line(plan: Plan) -> str:
+    host = reachable(plan.gateway.web_host or plan.gateway.host)
+    return f"Programs with WebSocket connect to ws://{joined(host, plan.gateway.web_port or 0)}{WEBSOCKET_PATH}."
 
 
 def _say(text: str) -> None:

@@ -23,6 +23,7 @@ import asyncio
 import contextlib
 import itertools
 import logging
+from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from types import TracebackType
@@ -37,6 +38,7 @@ from macs_zenoh.protocol.messages import (
     EXTENSIONS,
     OTHER_TYPE,
     ROS,
+    AccessRefused,
     DataRefused,
     Metadata,
     NodeRefused,
@@ -66,6 +68,7 @@ from .nodes import (
     Subscription,
     fail_all,
 )
+from .stream import TCP, Way
 
 log = logging.getLogger("macs.headset")
 
@@ -105,6 +108,8 @@ class Headset:
         heartbeat_s: float = HEARTBEAT_S,
         max_message_bytes: int = MAX_FRAME_BYTES,
         extensions: int = EXTENSIONS,
+        token: str | None = None,
+        way: Way = TCP,
         on_link: Callable[[Link], object] | None = None,
     ) -> None:
         self.host = host
@@ -117,6 +122,12 @@ class Headset:
         self._heartbeat_s = heartbeat_s
         self._max_message_bytes = max_message_bytes
         self._extensions = extensions
+        self._token = token
+        self._way = way
+        self._not_let_in = ""
+        """Why the gateway does not let this headset in; it makes no sense to come again."""
+        self.forbidden: deque[AccessRefused] = deque(maxlen=INBOX_MESSAGES)
+        """What its token does not permit, as the gateway has told it."""
         self._on_link = on_link
         self._nodes: dict[tuple[int, str], Node] = {}
         self._inbox: Mailbox[Incoming] = Mailbox(INBOX_MESSAGES)
@@ -143,16 +154,20 @@ class Headset:
         heartbeat_s: float = HEARTBEAT_S,
         max_message_bytes: int = MAX_FRAME_BYTES,
         extensions: int = EXTENSIONS,
+        token: str | None = None,
+        way: Way = TCP,
         on_link: Callable[[Link], object] | None = None,
     ) -> Headset:
         """Connect, wait for the router's first message and answer it.
 
         ``group`` 0 is none. With ``reconnect`` a lost connection is made again and again until `close`, and every
         node is registered anew; the first connection is tried once. ``extensions`` is the version of our extensions
-        of the protocol that it says it understands; with 0 it is an existing program to its gateway. ``on_link`` hears
-        every start and end.
+        of the protocol that it says it understands; with 0 it is an existing program to its gateway. ``token`` is
+        shown to the gateway, and ``way`` says whether that is reached over TLS or WebSocket. ``on_link`` hears every
+        start and end.
 
-        Raises Unreachable when there is no connection, or no id as its first message within ``handshake_timeout_s``.
+        Raises Unreachable when there is no connection, or no id as its first message within ``handshake_timeout_s``;
+        Refused when the gateway does not take the token.
         """
         headset = cls(
             host,
@@ -163,11 +178,15 @@ class Headset:
             heartbeat_s=heartbeat_s,
             max_message_bytes=max_message_bytes,
             extensions=extensions,
+            token=token,
+            way=way,
             on_link=on_link,
         )
         await headset._join()
         loop = asyncio.get_running_loop()
         headset._tasks = [loop.create_task(headset._live()), loop.create_task(headset._beat())]
+        if token is not None:
+            await headset._be_let_in()
         return headset
 
     async def __aenter__(self) -> Headset:
@@ -485,7 +504,11 @@ class Headset:
 
     async def _join(self) -> None:
         connection = await Connection.open(
-            self.host, self.port, timeout_s=self._handshake_s, max_message_bytes=self._max_message_bytes
+            self.host,
+            self.port,
+            timeout_s=self._handshake_s,
+            max_message_bytes=self._max_message_bytes,
+            way=self._way,
         )
         try:
             first = await connection.receive_first(self._handshake_s)
@@ -502,6 +525,16 @@ class Headset:
         log.info("online at %s with id %d", self.target, self.id)
         self._tell_link(Link(True, self.id))
 
+    async def _be_let_in(self) -> None:
+        """Wait until the gateway has taken the token. Raises Refused, Unreachable."""
+        try:
+            await self.online(self._handshake_s)
+        except Unreachable:
+            await self.abort()
+            if self._not_let_in:
+                raise Refused(self._not_let_in) from None
+            raise
+
     def _take_id(self, metadata: Metadata, data: bytes) -> None:
         if metadata.message_manager != Welcome.manager:
             raise WireError(f"it is {metadata.message_manager or metadata.node_name!r}, not {Welcome.manager!r}")
@@ -509,7 +542,7 @@ class Headset:
         self._welcome_request = metadata.request_id
 
     def _configuration(self, own_id: int) -> bytes:
-        return frames.configuration(own_id, self.group, self._welcome_request, self._extensions)
+        return frames.configuration(own_id, self.group, self._welcome_request, self._extensions, self._token)
 
     async def _live(self) -> None:
         """Read until the end; with ``reconnect`` join again and register everything."""
@@ -519,7 +552,9 @@ class Headset:
                 self._connection.abort()
             self._connection = None
             self._fail_open(Unreachable(self.target, why))
-            if not self._reconnect:
+            if self._not_let_in:
+                why = self._not_let_in
+            if not self._reconnect or self._not_let_in:
                 self._finish(why)
                 return
             log.warning("connection to %s lost: %s", self.target, why)
@@ -586,15 +621,22 @@ class Headset:
     def _take_refusal(self, message: Incoming) -> None:
         """Tell the node that a robot, or its gateway, refused it or what was sent for it."""
         refused: NodeRefused | DataRefused
+        by_gateway = message.sender_type is None
+        if message.metadata.message_manager == AccessRefused.manager and by_gateway:
+            self._take_access(decode_data(AccessRefused, message.data))
+            return
         if message.metadata.message_manager == NodeRefused.manager:
             refused = decode_data(NodeRefused, message.data)
+        elif message.metadata.message_manager == DataRefused.manager and by_gateway:
+            refused = decode_data(DataRefused, message.data)  # for robots to which it passes nothing on
         elif message.metadata.message_manager == DataRefused.manager and message.sender_type == ROS:
             refused = msgspec.structs.replace(decode_data(DataRefused, message.data), robot_id=message.sender_id or 0)
         else:
             return
         node = self._nodes.get((refused.node_type, refused.node_name))
         if node is not None:
-            node.refused(refused.robot_id, refused.reason, final=_is_final(refused))
+            for robot in [refused.robot_id] if refused.robot_id else sorted(node.agents) or [0]:
+                node.refused(robot, refused.reason, final=_is_final(refused))
         else:
             log.warning("robot %d refused %s: %s", refused.robot_id, refused.tos_name, refused.reason)
 
@@ -617,6 +659,18 @@ class Headset:
             return False
         answer.set_result(message.data)
         return True
+
+    def _take_access(self, refused: AccessRefused) -> None:
+        """What the gateway does not permit."""
+        if refused.kind in ("no_token", "ended"):
+            self._not_let_in = refused.reason
+        log.warning("%s: %s", self.target, refused.reason)
+        if refused.kind == "not_permitted":
+            self.forbidden.append(refused)
+            asked = [answer for (_, number), answer in self._asked.items() if number == refused.request_id]
+            if refused.request_id in self._open:
+                asked.append(self._open[refused.request_id])
+            fail_all(asked, Refused(refused.reason))
 
     async def _beat(self) -> None:
         loop = asyncio.get_running_loop()

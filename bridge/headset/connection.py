@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import socket
 from collections import deque
 
 from macs_zenoh.errors import Unreachable
@@ -14,9 +13,10 @@ from macs_zenoh.protocol.addresses import joined
 from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.timeouts import within
 
+from .stream import TCP, Stream, Way, open_stream
+
 log = logging.getLogger("macs.headset")
 
-_READ_BYTES = 256 << 10
 _DRAIN_ABOVE_BYTES = 256 << 10
 _GOODBYE_S = 1.0
 _SILENT_S = 0.5
@@ -28,16 +28,14 @@ class Connection:
 
     def __init__(
         self,
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
+        stream: Stream,
         place: tuple[str, int],
         max_message_bytes: int,
     ) -> None:
         self.target = joined(*place)
         self._place = place
         self.last_output = 0.0
-        self._reader = reader
-        self._writer = writer
+        self._stream = stream
         self._decoder = MessageDecoder(max_message_bytes, skip_large=True)
         self.too_large = 0
         """How many messages were let go of because they were."""
@@ -45,19 +43,18 @@ class Connection:
         self._draining = asyncio.Lock()
 
     @classmethod
-    async def open(cls, host: str, port: int, *, timeout_s: float, max_message_bytes: int) -> Connection:
+    async def open(
+        cls, host: str, port: int, *, timeout_s: float, max_message_bytes: int, way: Way = TCP
+    ) -> Connection:
         """Connect. Raises Unreachable."""
         target = joined(host, port)
         try:
-            reader, writer = await within(asyncio.open_connection(host, port), timeout_s)
+            stream = await within(open_stream(host, port, way), timeout_s)
         except asyncio.TimeoutError as error:
             raise Unreachable(target, f"no connection within {timeout_s:g} s") from error
         except OSError as error:
             raise Unreachable(target, error.strerror or str(error)) from error
-        raw = writer.get_extra_info("socket")
-        if raw is not None:
-            raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return cls(reader, writer, (host, port), max_message_bytes)
+        return cls(stream, (host, port), max_message_bytes)
 
     async def receive_first(self, timeout_s: float) -> bytes:
         """The router's first message. Raises Unreachable when none comes within ``timeout_s``: a Zenoh router, which
@@ -96,7 +93,7 @@ class Connection:
         """The next whole message. Raises Unreachable at the end of the connection, FrameTooLarge."""
         while not self._whole:
             try:
-                data = await self._reader.read(_READ_BYTES)
+                data = await self._stream.read()
             except OSError as error:
                 raise Unreachable(self.target, error.strerror or str(error)) from error
             if not data:
@@ -115,30 +112,29 @@ class Connection:
 
     async def send(self, frame: bytes) -> None:
         """Write one frame; wait only while much is unsent. Raises Unreachable when the connection is gone."""
-        if self._writer.is_closing():
+        if self._stream.closing:
             raise Unreachable(self.target, "the connection is closed")
-        self._writer.write(frame)
+        self._stream.write(frame)
         self.last_output = asyncio.get_running_loop().time()
-        if self._writer.transport.get_write_buffer_size() <= _DRAIN_ABOVE_BYTES:
+        if self._stream.unsent <= _DRAIN_ABOVE_BYTES:
             return
         try:
             async with self._draining:  # before Python 3.11 only one task may wait at a time
-                await self._writer.drain()
+                await self._stream.drain()
         except OSError as error:
             raise Unreachable(self.target, error.strerror or str(error)) from error
 
     async def close(self) -> None:
         """Send what is written, then close. Waits at most a second for a peer that does not take it."""
         with contextlib.suppress(OSError, asyncio.TimeoutError, RuntimeError):
-            # Half-closing first: closing a socket with unread data would reset it and lose our last frames.
-            self._writer.write_eof()
+            self._stream.finish()
             await within(self._read_to_end(), _GOODBYE_S)
         self.abort()
 
     def abort(self) -> None:
         """Drop the connection without a word, as a headset that lost power."""
-        self._writer.transport.abort()
+        self._stream.abort()
 
     async def _read_to_end(self) -> None:
-        while await self._reader.read(_READ_BYTES):
+        while await self._stream.read():
             pass

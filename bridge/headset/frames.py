@@ -53,10 +53,11 @@ class NodeSpec:
         object.__setattr__(self, "name", node_name(self.tos_name))
 
 
-def configuration(agent_id: int, group: int, request_id: int, extensions: int = 0) -> bytes:
+def configuration(agent_id: int, group: int, request_id: int, extensions: int = 0, token: str | None = None) -> bytes:
     """The answer to the router's first message: who I am. ``request_id`` is that message's.
 
-    ``extensions`` is what the C# program does not say: the version of our extensions that this headset understands.
+    ``extensions`` is what the C# program does not say: the version of our extensions that this headset understands;
+    and so is ``token``, by which it is let in.
     """
     management: dict[str, object] = {
         "agentType": UNITY,
@@ -65,7 +66,11 @@ def configuration(agent_id: int, group: int, request_id: int, extensions: int = 
         "requestId": request_id,
         "messageManager": Configuration.manager,
     }
-    return _management_frame({**management, "extensions": extensions} if extensions else management)
+    if extensions:
+        management["extensions"] = extensions
+    if token is not None:
+        management["token"] = token
+    return _management_frame(management)
 
 
 def heartbeat() -> bytes:

@@ -17,7 +17,8 @@ from macs_zenoh.timeouts import within
 
 from .client import Headset
 from .session import Emit, Session
-from .verbs import script_parser
+from .stream import Way
+from .verbs import WebTarget, script_parser
 
 _BACKGROUND = {"sub", "serve", "listen"}
 
@@ -31,9 +32,11 @@ async def perform(args: argparse.Namespace, emit: Emit) -> int:
     session = Session(emit, args.types)
     if args.headset_verb != "run":
         session.prepare(args)
-    host, port = args.target
+    host, port, *_ = args.target
     try:
-        headset = await Headset.connect(host, port, group=args.group, reconnect=args.reconnect)
+        headset = await Headset.connect(
+            host, port, group=args.group, reconnect=args.reconnect, token=args.token, way=_way(args)
+        )
         async with headset:
             session.use(headset)
             if args.headset_verb != "run":
@@ -42,6 +45,12 @@ async def perform(args: argparse.Namespace, emit: Emit) -> int:
             return await Script(session, emit, keep_going=args.keep_going).run(lines)
     except asyncio.CancelledError:
         return session.stopped_code
+
+
+def _way(args: argparse.Namespace) -> Way:
+    """How the command line wants the gateway to be reached."""
+    web = args.target if isinstance(args.target, WebTarget) else None
+    return Way(websocket=web is not None, tls=args.tls or bool(web and web.tls) or bool(args.ca), authority=args.ca)
 
 
 class Script:

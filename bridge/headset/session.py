@@ -351,12 +351,16 @@ class Session:
     async def _send(self, args: argparse.Namespace) -> Job:
         async def work() -> int:
             data = args.text.encode()
+            self.headset.forbidden.clear()
             await self.headset.send(
                 data, to=agent_type(args.to), ids=args.ids, groups=args.groups, manager=args.manager
             )
             sent = {"to": args.to, "ids": args.ids, "groups": args.groups, "bytes": len(data)}
             online = await self.headset.online()
             there = {"ros": online.ros_agent_ids, "unity": online.unity_agent_ids}.get(args.to, [])
+            if self.headset.forbidden:
+                self._emit({**sent, "refused": self.headset.forbidden[-1].reason})
+                return 1
             absent = [number for number in args.ids if number not in there]
             self._emit({**sent, "absent": absent} if absent else sent)
             return 1 if absent else 0

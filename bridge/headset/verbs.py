@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from macs_zenoh.errors import UsageError
 from macs_zenoh.protocol import addresses
+from macs_zenoh.protocol.websocket import WEBSOCKET_PATH
 
 SETTLE_S = 0.5
 """How long `pub` waits between registering and its first message, unless told otherwise."""
@@ -63,10 +64,30 @@ def add_run(verbs: Any) -> None:
     run.add_argument("--keep-going", action="store_true", help="go on after a line that failed")
 
 
-def parse_target(text: str) -> tuple[str, int]:
-    """``HOST:PORT``, ``[IPV6]:PORT`` or ``HOST`` (then port 7000). Raises argparse.ArgumentTypeError."""
+class WebTarget(NamedTuple):
+    """A gateway's web port."""
+
+    host: str
+    port: int
+    tls: bool
+
+
+WEB_PORT = 7080
+
+
+def parse_target(text: str) -> tuple[str, int] | WebTarget:
+    """``HOST:PORT``, ``[IPV6]:PORT`` or ``HOST`` (then port 7000); or ``ws://…``, ``wss://…`` (port 7080).
+    Raises argparse.ArgumentTypeError."""
     try:
-        return addresses.parse(text, 7000)
+        scheme, web, rest = text.partition("://")
+        if not web:
+            return addresses.parse(text, 7000)
+        if scheme not in ("ws", "wss", "http", "https"):
+            raise ValueError(f"{scheme}:// is no way to a gateway; say ws:// or wss://")
+        host, path, after = rest.partition("/")
+        if path and "/" + after not in ("/", WEBSOCKET_PATH):
+            raise ValueError(f"a gateway's WebSocket is at {WEBSOCKET_PATH}")
+        return WebTarget(*addresses.parse(host, WEB_PORT), scheme in ("wss", "https"))
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 

@@ -111,7 +111,7 @@ async def test_a_wrong_greeting_ends_it(greeting: bytes, why: str) -> None:
 
 async def test_small_frames_leave_at_once(headset: Headset) -> None:
     """Nagle's algorithm is off: commands are small and must not wait for each other."""
-    raw = headset._connection._writer.get_extra_info("socket")  # type: ignore[union-attr]
+    raw = headset._connection._stream._writer.get_extra_info("socket")  # type: ignore[union-attr]
     assert raw.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 
