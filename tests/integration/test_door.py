@@ -1,0 +1,554 @@
+"""The ports of a gateway, who is let in there, and what a token permits: real sockets, TLS and WebSockets."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import json
+import os
+import ssl
+import time
+import tracemalloc
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import NamedTuple
+
+import aiohttp
+import pytest
+
+from bridge.gateway import Gateway
+from bridge.headset.client import Headset
+from bridge.headset.stream import Way
+from bridge.tokens import store
+from macs_zenoh.agent import Agent, join
+from macs_zenoh.errors import Refused, Unreachable
+from macs_zenoh.protocol.decoders import MessageDecoder
+from macs_zenoh.protocol.messages import (
+    ROS,
+    UNITY,
+    AccessRefused,
+    Configuration,
+    decode_data,
+    encode_data,
+    encode_management,
+)
+from macs_zenoh.protocol.rights import Rights
+from macs_zenoh.protocol.tokens import Token, hash_of, new_pairing, new_secret
+from macs_zenoh.protocol.websocket import SUBPROTOCOL, TOKEN_SUBPROTOCOL
+from macs_zenoh.protocol.wire import encode_frame, split_message
+from tests.support.certificates import Authority
+from tests.support.given import StartGateway
+from tests.support.local import patient
+from tests.support.waiting import until
+
+PORTS = ["plain", "tls", "web", "web_tls"]
+
+
+class Tokens:
+    """A file of tokens."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def make(self, name: str, **rights: object) -> str:
+        """A token with these rights; its secret."""
+        secret = new_secret(os.urandom(32))
+        expires_at = rights.pop("expires_at", None)
+        token = Token(name=name, rights=Rights(**rights), hashes=[hash_of(secret)], expires_at=expires_at)  # type: ignore[arg-type]
+        store.change(self.path, lambda tokens: (tokens.with_token(token), None))
+        return secret
+
+    def revoke(self, name: str) -> None:
+        """End one."""
+        store.change(self.path, lambda tokens: (tokens.without(name), None))
+
+
+@pytest.fixture
+def tokens(tmp_path: Path) -> Tokens:
+    """Of a site that has none yet."""
+    return Tokens(tmp_path / "macs" / "tokens.json")
+
+
+class Door(NamedTuple):
+    """A gateway with all its ports, of which ``web`` is without TLS and ``web_tls`` another gateway's."""
+
+    gateway: Gateway
+    other: Gateway
+    authority: str
+    tokens: Tokens
+
+    def way(self, port: str) -> tuple[int, Way]:
+        """How it is reached there."""
+        ports = self.gateway.listeners
+        if port == "plain":
+            return ports.port, Way()
+        if port == "tls":
+            return ports.tls_port, Way(tls=True, authority=self.authority)
+        if port == "web":
+            return ports.web_port, Way(websocket=True)
+        return self.other.listeners.web_port, Way(websocket=True, tls=True, authority=self.authority)
+
+    async def come(self, port: str, token: str | None = None, **options: object) -> Headset:
+        """A headset by way of one of the ports."""
+        number, way = self.way(port)
+        return await Headset.connect("127.0.0.1", number, token=token, way=way, **options)  # type: ignore[arg-type]
+
+
+StartDoor = Callable[..., Awaitable[Door]]
+
+
+@pytest.fixture
+async def start_door(start_gateway: StartGateway, tokens: Tokens, tmp_path: Path) -> StartDoor:
+    """Starts it; keyword arguments are settings."""
+    authority = Authority(tmp_path / "ca")
+    certificate, key = authority.issue("gateway")
+
+    async def start(**settings: object) -> Door:
+        said = {"tokens_file": str(tokens.path), "certificate": str(certificate), "key": str(key), **settings}
+        gateway = await start_gateway(tls_port=0, web_port=0, **said)
+        # of one that others can reach, but nobody is told
+        other = await start_gateway(web_port=0, **{**said, "web_host": "0.0.0.0"})
+        return Door(gateway, other, str(authority.ca), tokens)
+
+    return start
+
+
+NOBODY = {"plain_without_token": "nobody", "tls_without_token": "nobody", "web_without_token": "nobody"}
+
+
+@pytest.fixture
+async def robots(router: str) -> AsyncIterator[list[Agent]]:
+    """Robots 1 and 2, the first in group 3, the second in group 4."""
+    async with AsyncExitStack() as stack:
+        made = []
+        for number in (1, 2):
+            joining = join(ROS, id=number, group=3 if number == 1 else 4, settings=patient(router))
+            agent = await stack.enter_async_context(joining)
+            made.append(agent)
+        yield made
+
+
+@pytest.mark.parametrize("port", PORTS)
+async def test_each_port_leads_to_the_same_agents(start_door: StartDoor, port: str) -> None:
+    """A headset that came by TLS or WebSocket and one that came plainly send each other anything, small and large."""
+    door = await start_door(web_without_token="everybody")
+    async with await door.come(port, group=3) as one, await Headset.connect("127.0.0.1", door.gateway.port) as two:
+        await until(lambda: len([*door.gateway.agents.online(), *door.other.agents.online()]) == 2)
+        await asyncio.sleep(0.2)
+        for size in (0, 1, 125, 126, 65_535, 65_536, 3 << 20):
+            data = os.urandom(size)
+            await one.send(data, to=UNITY, ids=[two.id])
+            assert (await two.receive(10)).data == data
+            await two.send(data, to=UNITY, ids=[one.id])
+            assert (await one.receive(10)).data == data
+        for number in range(2000):
+            await one.send(b"%d" % number, to=UNITY, ids=[two.id])
+        assert [int((await two.receive(10)).data) for _ in range(2000)] == list(range(2000))
+
+
+@pytest.mark.parametrize("port", PORTS)
+async def test_nobody_is_let_in_without_a_token(start_door: StartDoor, port: str) -> None:
+    """Wrong, ended, revoked, cut off or foreign: each gets the same words, and an agent of none of them was seen."""
+    door = await start_door(**NOBODY)
+    good = door.tokens.make("good", may=["see"])
+    ended = door.tokens.make("ended", expires_at=time.time() - 1)
+    revoked = door.tokens.make("revoked")
+    door.tokens.revoke("revoked")
+    async with await door.come(port, good) as let_in:
+        await let_in.online()
+    told = set()
+    for shown in (ended, revoked, good[:-1], good + "x", new_secret(os.urandom(32)), "x", "", "x" * 5000):
+        with pytest.raises(Refused) as refused:
+            await door.come(port, shown)
+        told.add(str(refused.value))
+    async with await door.come(port) as without:
+        told.add(await without.wait_ended())
+    assert told == {"a valid token is wanted here"}
+    await until(lambda: not [*door.gateway.agents.connections(), *door.other.agents.connections()])
+    assert (door.gateway.drops + door.other.drops)["NotAdmitted"] == 9
+
+
+@pytest.mark.parametrize("port", PORTS)
+async def test_a_token_is_held_to_its_rights(start_door: StartDoor, robots: list[Agent], port: str) -> None:
+    """What a token permits arrives, what it does not makes no byte arrive, and its agent is told."""
+    door = await start_door(**NOBODY)
+    heard: dict[int, list[bytes]] = {1: [], 2: []}
+    for robot in robots:
+        robot.on_message(lambda message, number=robot.id: heard[number].append(bytes(message.data)))
+    token = door.tokens.make("anna", may=["ask", "send"], robots=[1], groups=[3])
+    async with await door.come(port, token) as anna, await door.come(port, token) as bert:
+        await asyncio.sleep(0.3)
+        await anna.send(b"allowed", to=ROS, ids=[1])
+        for forbidden in ({"ids": [2]}, {"ids": [1, 2]}, {"groups": [4]}, {"ids": [1], "groups": [4]}):
+            await anna.send(b"forbidden", to=ROS, **forbidden)  # type: ignore[arg-type]
+        await anna.send(b"forbidden")  # to everybody
+        await anna.send(b"hello", to=UNITY, ids=[bert.id])
+        assert (await bert.receive(5)).data == b"hello"
+        await anna.send(b"last", to=ROS, ids=[1])
+        await until(lambda: b"last" in heard[1])
+        assert heard == {1: [b"allowed", b"last"], 2: []}
+        await anna.online()
+        assert {refused.kind for refused in anna.forbidden} == {"not_permitted"}
+        assert len(anna.forbidden) >= 4
+    await until(lambda: (door.gateway.drops + door.other.drops)["NotPermitted"] == 5)
+
+
+async def test_a_revoked_token_ends_its_connections(start_door: StartDoor) -> None:
+    """Within a second, on each port, with a hundred connections; others stay."""
+    door = await start_door(**NOBODY)
+    lost, kept = door.tokens.make("lost"), door.tokens.make("kept")
+    ports = [PORTS[number % len(PORTS)] for number in range(100)]
+    async with AsyncExitStack() as stack:
+        gone = [await stack.enter_async_context(await door.come(port, lost)) for port in ports]
+        stays = [await stack.enter_async_context(await door.come(port, kept)) for port in PORTS]
+        began = time.monotonic()
+        door.tokens.revoke("lost")
+        reasons = await asyncio.wait_for(asyncio.gather(*(headset.wait_ended() for headset in gone)), 30)
+        took_s = time.monotonic() - began
+        assert set(reasons) == {"this token holds no longer"}
+        print(f"100 connections ended {took_s:.2f} s after their token")
+        for headset in stays:
+            await headset.online()
+        with pytest.raises(Refused):
+            await door.come("plain", lost)
+
+
+async def test_changed_rights_hold_at_once(start_door: StartDoor, robots: list[Agent]) -> None:
+    """A token that may do less may do less on the connections that it has, and they are told; more, likewise."""
+    door = await start_door(**NOBODY)
+    heard: list[bytes] = []
+    robots[0].on_message(lambda message: heard.append(bytes(message.data)))
+    token = door.tokens.make("anna", may=["ask"], robots=[1])
+    async with await door.come("plain", token) as anna:
+        await asyncio.sleep(0.3)
+
+        async def change(may: list[str]) -> None:
+            def edit(now):  # type: ignore[no-untyped-def]
+                rights = Rights(may=may, robots=[1])  # type: ignore[arg-type]
+                return now.with_token(Token(name="anna", rights=rights, hashes=now.named("anna").hashes)), None
+
+            store.change(door.tokens.path, edit)
+            while (message := await anna.receive(5)).metadata.message_manager != AccessRefused.manager or (
+                decode_data(AccessRefused, message.data).kind != "changed"
+            ):
+                pass
+
+        await anna.send(b"one", to=ROS, ids=[1])
+        await change(["see"])
+        await anna.send(b"two", to=ROS, ids=[1])
+        await change(["ask"])
+        await anna.send(b"three", to=ROS, ids=[1])
+        await until(lambda: b"three" in heard)
+        assert heard == [b"one", b"three"]
+
+
+async def test_loopback_needs_no_token_unless_it_is_said(start_door: StartDoor) -> None:
+    """TLS and web want a token where others reach them, and nowhere else; the plain port where that is said."""
+    door = await start_door()
+    for port in ("plain", "tls", "web"):
+        async with await door.come(port) as headset:
+            await headset.online()
+    async with await door.come("web_tls") as headset:
+        assert await headset.wait_ended() == "a valid token is wanted here"
+
+
+async def test_who_shows_a_token_is_judged_by_it(start_door: StartDoor, robots: list[Agent]) -> None:
+    """Also where none is wanted: a wrong one is refused, and a right one gives its rights and no more."""
+    door = await start_door()
+    with pytest.raises(Refused):
+        await door.come("plain", "macs_wrong")
+    async with await door.come("plain", door.tokens.make("anna", may=["see"], robots=[1])) as anna:
+        await anna.send(b"x", to=ROS, ids=[2])
+        await until(lambda: anna.forbidden)
+
+
+@pytest.mark.parametrize("old", ["TLSv1", "TLSv1_1"])
+async def test_old_tls_is_refused(start_door: StartDoor, old: str) -> None:
+    """Nothing below TLS 1.2, and nothing plain on the TLS port."""
+    door = await start_door()
+    context = ssl.create_default_context(cafile=door.authority)
+    context.minimum_version = ssl.TLSVersion.MINIMUM_SUPPORTED
+    context.maximum_version = ssl.TLSVersion[old]
+    context.set_ciphers("ALL:@SECLEVEL=0")
+    with pytest.raises((ssl.SSLError, OSError)):
+        await asyncio.open_connection("127.0.0.1", door.gateway.listeners.tls_port, ssl=context)
+    with pytest.raises(Unreachable):
+        await Headset.connect("127.0.0.1", door.gateway.listeners.tls_port, handshake_timeout_s=1.0)
+
+
+async def test_a_new_certificate_is_shown_without_a_restart(start_door: StartDoor, tmp_path: Path) -> None:
+    """Renewed files are what the next connection sees; files that do not fit change nothing."""
+    door = await start_door()
+    port, way = door.way("tls")
+    files = door.gateway.settings.certificate, door.gateway.settings.key
+    assert files[0] is not None
+    assert files[1] is not None
+    Path(files[0]).write_text("no certificate")
+    await asyncio.sleep(0.6)
+    async with await door.come("tls") as headset:
+        await headset.online()
+    other = Authority(tmp_path / "other ca")
+    certificate, key = other.issue("gateway")
+    Path(files[1]).write_bytes(key.read_bytes())
+    Path(files[0]).write_bytes(certificate.read_bytes())
+
+    async def shown() -> bool:
+        try:
+            async with await Headset.connect("127.0.0.1", port, way=Way(tls=True, authority=str(other.ca))):
+                return True
+        except Unreachable:
+            return False
+
+    deadline = time.monotonic() + 5
+    while not await shown():
+        assert time.monotonic() < deadline
+    with pytest.raises(Unreachable):
+        await Headset.connect("127.0.0.1", port, way=way)
+
+
+# -- the web port ----------------------------------------------------------------------------------------------------
+
+
+def url(door: Door, path: str, scheme: str = "http") -> str:
+    """An address of the web port without TLS."""
+    return f"{scheme}://127.0.0.1:{door.gateway.listeners.web_port}{path}"
+
+
+async def test_a_token_travels_as_subprotocol_or_cookie(start_door: StartDoor) -> None:
+    """A browser, which has no headers for it, comes by either; with a wrong one it gets no WebSocket."""
+    door = await start_door(**NOBODY)
+    token = door.tokens.make("page", may=["see"])
+    async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session:
+        offered = (SUBPROTOCOL, TOKEN_SUBPROTOCOL + token)
+        async with session.ws_connect(url(door, "/macs", "ws"), protocols=offered) as socket:
+            assert socket.protocol == SUBPROTOCOL
+            assert b"AgentConfigurer" in (await socket.receive_bytes())
+        for wrong in (token[:-1], "x", "macs_" + "a" * 43):
+            with pytest.raises(aiohttp.WSServerHandshakeError) as error:
+                await session.ws_connect(url(door, "/macs", "ws"), protocols=(SUBPROTOCOL, TOKEN_SUBPROTOCOL + wrong))
+            assert error.value.status == 401
+        for body in ({"token": "x"}, {"token": 1}, {}, [], {"token": token[:-1]}):
+            async with session.post(url(door, "/login"), json=body) as response:
+                assert response.status == 401
+                assert await response.json() == {"error": "a valid token is wanted here"}
+                assert not response.cookies
+        async with session.post(url(door, "/login"), json={"token": token}) as response:
+            assert response.status == 200
+            cookie = response.cookies["macs_token"]
+            assert cookie["httponly"]
+            assert cookie["samesite"] == "Strict"
+        async with session.ws_connect(url(door, "/macs", "ws")) as socket:
+            assert b"AgentConfigurer" in (await socket.receive_bytes())
+
+
+async def test_a_code_is_exchanged_once(start_door: StartDoor) -> None:
+    """Six digits give a token of one's own; a second time, and after five wrong ones, they give nothing."""
+    door = await start_door(**NOBODY)
+    door.tokens.make("anna", may=["see"])
+
+    def pair() -> None:
+        pairing = new_pairing("anna", "123456", os.urandom(32), time.time())
+        store.change(door.tokens.path, lambda tokens: (tokens.with_pairing(pairing, time.time()), None))
+
+    async with aiohttp.ClientSession() as session:
+
+        async def exchange(code: object) -> str | None:
+            async with session.post(url(door, "/pair"), json={"code": code}) as response:
+                answer = json.loads(await response.read())
+                assert answer.get("error", "a valid token is wanted here") == "a valid token is wanted here"
+                assert response.status == (200 if "token" in answer else 401)
+                return str(answer["token"]) if "token" in answer else None
+
+        assert await exchange("123456") is None
+        pair()
+        token = await exchange("123456")
+        assert token is not None
+        async with await door.come("web", token) as headset:
+            await headset.online()
+        assert await exchange("123456") is None
+        pair()
+        for number in range(5):
+            assert await exchange(f"00000{number}") is None
+        assert await exchange("123456") is None
+
+
+async def test_another_page_gets_no_websocket(start_door: StartDoor) -> None:
+    """The origin must be the gateway's own or be listed, and the host an address or a known name."""
+    door = await start_door(web_origins=["https://listed.example.org"], web_names=["hall.example.org"])
+    own = f"127.0.0.1:{door.gateway.listeners.web_port}"
+    async with aiohttp.ClientSession() as session:
+        for headers, allowed in [
+            ({}, True),
+            ({"Origin": f"http://{own}"}, True),
+            ({"Origin": "https://listed.example.org"}, True),
+            ({"Origin": "http://evil.example"}, False),
+            ({"Origin": "http://evil.example", "Host": "evil.example"}, False),
+            ({"Host": "evil.example"}, False),
+            ({"Host": "hall.example.org", "Origin": "https://hall.example.org"}, True),
+        ]:
+            if allowed:
+                async with session.ws_connect(url(door, "/macs", "ws"), headers=headers):
+                    pass
+            else:
+                with pytest.raises(aiohttp.WSServerHandshakeError) as error:
+                    await session.ws_connect(url(door, "/macs", "ws"), headers=headers)
+                assert error.value.status == 403
+
+
+async def raw_websocket(port: int, *headers: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """A WebSocket whose bytes are in one's own hands."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    lines = [
+        "GET /macs HTTP/1.1",
+        f"Host: 127.0.0.1:{port}",
+        "Upgrade: websocket",
+        "Connection: Upgrade",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+        *headers,
+    ]
+    writer.write("\r\n".join([*lines, "", ""]).encode())
+    assert b" 101 " in await reader.readuntil(b"\r\n\r\n")
+    return reader, writer
+
+
+def masked(first: int, payload: bytes, declared: int | None = None) -> bytes:
+    """A client's WebSocket frame, masked with zeros; ``first`` is its first byte."""
+    size = len(payload) if declared is None else declared
+    if size < 126:
+        return bytes([first, 0x80 | size]) + bytes(4) + payload
+    if size < 1 << 16:
+        return bytes([first, 0x80 | 126]) + size.to_bytes(2, "big") + bytes(4) + payload
+    return bytes([first, 0x80 | 127]) + size.to_bytes(8, "big") + bytes(4) + payload
+
+
+BAD_WEBSOCKETS = {
+    "larger than a message may be": [masked(0x82, bytes(1 << 20) + b"xx")],
+    "declared without end": [masked(0x82, b"x", declared=1 << 62)],
+    "fragments without end": [masked(0x02, bytes(1 << 18)), *[masked(0x00, bytes(1 << 18))] * 5],
+    "compressed": [masked(0xC2, bytes(100))],
+    "text": [masked(0x81, b"hello")],
+    "no such opcode": [masked(0x83, b"hello")],
+    "a continuation of nothing": [masked(0x80, b"hello")],
+    "a ping in pieces": [masked(0x09, b"x")],
+    "a large ping": [masked(0x89, bytes(126))],
+    "a flood of pings": [masked(0x89, b"x") * 1000],
+    "a flood of pongs": [masked(0x8A, b"x") * 1000],
+    "a flood of nothing": [masked(0x82, b"") * 1000],
+    "a frame that is too large": [masked(0x82, bytes(35) + b"\xff" * 4 + bytes(61))],
+}
+
+
+@pytest.mark.parametrize("what", BAD_WEBSOCKETS)
+async def test_a_bad_websocket_costs_its_own_connection(start_door: StartDoor, what: str) -> None:
+    """Whatever comes instead of messages ends that connection, and nobody else notices."""
+    door = await start_door()
+    port = door.gateway.listeners.web_port
+    async with await door.come("web") as neighbour:
+        reader, writer = await raw_websocket(port, "Sec-WebSocket-Extensions: permessage-deflate")
+        for piece in BAD_WEBSOCKETS[what]:
+            writer.write(piece)
+        with contextlib.suppress(ConnectionError):
+            await asyncio.wait_for(reader.read(), 10)  # to the end
+        writer.close()
+        await neighbour.online()
+        await until(lambda: len(door.gateway.agents) == 1)
+
+
+async def test_slow_headers_get_their_time_and_no_more(start_door: StartDoor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who sends a request a byte at a time, or nothing, or a body without end, is closed; the port stays open."""
+    monkeypatch.setattr("bridge.gateway.web.REQUEST_S", 0.5)
+    door = await start_door()
+    port = door.gateway.listeners.web_port
+    beginnings = [b"", b"GET /macs HTT", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: "]
+    beginnings += [b"POST /login HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 1000\r\n\r\n{"]
+    ended = []
+
+    async def slow(beginning: bytes) -> None:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(beginning)
+        with contextlib.suppress(ConnectionError):
+            reading = asyncio.ensure_future(reader.read())
+            while not reading.done():
+                writer.write(b"x")
+                await asyncio.sleep(0.05)
+        writer.close()
+        ended.append(beginning)
+
+    await asyncio.wait_for(asyncio.gather(*map(slow, beginnings)), 20)
+    assert len(ended) == len(beginnings)
+    async with await door.come("web") as headset:
+        await headset.online()
+
+
+async def test_one_address_has_so_many_http_connections(start_door: StartDoor) -> None:
+    """Who opens many gets no more than its share, and each that ends makes room; WebSockets are counted elsewhere."""
+    door = await start_door()
+    port = door.gateway.listeners.web_port
+    async with await door.come("web") as headset:
+        opened = [await asyncio.open_connection("127.0.0.1", port) for _ in range(200)]
+        await until(lambda: door.gateway.drops["no_descriptors"] == 200 - 128)
+        for _, writer in opened:
+            writer.close()
+        await headset.online()
+        await asyncio.sleep(0.2)
+        async with await door.come("web") as other:
+            await other.online()
+
+
+@pytest.mark.alone
+async def test_ten_thousand_attempts_leave_nothing_behind(
+    start_door: StartDoor, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Without, with ended, revoked, cut-off and foreign tokens: none gets in, no memory stays, and the log counts."""
+    door = await start_door(**NOBODY)
+    good = door.tokens.make("good")
+    wrong = [
+        None,
+        good[:-1],
+        new_secret(os.urandom(32)),
+        door.tokens.make("ended", expires_at=time.time() - 1),
+        "x" * 999,
+    ]
+    port = door.gateway.listeners.port
+    answers = set()
+
+    async def attempt(shown: str | None) -> None:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        configuration = Configuration(UNITY, 0, token=shown)
+        writer.write(encode_frame(management=encode_management(configuration)))
+        everything = await reader.read()
+        messages = MessageDecoder().feed(everything)
+        answers.add(bytes(split_message(messages[1])[1]))
+        assert len(messages) == 2
+        writer.close()
+
+    async def many(count: int) -> None:
+        gate = asyncio.Semaphore(50)
+
+        async def one(number: int) -> None:
+            async with gate:
+                await attempt(wrong[number % len(wrong)])
+
+        await asyncio.wait_for(asyncio.gather(*(one(number) for number in range(count))), 100)
+
+    await many(500)
+    gc.collect()
+    tracemalloc.start()
+    await many(500)
+    gc.collect()
+    before, _ = tracemalloc.get_traced_memory()
+    await many(9_000)
+    gc.collect()
+    after, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert answers == {encode_data(AccessRefused("no_token", "a valid token is wanted here"))}
+    await until(lambda: door.gateway.drops["NotAdmitted"] == 10_000)
+    print(f"10 000 attempts: {after - before} bytes more")
+    assert after - before < 64 << 10
+    shown = [record.getMessage() for record in caplog.records if "shows no valid token" in record.getMessage()]
+    assert shown[0].startswith("127.0.0.1 shows no valid token at the plain port")
+    assert len(shown) <= 3
+    assert not any(secret in caplog.text for secret in (good, good[:-1]))
