@@ -1,5 +1,6 @@
 # make run    a headset, a mesh and a robot on this machine, without hardware
-# make test   the tests;  make test-all   and those that take minutes, as CI;  make lint   ruff, mypy and codespell
+# make check  in a minute: make lint (ruff, mypy and codespell) and the tests of single modules
+# make test   the tests;  make test-all   and those that take minutes, as CI
 # make bench  the speed ratios;  make clean
 # make attacks    every attack on a running site, as a table;  make chaos   an hour of kills, floods and cuts
 # make docs   the pages as a site, in build/docs;  make docs-links   and whether the links out of it still lead somewhere
@@ -29,7 +30,7 @@ VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)
 INTERFACES := $(if $(findstring ros,$(EXTRAS)),$(VENV)/.interfaces)
 
 .DEFAULT_GOAL := help
-.PHONY: help run install test test-all lint format bench attacks chaos docs docs-links zenohd clean
+.PHONY: help run install check test test-all lint format bench attacks chaos docs docs-links zenohd clean
 
 help:
 	@sed -n '/^$$/q; s/^# \{0,1\}//p' Makefile
@@ -57,6 +58,9 @@ $(VENV)/.interfaces: $(STAMP) $(wildcard interfaces/*/package.xml interfaces/*/m
 	@echo "building the ROS interfaces in interfaces/ (a few seconds, once)"
 	@if $(BIN)/macs interfaces build interfaces/as2_ca_msgs --into build/interfaces --install >/dev/null; \
 	  then touch $@; else echo "macs awareness will not run until this is done: make install"; fi
+
+check: lint
+	@$(BIN)/python -m tests.run --fast
 
 # A whole run that ran no ROS test proves too little, so it fails (tests/conftest.py); a chosen part may.
 test: install

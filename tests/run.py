@@ -1,7 +1,7 @@
 """The tests: those that may share the machine at the same time, then one by one those that measure time.
 
-``python -m tests.run`` is what ``make test`` runs; with ``--all`` those that take minutes too (``make test-all``, CI).
-A part of the tests is plain pytest: ``make test ARGS=tests/unit``.
+``python -m tests.run`` is what ``make test`` runs; ``--all`` adds those that take minutes (``make test-all``, CI);
+``--fast`` is those of single modules (``make check``). A part is plain pytest: ``make test ARGS=tests/unit``.
 """
 
 from __future__ import annotations
@@ -11,16 +11,21 @@ import re
 import subprocess
 import sys
 
-WORKERS = 4
+from tests.support import tools
+
+WORKERS = 6
 """More than this machine may have cores: most tests wait most of the time."""
+BUSY_WORKERS = max(2, os.cpu_count() or 1)
+"""For tests that do not wait."""
 
 TIERS = "not chaos and not kin"
 
 
-def part(name: str, *argv: str) -> tuple[bool, int, int]:
+def part(name: str, *argv: str, workers: int = 0) -> tuple[bool, int, int]:
     """Run pytest; whether it went well, and how many tests passed and failed."""
     print(f"::: {name}", flush=True)
-    process = subprocess.Popen([sys.executable, "-m", "pytest", *argv], stdout=subprocess.PIPE, text=True)
+    shared = ("-n", str(workers), "--dist", "worksteal") if workers else ()
+    process = subprocess.Popen([sys.executable, "-m", "pytest", *shared, *argv], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     closing = ""
     for line in process.stdout:
@@ -31,11 +36,20 @@ def part(name: str, *argv: str) -> tuple[bool, int, int]:
     return good, counts.get("passed", 0), counts.get("failed", 0) + counts.get("error", 0)
 
 
-def main() -> int:
-    tiers = TIERS if "--all" in sys.argv[1:] else f"{TIERS} and not soak"
-    parts = [part("together", "-n", str(WORKERS), "--dist", "loadfile", "-m", f"{tiers} and not alone")]
+def run(words: list[str]) -> list[tuple[bool, int, int]]:
+    """The parts that were asked for."""
+    if "--fast" in words:
+        return [part("fast", "tests/unit", workers=BUSY_WORKERS)]
+    tiers = TIERS if "--all" in words else f"{TIERS} and not soak"
+    parts = [part("together", "-m", f"{tiers} and not alone", workers=WORKERS)]
     os.environ.pop("MACS_NEED_ROS_TESTS", None)  # judged by the first part
-    parts.append(part("alone", "-m", f"{tiers} and alone"))
+    return [*parts, part("alone", "-m", f"{tiers} and alone")]
+
+
+def main() -> int:
+    parts = run(sys.argv[1:])
+    if (advice := tools.advice()) is not None:
+        print(advice)
     print(f"{sum(passed for _, passed, _ in parts)} passed, {sum(failed for *_, failed in parts)} failed")
     return 0 if all(good for good, *_ in parts) else 1
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from bridge.cli import VERBS
+from tests.support.once import made_once
 from tests.support.programs import ROOT
 
 SETTINGS = ["macs.toml", "one-host/robot.toml", "systemd/macs-robot.service", "security/site.yaml"]
@@ -30,15 +31,18 @@ VERSION = "1.2.3rc1"
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with wheel and sdist of this checkout, built beside it: an old build/ must not help."""
-    sources, folder = tmp_path_factory.mktemp("sources"), tmp_path_factory.mktemp("dist")
-    copy_sources(sources)
-    environment = {"SETUPTOOLS_SCM_PRETEND_VERSION_FOR_MACS_ZENOH": VERSION}
-    build("sdist", sources, folder, **environment)
-    (sdist,) = folder.glob("*.tar.gz")
-    with tarfile.open(sdist) as archive:
-        archive.extractall(folder, filter="data")
-    build("wheel", folder / sdist.name.removesuffix(".tar.gz"), folder)  # the sdist knows its version
-    return folder
+    sources = tmp_path_factory.mktemp("sources")
+
+    def make(folder: Path) -> None:
+        copy_sources(sources)
+        environment = {"SETUPTOOLS_SCM_PRETEND_VERSION_FOR_MACS_ZENOH": VERSION}
+        build("sdist", sources, folder, **environment)
+        (sdist,) = folder.glob("*.tar.gz")
+        with tarfile.open(sdist) as archive:
+            archive.extractall(folder, filter="data")
+        build("wheel", folder / sdist.name.removesuffix(".tar.gz"), folder)  # the sdist knows its version
+
+    return made_once(tmp_path_factory, "dist", make)
 
 
 def copy_sources(into: Path) -> None:
@@ -57,14 +61,16 @@ def build(kind: str, sources: Path, into: Path, **environment: str) -> None:
 @pytest.fixture(scope="module")
 def macs(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The command of an environment that has the wheel, and our dependencies without us."""
-    folder = tmp_path_factory.mktemp("installed")
-    venv.create(folder, with_pip=False, symlinks=True)
-    site = next((folder / "lib").glob("python*/site-packages"))
-    (site / "dependencies.pth").write_text(f"{sysconfig.get_paths()['purelib']}\n")
-    (wheel,) = built.glob("*.whl")
-    install = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "install", "--quiet"]
-    subprocess.run([*install, "--no-index", "--no-deps", "--ignore-installed", str(wheel)], check=True)
-    return folder / "bin" / "macs"
+
+    def make(folder: Path) -> None:
+        venv.create(folder, with_pip=False, symlinks=True)
+        site = next((folder / "lib").glob("python*/site-packages"))
+        (site / "dependencies.pth").write_text(f"{sysconfig.get_paths()['purelib']}\n")
+        (wheel,) = built.glob("*.whl")
+        install = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "install", "--quiet"]
+        subprocess.run([*install, "--no-index", "--no-deps", "--ignore-installed", str(wheel)], check=True)
+
+    return made_once(tmp_path_factory, "installed", make) / "bin" / "macs"
 
 
 def run(*argv: object, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -20,6 +20,7 @@ os.environ.pop("ROS_STATIC_PEERS", None)
 from bridge.interfaces import build
 from bridge.ros.session import RosSession
 from tests.support.isolation import worker_number
+from tests.support.once import made_once
 from tests.support.ros_peer import Peer
 
 DOMAINS = 100
@@ -29,10 +30,14 @@ for _ in range((os.getpid() + worker_number() * DOMAINS // 8) % DOMAINS):
     next(_domains)
 
 
-def _installed(package: str, into: Path) -> Path:
+def _installed(package: str, factory: pytest.TempPathFactory) -> Path:
     """An interface package, built from its definitions; the processes of a test find it as well. Its prefix."""
-    with zipfile.ZipFile(build(Path(__file__).parent / package, into).wheel) as wheel:
-        wheel.extractall(into)
+
+    def make(into: Path) -> None:
+        with zipfile.ZipFile(build(Path(__file__).parent / package, into).wheel) as wheel:
+            wheel.extractall(into)
+
+    into = made_once(factory, package, make)
     prefix = next(into.glob("*.data")) / "data"
     sys.path.insert(0, str(into))
     for variable, value in (("AMENT_PREFIX_PATH", str(prefix)), ("PYTHONPATH", str(into))):
@@ -43,14 +48,14 @@ def _installed(package: str, into: Path) -> Path:
 @pytest.fixture(scope="session")
 def count_action(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """An action. None comes from PyPI."""
-    _installed("macs_test_msgs", tmp_path_factory.mktemp("actions"))
+    _installed("macs_test_msgs", tmp_path_factory)
     return importlib.import_module("macs_test_msgs.action").Count
 
 
 @pytest.fixture(scope="session")
 def kinds(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Messages with every kind of field: the module that has them."""
-    _installed("macs_kinds_msgs", tmp_path_factory.mktemp("kinds"))
+    _installed("macs_kinds_msgs", tmp_path_factory)
     return importlib.import_module("macs_kinds_msgs.msg")
 
 

@@ -13,6 +13,7 @@ import pytest
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
+from tests.support.once import made_once
 from tests.support.programs import ROOT, Program, free_port
 from tests.support.ros_peer import Peer, say_hello, set_bool
 from tests.support.waiting import get
@@ -28,11 +29,14 @@ pytestmark = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The program, compiled without a warning by the command that the file names."""
-    into = tmp_path_factory.mktemp("csharp") / "MacsHeadset.exe"
-    command = ["mcs", "-warnaserror", "-r:System.Runtime.Serialization", f"-out:{into}", str(SOURCE)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return into
+
+    def make(folder: Path) -> None:
+        out = f"-out:{folder / 'MacsHeadset.exe'}"
+        command = ["mcs", "-warnaserror", "-r:System.Runtime.Serialization", out, str(SOURCE)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    return made_once(tmp_path_factory, "csharp", make) / "MacsHeadset.exe"
 
 
 class CSharp:
