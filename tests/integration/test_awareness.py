@@ -57,7 +57,7 @@ async def test_a_message_reaches_its_receiver_only(meet: Meet) -> None:
         ("a", "t", b"to all", True),
     }
     assert (await modules[2].next()).data == b"to all"
-    assert await c.deliver("a", "t", b"end", deadline_s=5) is Outcome.DELIVERED
+    assert await c.deliver("a", "t", b"end", deadline_s=PATIENCE_S) is Outcome.DELIVERED
     assert (await modules[0].next()).data == b"end"
     assert all(module.received.empty() for module in modules)
 
@@ -73,7 +73,7 @@ async def test_delivery_is_known(meet: Meet) -> None:
     assert await a.deliver("nobody", "t", b"", deadline_s=0.1) is Outcome.NO_SUCH_AGENT
     assert await a.deliver("b", "t", b"", deadline_s=0.1) is Outcome.NOT_REGISTERED
     Module(b, "t")
-    assert await a.deliver("b", "t", b"x", deadline_s=5) is Outcome.DELIVERED
+    assert await a.deliver("b", "t", b"x", deadline_s=PATIENCE_S) is Outcome.DELIVERED
     assert a.counters == {"not_registered": 3, "no_such_agent": 2, "to_itself": 1, "delivered": 1}
 
 
@@ -84,7 +84,7 @@ async def test_an_unregistered_type_is_warned_of_once(meet: Meet, caplog: pytest
     await a.wait_for("b", "known", timeout_s=PATIENCE_S)
     for _ in range(5):
         a.send("b", "unknown", b"")
-    assert await a.deliver("b", "known", b"end", deadline_s=5) is Outcome.DELIVERED
+    assert await a.deliver("b", "known", b"end", deadline_s=PATIENCE_S) is Outcome.DELIVERED
     await module.next()
     await until(lambda: b.counters["unregistered"] == 5)
     assert [r.getMessage().count("unknown") for r in caplog.records if r.name == "macs.awareness"] == [1]
@@ -93,7 +93,7 @@ async def test_an_unregistered_type_is_warned_of_once(meet: Meet, caplog: pytest
 async def test_a_message_waits_for_its_receiver_until_its_deadline(meet: Meet) -> None:
     """A message to an agent that comes and registers later is delivered, once, when it has."""
     a = await meet("a")
-    delivery = asyncio.create_task(a.deliver("b", "t", b"waited", deadline_s=10))
+    delivery = asyncio.create_task(a.deliver("b", "t", b"waited", deadline_s=PATIENCE_S))
     b = await meet("b")
     assert not delivery.done()
     module = Module(b, "t")
@@ -155,7 +155,7 @@ async def test_any_text_is_a_name_and_a_type(meet: Meet, name: str) -> None:
     await a.wait_for(name, name, timeout_s=PATIENCE_S)
     assert a.send(name, name, b"1") is Outcome.SENT
     assert (await module.next())[:3] == ("a", name, b"1")
-    assert await b.deliver("a", name, b"2", deadline_s=5) is Outcome.DELIVERED
+    assert await b.deliver("a", name, b"2", deadline_s=PATIENCE_S) is Outcome.DELIVERED
     assert (await other.next())[:3] == (name, name, b"2")
 
 
@@ -170,7 +170,7 @@ async def test_what_cannot_be_sent_is_an_error(meet: Meet, receiver: str, messag
         a.send(receiver, message_type, b"")
     with pytest.raises(UsageError):
         await a.deliver("", "t", b"", deadline_s=1)
-    assert await a.deliver("b", "t", b"next", deadline_s=5) is Outcome.DELIVERED
+    assert await a.deliver("b", "t", b"next", deadline_s=PATIENCE_S) is Outcome.DELIVERED
     assert (await module.next()).data == b"next"
 
 
@@ -192,7 +192,7 @@ async def test_ten_megabytes_arrive_whole(meet: Meet, how: str) -> None:
         a.send("", "t", data)
         assert (await module.next()).data == data
     else:
-        assert await a.deliver("b", "t", data, deadline_s=20) is Outcome.DELIVERED
+        assert await a.deliver("b", "t", data, deadline_s=PATIENCE_S) is Outcome.DELIVERED
     assert a.send("b", "small", b"x") is Outcome.SENT
     assert (await small.next()).data == b"x"
     assert (await module.next()).data == data
@@ -208,7 +208,7 @@ async def test_a_name_belongs_to_one(meet: Meet, router: str) -> None:
     with pytest.raises(UsageError, match="'a' is already on the mesh"):
         await meet("a")
     b = await meet("b")
-    assert await b.deliver("a", "t", b"x", deadline_s=5) is Outcome.DELIVERED
+    assert await b.deliver("a", "t", b"x", deadline_s=PATIENCE_S) is Outcome.DELIVERED
     await module.next()
 
 
@@ -230,7 +230,7 @@ async def test_a_bad_message_costs_only_itself(meet: Meet, caplog: pytest.LogCap
         a.mesh.put(NAMED.of(name="b", message_type="t", from_name="a"), payload)
         a.mesh.put(NAMED_ALL.of(message_type="t", from_name="a"), payload)
         await a.mesh.query(NAMED.of(name="b", message_type="t", from_name="a"), payload, timeout_s=PATIENCE_S)
-    assert await a.deliver("b", "t", b"good", deadline_s=5) is Outcome.DELIVERED
+    assert await a.deliver("b", "t", b"good", deadline_s=PATIENCE_S) is Outcome.DELIVERED
     assert (await module.next()).data == b"good"
     await until(lambda: b.counters["bad_message"] == 9)
     assert len([r for r in caplog.records if "cannot be used" in r.getMessage()]) == 1
@@ -242,7 +242,7 @@ async def test_a_failing_callback_costs_the_others_nothing(meet: Meet, caplog: p
     b.register("t", lambda message: [][1])
     module = Module(b, "t")
     for data in (b"1", b"2"):
-        assert await a.deliver("b", "t", data, deadline_s=5) is Outcome.DELIVERED
+        assert await a.deliver("b", "t", data, deadline_s=PATIENCE_S) is Outcome.DELIVERED
         assert (await module.next()).data == data
     assert len([r for r in caplog.records if r.exc_info]) == 2
 
@@ -254,7 +254,7 @@ async def test_a_closed_registration_is_known(meet: Meet) -> None:
     await a.wait_for("b", "t", timeout_s=PATIENCE_S)
     modules[0].registration.close()
     modules[0].registration.close()
-    assert await a.deliver("b", "t", b"x", deadline_s=5) is Outcome.DELIVERED
+    assert await a.deliver("b", "t", b"x", deadline_s=PATIENCE_S) is Outcome.DELIVERED
     modules[1].registration.close()
     await until(lambda: not a.names.takes("b", "t"))
     assert a.send("b", "t", b"") is Outcome.NOT_REGISTERED
@@ -302,7 +302,7 @@ async def test_nothing_is_lost_for_ever_with_a_router(tmp_path: object) -> None:
             await router.stop()
             await until(lambda: not a.mesh.linked)
             assert a.send("b", "t", b"") is Outcome.NO_ROUTER
-            delivery = asyncio.create_task(a.deliver("b", "t", b"waited", deadline_s=20))
+            delivery = asyncio.create_task(a.deliver("b", "t", b"waited", deadline_s=PATIENCE_S))
             await router.start()
             assert await delivery is Outcome.DELIVERED
             assert (await module.next()).data == b"waited"

@@ -756,7 +756,7 @@ async def test_our_programs_work_with_the_generated_files(site: Site) -> None:
         received: asyncio.Queue[awareness.Received] = asyncio.Queue()
         second.register("planning", received.put_nowait)
         await drone.wait_for("drone8", "planning", timeout_s=PATIENCE_S)
-        assert await drone.deliver("drone8", "planning", b"by name", deadline_s=5) is Outcome.DELIVERED
+        assert await drone.deliver("drone8", "planning", b"by name", deadline_s=PATIENCE_S) is Outcome.DELIVERED
         assert (await asyncio.wait_for(received.get(), PATIENCE_S)).data == b"by name"
 
 

@@ -296,7 +296,7 @@ async def test_messages_by_name_are_limited(router: str) -> None:
         await a.wait_for("b", "t", timeout_s=PATIENCE_S)
         for number in range(100):
             a.send("b", "t", b"%d" % number)
-        assert await a.deliver("b", "t", b"end", deadline_s=5) is Outcome.DELIVERED
+        assert await a.deliver("b", "t", b"end", deadline_s=PATIENCE_S) is Outcome.DELIVERED
         await until(lambda: arrived[-1] == b"end")
         assert len(arrived) - 1 + one.mesh.drops["over_rate"] == 100
         assert len(arrived) >= 1 + 20 * BURST_S

@@ -26,7 +26,7 @@ from macs_zenoh.protocol.messages import ActionVerb, Metadata, NodeType
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import MACS, split_message
 from tests.support.ros_peer import Peer, adding, pause
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 COUNT = "macs_test_msgs/Count"
 
@@ -92,7 +92,7 @@ class Headset:
 async def site(session: RosSession, peer: Peer, count_action: Any) -> AsyncIterator[SimpleNamespace]:
     """A counting robot, headsets 5 and 6 of group 3, and 9 of none."""
     headsets = {number: Headset(number) for number in (5, 6, 9)}
-    rules = Rules(RobotSettings(call_timeout_s=1, rules=[TopicRule(match="/other", cancel_on_leave=True)]))
+    rules = Rules(RobotSettings(call_timeout_s=30, rules=[TopicRule(match="/other", cancel_on_leave=True)]))
     robot = Robot(
         session,
         7,
@@ -121,7 +121,7 @@ async def test_a_goal_gives_feedback_and_its_result(site: SimpleNamespace) -> No
     """Every step is told, then the result with its status."""
     goal = await site.five.client.send_goal(7, site.goal(5))
     seen = [deserialize_message(feedback, site.action.Feedback).at async for feedback in goal]
-    status, result = await goal.result(5)
+    status, result = await goal.result(PATIENCE_S)
     assert seen == [1, 2, 3, 4, 5]
     assert status == SUCCEEDED
     assert deserialize_message(result, site.action.Result).text == "done"
@@ -135,7 +135,7 @@ async def test_goals_of_several_headsets_run_at_once(site: SimpleNamespace) -> N
             for headset, to in ((site.five, 3), (site.six, 4), (site.five, 5))
         )
     )
-    reached = [deserialize_message((await goal.result(5)).data, site.action.Result).reached for goal in goals]
+    reached = [deserialize_message((await goal.result(PATIENCE_S)).data, site.action.Result).reached for goal in goals]
     assert reached == [3, 4, 5]
 
 
@@ -143,7 +143,7 @@ async def test_a_goal_is_canceled(site: SimpleNamespace) -> None:
     """The action agrees to stop, and the result says that it did."""
     goal = await site.five.client.send_goal(7, site.goal(1000))
     await goal.cancel()
-    status, result = await goal.result(5)
+    status, result = await goal.result(PATIENCE_S)
     assert status == CANCELED
     assert deserialize_message(result, site.action.Result).text == "canceled"
 
@@ -181,7 +181,7 @@ async def test_a_result_survives_a_lost_connection(site: SimpleNamespace) -> Non
     await until(lambda: node.status()["goals"][0]["finished"])
     site.five.online = True
     await site.five.client.ask_again()
-    assert (await goal.result(5)).status == SUCCEEDED
+    assert (await goal.result(PATIENCE_S)).status == SUCCEEDED
 
 
 async def test_a_successor_of_the_group_finds_the_goal(site: SimpleNamespace) -> None:
@@ -196,7 +196,7 @@ async def test_a_successor_of_the_group_finds_the_goal(site: SimpleNamespace) ->
         assert deserialize_message(feedback, site.action.Feedback).at > 0
         break
     await mine.cancel()
-    assert (await mine.result(5)).status == CANCELED
+    assert (await mine.result(PATIENCE_S)).status == CANCELED
 
 
 async def test_a_goal_is_not_the_next_ones_who_has_the_id(site: SimpleNamespace) -> None:
@@ -243,7 +243,7 @@ async def test_goals_end_with_their_headset_where_a_rule_says_so(site: SimpleNam
     assert states(node)[stays.id.hex()] in (ACCEPTED, EXECUTING)
     assert states(site.nodes.get(NodeType.ACTION, "nd__count"))[elsewhere.id.hex()] in (ACCEPTED, EXECUTING)
     await stays.cancel()
-    assert (await stays.result(5)).status == CANCELED
+    assert (await stays.result(PATIENCE_S)).status == CANCELED
     late.cancel()
     await site.peer.session.run(counter.server.destroy)
 
@@ -259,16 +259,16 @@ async def test_an_unknown_goal_is_told(site: SimpleNamespace) -> None:
     """Who asks for a result that nobody has, hears so."""
     goal = await site.five.client.resume(7, bytes(16))
     with pytest.raises(Refused, match="there is no such goal"):
-        await goal.result(5)
+        await goal.result(PATIENCE_S)
 
 
 async def test_results_are_not_kept_for_ever(site: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the configured time the result is gone, and without registrants the node too."""
     settings = site.nodes.robot.rules.settings
-    site.nodes.robot.rules.settings = RobotSettings(call_timeout_s=settings.call_timeout_s, result_timeout_s=0.1)
+    site.nodes.robot.rules.settings = RobotSettings(call_timeout_s=settings.call_timeout_s, result_timeout_s=1)
     monkeypatch.setattr("bridge.ros.actions.WATCH_S", 0.05)
     goal = await site.five.client.send_goal(7, site.goal(1))
-    await goal.result(5)
+    await goal.result(PATIENCE_S)
     site.nodes.forget(Registrant(2, 5))
     await until(lambda: site.nodes.get(NodeType.ACTION, "nd__count") is None)
 
@@ -278,7 +278,7 @@ async def test_an_emergency_stop_cancels_goals(site: SimpleNamespace) -> None:
     await site.nodes.open_stop("/emergency_stop")
     goal = await site.five.client.send_goal(7, site.goal(1000))
     site.nodes.stop.press("unity/5")
-    assert (await goal.result(5)).status == CANCELED
+    assert (await goal.result(PATIENCE_S)).status == CANCELED
     with pytest.raises(Refused, match="the emergency stop by unity/5 holds"):
         await site.five.client.send_goal(7, site.goal(1))
     site.nodes.stop.release("unity/5")
@@ -294,7 +294,7 @@ async def test_a_server_that_dies_aborts_its_goals(
     goal = await site.five.client.send_goal(7, site.goal(1000, 0.05))
     node = site.nodes.get(NodeType.ACTION, "nd__count")
     monkeypatch.setattr(node._client, "server_is_ready", lambda: False)
-    assert (await goal.result(5)).status == ABORTED
+    assert (await goal.result(PATIENCE_S)).status == ABORTED
 
 
 @pytest.mark.parametrize("data", [b"", b"short", bytes(16), bytes(17)])
@@ -304,7 +304,7 @@ async def test_a_bad_message_harms_nothing(site: SimpleNamespace, verb: str, dat
     metadata = Metadata(2, 5, 0, verb, NodeType.ACTION, "nd__count", COUNT)
     site.nodes.deliver(Message("unity", 5, metadata, data))
     goal = await site.five.client.send_goal(7, site.goal(1))
-    assert (await goal.result(5)).status == SUCCEEDED
+    assert (await goal.result(PATIENCE_S)).status == SUCCEEDED
 
 
 async def test_the_headset_side_survives_bad_messages(site: SimpleNamespace) -> None:

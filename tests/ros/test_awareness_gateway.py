@@ -126,7 +126,7 @@ async def test_type_and_data_are_forwarded_unchanged(start: StartGateway, peer: 
     topic = await register(peer, "test_type")
     received = await peer.subscription(LocalGenericMessage, topic)
     data = bytes(range(256))
-    assert (await ground.owner.deliver("drone0", "test_type", data, deadline_s=10)).value == "delivered"
+    assert (await ground.owner.deliver("drone0", "test_type", data, deadline_s=PATIENCE_S)).value == "delivered"
     message = await get(received)
     assert (message.agent, message.type, bytes(message.data)) == ("ground", "test_type", data)
 
@@ -360,12 +360,12 @@ async def test_it_is_a_managed_node(start: StartGateway, peer: Peer, ground: Gro
     received = await peer.subscription(LocalGenericMessage, topic)
     assert (await state(), "drone0" in ground.owner.names) == ("inactive", False)
     assert await change(Transition.TRANSITION_ACTIVATE)
-    assert (await ground.owner.deliver("drone0", "t", b"1", deadline_s=10)).value == "delivered"
+    assert (await ground.owner.deliver("drone0", "t", b"1", deadline_s=PATIENCE_S)).value == "delivered"
     assert bytes((await get(received)).data) == b"1"
     assert await change(Transition.TRANSITION_DEACTIVATE)
     await until(lambda: "drone0" not in ground.owner.names)
     assert await change(Transition.TRANSITION_ACTIVATE)
-    assert (await ground.owner.deliver("drone0", "t", b"2", deadline_s=10)).value == "delivered"
+    assert (await ground.owner.deliver("drone0", "t", b"2", deadline_s=PATIENCE_S)).value == "delivered"
     assert await change(Transition.TRANSITION_DEACTIVATE)
     assert await change(Transition.TRANSITION_CLEANUP)
     assert await state() == "unconfigured"
@@ -476,6 +476,6 @@ async def test_it_starts_before_its_router(domain: int) -> None:
             awareness.join(agent, "ground") as owner,
         ):
             await asyncio.wait_for(starting, PATIENCE_S)
-            assert (await owner.deliver("drone0", "t", b"x", deadline_s=10)).value == "delivered"
+            assert (await owner.deliver("drone0", "t", b"x", deadline_s=PATIENCE_S)).value == "delivered"
             assert (await get(received)).agent == "ground"
             await asyncio.to_thread(peer.session.close)

@@ -157,7 +157,7 @@ async def test_an_action_over_the_wire(site: Site, peer: Peer, count_action: Any
     counting = await site.headset.action("/count", "macs_test_msgs/Count", agents=[1], buffer_size=100)
     goal = await counting.send_goal(1, bytes(serialize_message(count_action.Goal(to=3))), timeout_s=10)
     assert [deserialize_message(data, count_action.Feedback).at async for data in goal] == [0, 1, 2]
-    assert (await goal.result(5)).status == SUCCEEDED
+    assert (await goal.result(PATIENCE_S)).status == SUCCEEDED
     site.headset.drop_connection()
     while True:
         try:
@@ -165,7 +165,7 @@ async def test_an_action_over_the_wire(site: Site, peer: Peer, count_action: Any
             break
         except Unreachable:  # it is not back yet
             await asyncio.sleep(0.02)
-    status, data = await again.result(10)
+    status, data = await again.result(PATIENCE_S)
     assert status == SUCCEEDED
     assert deserialize_message(data, count_action.Result).text == "done"
     where = site.headset.target

@@ -29,6 +29,8 @@ from tests.support.ros_peer import Peer, adding, removing
 from tests.support.waiting import PATIENCE_S, get, until
 
 DEADLINE_S = 0.5
+IN_VAIN = ("/hangs", "/nowhere", "/silent", "/empty", "/every_third")
+"""Services that let callers wait for their deadline."""
 SET = "std_srvs/SetBool"
 
 
@@ -56,10 +58,10 @@ async def headsets() -> Headsets:
 async def nodes(session: RosSession, headsets: Headsets) -> AsyncIterator[InterfaceNodes]:
     rules = Rules(
         RobotSettings(
-            call_timeout_s=DEADLINE_S,
+            call_timeout_s=PATIENCE_S,
             rules=[
-                TopicRule(match="/code", error_response={"message": "E1"}),
-                TopicRule(match="/slow", call_timeout_s=5),
+                TopicRule(match="/code", call_timeout_s=DEADLINE_S, error_response={"message": "E1"}),
+                *(TopicRule(match=match, call_timeout_s=DEADLINE_S) for match in IN_VAIN),
             ],
         )
     )
@@ -324,7 +326,7 @@ async def test_a_second_headset_cannot_serve_the_same(nodes: InterfaceNodes, hea
 
 @pytest.mark.parametrize(
     ("service", "kind", "reason"),
-    [("/ask", SetBool, "no answer from unity/5"), ("/ask", Trigger, "no answer"), ("/code", SetBool, "E1")],
+    [("/silent", SetBool, "no answer from unity/5"), ("/silent", Trigger, "no answer"), ("/code", SetBool, "E1")],
 )
 async def test_a_silent_headset_is_an_error_at_the_deadline(
     nodes: InterfaceNodes, headsets: Headsets, peer: Peer, service: str, kind: Any, reason: str
@@ -408,7 +410,7 @@ async def test_a_service_at_its_end_is_not_kept_by_callers(
     await get(headsets.sent)
     nodes.forget(Registrant(2, 5))
     assert "has left" in (await asyncio.wait_for(first, PATIENCE_S))[0].message
-    deadline = time.monotonic() + 5
+    deadline = time.monotonic() + PATIENCE_S
     while caller.client.service_is_ready():
         assert time.monotonic() < deadline
         caller.call(SetBool.Request())
@@ -429,7 +431,7 @@ async def test_a_thousand_calls_with_every_third_unanswered(
     nodes: InterfaceNodes, headsets: Headsets, peer: Peer
 ) -> None:
     """Two of three are answered, every third gets its error within the deadline and 0.2 s, and topics go on."""
-    caller = await caller_of(nodes, peer, "/ask")
+    caller = await caller_of(nodes, peer, "/every_third")
     await nodes.add(adding("/talk", node_type=NodeType.PUBLISHER))
     heard = await peer.subscription(String, "/talk")
     await peer.sees("/talk", publishers=1, subscriptions=1)
@@ -437,7 +439,7 @@ async def test_a_thousand_calls_with_every_third_unanswered(
     def answer(to: Registrant, metadata: Metadata, data: bytes) -> None:
         if metadata.request_id % 3:
             reply = SetBool.Response(success=True, message=str(metadata.request_id))
-            nodes.deliver(request("/ask", reply, number=metadata.request_id, node_type=4))
+            nodes.deliver(request("/every_third", reply, number=metadata.request_id, node_type=4))
 
     headsets.answer = answer
     late: list[float] = []
@@ -470,12 +472,12 @@ async def test_calls_beyond_the_limit_are_refused(session: RosSession, headsets:
             7,
             lambda node, frame: None,
             send=headsets.send,
-            rules=Rules(RobotSettings(max_calls=2, call_timeout_s=3)),
+            rules=Rules(RobotSettings(max_calls=2, call_timeout_s=PATIENCE_S)),
         )
     )
     caller = await caller_of(nodes, peer, "/ask")
     calls = [caller.call(SetBool.Request()) for _ in range(3)]
-    done, _ = await asyncio.wait(calls, return_when=asyncio.FIRST_COMPLETED, timeout=2)
+    done, _ = await asyncio.wait(calls, return_when=asyncio.FIRST_COMPLETED, timeout=PATIENCE_S)
     (first,) = done
     assert "takes no calls now" in first.result()[0].message
     nodes.close()
