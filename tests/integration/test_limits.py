@@ -53,7 +53,7 @@ async def site(*options: str) -> AsyncIterator[tuple[str, Program]]:
         yield endpoint, gateway
 
 
-async def answers(headset: Headset, timeout_s: float = 5.0) -> None:
+async def answers(headset: Headset, timeout_s: float = PATIENCE_S) -> None:
     """The gateway still answers this headset."""
     assert headset.id in (await headset.online(timeout_s)).unity_agent_ids
 

@@ -31,6 +31,7 @@ from macs_zenoh.protocol.wire import encode_frame, encode_message, parse_frames
 from tests.integration.test_gateway import socket
 from tests.support.given import Connect, StartGateway
 from tests.support.links import counted
+from tests.support.local import patient
 from tests.support.programs import Program
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
@@ -74,7 +75,7 @@ async def sender(router: str) -> AsyncIterator[Sender]:
     async with AsyncExitStack() as stack:
 
         async def open_mesh(taker: Taker, *rules: TrafficRule) -> Mesh:
-            mesh = await stack.enter_async_context(await Mesh.open(MeshSettings(connect=[router]), traffic=rules))
+            mesh = await stack.enter_async_context(await Mesh.open(patient(router), traffic=rules))
             while not taker.count(MARKER):
                 mesh.put(MARKER, b"")
                 await asyncio.sleep(0.01)
@@ -385,6 +386,7 @@ async def test_a_rule_gives_a_priority_and_leaves_the_rest(router: str) -> None:
         ]
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("ruled", [True, False], ids=["ruled", "unruled"])
 async def test_a_high_priority_overtakes_a_camera_on_a_full_link(router: str, ruled: bool) -> None:
     """While a camera fills a link, messages of a topic with a higher priority all arrive, and before images that were
