@@ -13,7 +13,7 @@ import pytest
 from geometry_msgs.msg import Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool, String
-from test_agent import ROBOT, headset, robot, router  # noqa: F401 - fixtures
+from test_agent import ROBOT, headset, robot  # noqa: F401 - fixtures
 
 from bridge.ros.agent import RobotAgent
 from bridge.ros.interface import Robot
