@@ -12,10 +12,12 @@ Nothing here blocks: it works on the node's own executor, whichever that is, and
 from __future__ import annotations
 
 import array
+import copy
 import json
 import logging
 import threading
 import time
+import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -23,10 +25,11 @@ from typing import Any
 from as2_ca_msgs.msg import LocalGenericMessage
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.duration import Duration
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import String
 
-from bridge.awareness.node import AGENTS_TOPIC, LATCHED, QOS, UNDELIVERED_TOPIC
+from bridge.awareness.node import AGENTS_TOPIC, LATCHED, QOS, QUESTION, RECEIVED_TOPIC, UNDELIVERED_TOPIC
 from bridge.awareness.registrar import LOOK_S, Entry, Registrar
 from macs_zenoh.handles import Callbacks, Handle
 
@@ -34,6 +37,11 @@ log = logging.getLogger("macs.awareness")
 
 OnMessage = Callable[[Any, str], None]
 OnUndelivered = Callable[[str, str, str], None]
+
+QUESTIONS, ASK_AGAIN_S = 6, 0.1
+"""How often a gateway is asked at most, and after how long again, each time after twice as long."""
+POLL_S = 0.002
+POLL = Duration(seconds=POLL_S)
 
 
 class Module:
@@ -89,7 +97,9 @@ class GatewayClient:
         self._registrar = Registrar(node, service)
         # typed callbacks of one client never run at the same time, and never wait for the registrations
         self._group = MutuallyExclusiveCallbackGroup()
-        self._out = node.create_publisher(LocalGenericMessage, out_topic, qos)
+        self._out = node.create_publisher(LocalGenericMessage, out_topic, _with_room_for_questions(qos))
+        self._received = self._subscribe(String, RECEIVED_TOPIC, self._take_received, QOS)
+        self._answered: deque[str] = deque(maxlen=QUESTIONS)
         self._timer = node.create_timer(LOOK_S, self._flush, callback_group=self._registrar.group)
         self._watching = [
             self._subscribe(String, AGENTS_TOPIC, self._take_agents, LATCHED),
@@ -195,16 +205,31 @@ class GatewayClient:
     def flush(self, timeout_s: float = 5.0) -> bool:
         """Wait until the gateway has everything that was sent: for programs that end then. Whether it has.
 
-        Fast DDS, ROS's usual middleware, asks for acknowledgement every 3 s, so long it may take.
+        Our gateway answers when it is asked. Of another one it is known when its middleware has acknowledged all, and
+        Fast DDS, ROS's usual one, asks for that every 3 s.
         """
         deadline = time.monotonic() + timeout_s
-        while True:
+        word, asked, ask_at = uuid.uuid4().hex, 0, 0.0
+        while (now := time.monotonic()) < deadline:
             self._flush()
-            if not self._held or time.monotonic() > deadline:
-                break
-            time.sleep(0.01)
-        left = Duration(seconds=max(0.0, deadline - time.monotonic()))
-        return not self._held and bool(self._out.wait_for_all_acked(left))
+            if not self._held:
+                if asked < QUESTIONS and now >= ask_at and self._received.get_publisher_count():
+                    self._out.publish(LocalGenericMessage(agent=word, data=array.array("B", QUESTION)))
+                    asked, ask_at = asked + 1, now + ASK_AGAIN_S * 2**asked  # its publisher may not know us yet
+                if self._has_answered(word) or self._out.wait_for_all_acked(POLL):
+                    return True
+            time.sleep(POLL_S)
+        return False
+
+    def _has_answered(self, word: str) -> bool:
+        with self._received.handle:  # the node's executor may be this very thread
+            taken = self._received.handle.take_message(String, False)
+        if taken is not None:
+            self._take_received(taken[0])
+        return word in self._answered
+
+    def _take_received(self, message: Any) -> None:
+        self._answered.append(message.data)
 
     def _flush(self) -> None:
         with self._lock:
@@ -238,3 +263,10 @@ class GatewayClient:
             log.warning("%r to %r was not delivered: %s", message.type, message.agent, why)
         for callback in self._on_undelivered:
             callback(message.agent, message.type, why)
+
+
+def _with_room_for_questions(qos: Any) -> QoSProfile:
+    """A queue in which questions displace no messages that wait to be acknowledged."""
+    profile = QoSProfile(depth=qos) if isinstance(qos, int) else copy.copy(qos)
+    profile.depth += QUESTIONS
+    return profile

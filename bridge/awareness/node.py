@@ -32,10 +32,16 @@ log = logging.getLogger("macs.awareness")
 NODE_NAME = "ca_gateway_node"
 AGENTS_TOPIC = "gateway_agents"
 UNDELIVERED_TOPIC = "gateway_undelivered"
+RECEIVED_TOPIC = "gateway_received"
+QUESTION = b"received?"
+"""A message of no type with this data asks whether all is here that its sender has sent. The answer, on the topic
+above, is the name that it bears in place of a receiver's."""
 
 QOS = QoSProfile(depth=100)
 """Reliable and volatile as as2_ca's, which has depth 10: that loses all but ten messages of a burst. The depth is each
 side's own and no part of what must agree."""
+FROM_MODULES_QOS = QoSProfile(depth=2 * QOS.depth)
+"""Room for a burst as long as modules send one, and for their questions behind it."""
 SERVICE_QOS = QoSProfile(depth=1000)
 """Modules start all at once: at the default depth of 10 some of their requests would be lost silently."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -85,6 +91,7 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
         self._inter_agent: Any = None
         self._agents: Any = None
         self._undelivered: Any = None
+        self._received: Any = None
         self._diagnostics: Any = None
         self._chosen = Parameters("", "", "", "", "")
         try:
@@ -178,8 +185,9 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
             self._subscribe(InterAgentMessage, parameters.inter_agent_topic, self._from_topic)
         self._agents = self._publisher(String, AGENTS_TOPIC, LATCHED)
         self._undelivered = self._publisher(LocalGenericMessage, UNDELIVERED_TOPIC, QOS)
+        self._received = self._publisher(String, RECEIVED_TOPIC, QOS)
         self._diagnostics = self._publisher(DiagnosticArray, "/diagnostics", QOS)
-        from_modules = parameters.out_messages_topic, self._from_module, QOS
+        from_modules = parameters.out_messages_topic, self._from_module, FROM_MODULES_QOS
         self._made.append((self._intake.unsubscribe, self._intake.subscribe(LocalGenericMessage, *from_modules)))
         timer = self.create_timer(LOOK_S, self._look)
         self._made.append((self.destroy_timer, timer))
@@ -201,7 +209,7 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
         with self._lock:
             made, self._made = self._made, []
             modules, self._modules = self._modules, {}
-            self._inter_agent = self._agents = self._undelivered = self._diagnostics = None
+            self._inter_agent = self._agents = self._undelivered = self._received = self._diagnostics = None
         for destroy, entity in reversed(made):
             destroy(entity)
         for publisher in modules.values():
@@ -239,14 +247,15 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
             self._owner.types_wanted(types)
 
     def _from_module(self, raw: bytes, _info: Mapping[str, Any]) -> None:
-        if not self._active:
-            return
         try:
             message = cdr.read(raw) or deserialize_message(raw, LocalGenericMessage)
         except Exception as error:  # noqa: BLE001 - whatever rclpy raises for bytes that are none of its type
             log.warning("a message on %s cannot be read: %s", self._chosen.out_messages_topic, error)
             return
-        self._owner.module_sent(message.agent, message.type, bytes(message.data))
+        if not message.type and bytes(message.data) == QUESTION:
+            self._publish("_received", String(data=message.agent))
+        elif self._active:
+            self._owner.module_sent(message.agent, message.type, bytes(message.data))
 
     def _from_topic(self, message: Any) -> None:
         if self._active:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from as2_ca_msgs.msg import LocalGenericMessage
+from as2_ca_msgs.msg import InterAgentMessage, LocalGenericMessage
 from as2_ca_msgs.srv import RegisterModule
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
@@ -129,6 +129,36 @@ async def test_messages_wait_for_a_gateway(client: GatewayClient, peer: Peer) ->
         out.get_nowait()
     client.send(String(data="x"), "t", to=["a", "b"])
     assert [(await get(out)).agent for _ in range(2)] == ["a", "b"]
+
+
+async def test_what_was_sent_is_known_to_be_there(
+    gateway: Program, client: GatewayClient, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gateway says so itself, and has passed on all of it then; nobody waits for the middleware to acknowledge,
+    and whether the node's executor spins makes no difference."""
+    passed = await peer.subscription(InterAgentMessage, "/agent_to_agent", 200)
+    await until(lambda: (client.send_data(b"are you there?", "t"), passed.qsize())[1])
+    monkeypatch.setattr(client._out, "wait_for_all_acked", lambda _: False)
+    for spins in (True, False):
+        for number in range(20):
+            client.send_data(b"%d" % number, "t")
+        wait = peer.session.run(lambda: client.flush(20)) if not spins else asyncio.to_thread(client.flush, 20)
+        assert await wait
+        while bytes((await get(passed)).data) != b"0":
+            pass
+        for number in range(1, 20):
+            assert bytes((await get(passed)).data) == b"%d" % number
+    assert "invalid" not in "".join(gateway.log)
+
+
+async def test_a_gateway_that_does_not_answer_is_known_to_have_acknowledged(client: GatewayClient, peer: Peer) -> None:
+    """Of as2_ca's gateway, which is asked nothing, and when nobody is there at all it is known, too."""
+    client.send_data(b"x", "t")
+    assert not await asyncio.to_thread(client.flush, 0.3)
+    out = await peer.subscription(LocalGenericMessage, "gateway_out", 200)
+    assert await asyncio.to_thread(client.flush, 20)
+    assert bytes((await get(out)).data) == b"x"
+    assert out.empty()
 
 
 async def test_a_module_misses_its_gateway(
