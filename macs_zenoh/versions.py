@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, version
-
 
 def installed(package: str) -> str:
     """The version of a Python package, empty when it is not installed."""
+    from importlib.metadata import PackageNotFoundError, version  # a third of what help takes otherwise
+
     try:
         return version(package)
     except PackageNotFoundError:

@@ -111,6 +111,14 @@ def _meant(word: Any, known: Iterable[Any]) -> str:
     return f", did you mean {names[near[0]]}?" if near else ""
 
 
+class _Version(argparse.Action):
+    """argparse's own wants to know the version before anybody asks for it."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        print(f"macs-zenoh {installed('macs-zenoh') or '(not installed)'}")
+        parser.exit()
+
+
 class _VerbsInOneColumn(argparse.RawDescriptionHelpFormatter):
     """argparse forgets that verbs are indented, and breaks the line after each of the longest."""
 
@@ -121,8 +129,7 @@ class _VerbsInOneColumn(argparse.RawDescriptionHelpFormatter):
 
 def build_parser() -> Parser:
     parser = Parser(prog="macs", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=_VerbsInOneColumn)
-    version = installed("macs-zenoh") or "(not installed)"
-    parser.add_argument("--version", action="version", version=f"macs-zenoh {version}")
+    parser.add_argument("--version", action=_Version, nargs=0, help="show program's version number and exit")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True, title="verbs")
     for name, module in VERBS.items():
         verb = verbs.add_parser(

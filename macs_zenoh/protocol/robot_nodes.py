@@ -72,7 +72,7 @@ class RobotNodes:
     besides the `COMMON` ones."""
 
     def __init__(self, packages: Collection[str] = ()) -> None:
-        self._packages = COMMON.union(packages)
+        self._packages = COMMON.union(packages) if packages else COMMON
         self._nodes: dict[NodeKey, AddNode] = {}
         """As the first registrant asked for them."""
         self._registrants: dict[NodeKey, dict[AgentKey, None]] = {}
