@@ -115,7 +115,7 @@ class _Version(argparse.Action):
     """argparse's own wants to know the version before anybody asks for it."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        print(f"macs-zenoh {installed('macs-zenoh') or '(not installed)'}")
+        parser._print_message(f"macs-zenoh {installed('macs-zenoh') or '(not installed)'}\n", sys.stdout)
         parser.exit()
 
 

@@ -16,6 +16,7 @@ from .messages import Metadata, correct_sender
 
 _REQUEST_ID = re.compile(rb'"requestId":(0|[1-9][0-9]{0,9})(?=[,}])')
 _LARGEST = 0xFFFFFFFF
+ZERO = ord("0")
 
 
 class Judged(NamedTuple):
@@ -51,6 +52,20 @@ class _Shape(NamedTuple):
     """Whether that is what came."""
     readable: bool
 
+    def numbered(self, raw: bytes, number: bytes) -> Judged:
+        """What ``raw`` says, which is of this shape, with this request id in it."""
+        usual = self.metadata
+        metadata = Metadata(
+            usual.sender_agent_type,
+            usual.sender_agent_id,
+            int(number),
+            usual.message_manager,
+            usual.node_type,
+            usual.node_name,
+            usual.data_exchange_type,
+        )
+        return Judged(metadata, raw if self.same else self.before + number + self.after, self.readable)
+
 
 class Judge:
     """Judges the metadata of one sender. What comes again is looked up; of what was seen with different request ids
@@ -66,6 +81,8 @@ class Judge:
         self._known: dict[bytes, Judged] = {}
         self._shapes: dict[tuple[bytes, bytes], _Shape | None] = {}
         """By what is around the request id; None for what was seen once, or is no shape."""
+        self._last: tuple[bytes, bytes, _Shape] | None = None
+        """What was around the last request id that only its number was read of: it is the next one's most often."""
 
     def __call__(self, raw: bytes) -> Judged:
         """`judge`, of this sender."""
@@ -74,6 +91,12 @@ class Judge:
             return known
         if len(raw) > self.BYTES:
             return judge(raw, *self._sender)
+        if self._last is not None:
+            before, after, usual = self._last
+            if raw.startswith(before) and raw.endswith(after):
+                number = raw[len(before) : len(raw) - len(after)]
+                if number.isdigit() and len(number) < 10 and number[0] != ZERO:
+                    return usual.numbered(raw, number)
         found = _REQUEST_ID.search(raw)
         if found is None:
             return self._remember(raw, judge(raw, *self._sender))
@@ -84,20 +107,10 @@ class Judge:
             judged = self._remember(raw, judge(raw, *self._sender))
             self._learn(around, found[1], judged)
             return judged
-        number = int(found[1])
-        if number > _LARGEST:
+        if int(found[1]) > _LARGEST:
             return judge(raw, *self._sender)  # which refuses it
-        usual = shape.metadata
-        metadata = Metadata(
-            usual.sender_agent_type,
-            usual.sender_agent_id,
-            number,
-            usual.message_manager,
-            usual.node_type,
-            usual.node_name,
-            usual.data_exchange_type,
-        )
-        return Judged(metadata, raw if shape.same else shape.before + found[1] + shape.after, shape.readable)
+        self._last = *around, shape
+        return shape.numbered(raw, found[1])
 
     def known(self, raw: bytes) -> Judged | None:
         """What these very bytes were judged to be, if that is remembered."""
