@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import decoder
 import pytest
 
 from macs_zenoh.protocol.messages import Metadata
+from tests.fuzz import decoder
 
 
 @pytest.mark.parametrize("seed", range(2))

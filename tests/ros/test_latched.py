@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
-import unity_serializer
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -23,6 +22,7 @@ from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.protocol.messages import Metadata, StreamData, decode_management
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import parse_frame
+from tests.ros import unity_serializer
 from tests.support.ros_peer import Peer, adding, removing
 from tests.support.waiting import until
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
-import unity_serializer
 from rclpy.action import ActionServer
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.serialization import deserialize_message, serialize_message
@@ -25,6 +24,7 @@ from std_srvs.srv import SetBool, Trigger
 from bridge.headset.actions import SUCCEEDED
 from bridge.headset.client import Headset
 from macs_zenoh.errors import Refused, Unreachable
+from tests.ros import unity_serializer
 from tests.support.programs import ROOT, Program, ended, free_port, macs
 from tests.support.ros_peer import Peer
 from tests.support.waiting import PATIENCE_S, until

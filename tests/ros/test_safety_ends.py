@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from driven import STOPPED, Heard, driving, hear, may_command, site
 
 from macs_zenoh import join
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh.panics import PANICKED
 from tests.panicking import panicking
+from tests.ros.driven import STOPPED, Heard, driving, hear, may_command, site
 from tests.support.programs import ROOT, Program, free_port
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until

@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from driven import SETTINGS, STOPPED, Heard, driving, hear, may_command, send_bool, site
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Bool
-from test_safety_shared import told
 
 from macs_zenoh.agent import Agent
 from macs_zenoh.protocol.keyexpr import CALL, GROUP
 from macs_zenoh.protocol.messages import Metadata, NodeType
 from macs_zenoh.protocol.routing import unicast_key
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from tests.ros.driven import SETTINGS, STOPPED, Heard, driving, hear, may_command, send_bool, site
+from tests.ros.test_safety_shared import told
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
 

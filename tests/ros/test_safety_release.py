@@ -8,11 +8,11 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from driven import STOPPED, driving, hear, may_command, send_bool, site
 
 from bridge.ros.safety import EmergencyStop
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Refused
+from tests.ros.driven import STOPPED, driving, hear, may_command, send_bool, site
 from tests.support.programs import ended
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until

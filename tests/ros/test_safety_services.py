@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from driven import hear
 from rclpy.serialization import serialize_message
 from std_srvs.srv import SetBool, Trigger
 
@@ -20,6 +19,7 @@ from bridge.ros.session import RosSession
 from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, node_name
 from macs_zenoh.protocol.reading import Message
+from tests.ros.driven import hear
 from tests.support.ros_peer import Peer, adding, drive
 from tests.support.waiting import get, until
 

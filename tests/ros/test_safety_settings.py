@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from driven import site
 from geometry_msgs.msg import Twist
 
 from bridge.ros.checked import CheckedSettings
 from bridge.ros.interface import Drops
 from bridge.ros.rules import Rules
 from bridge.settings import RobotSettings, TopicRule
+from tests.ros.driven import site
 from tests.support.programs import ended
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until

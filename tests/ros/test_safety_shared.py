@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from driven import STOPPED, driving, hear, may_command, send_bool, site
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.duration import Duration
@@ -22,6 +21,7 @@ from bridge.ros.shared_stop import A_NODE
 from macs_zenoh import join
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Refused
+from tests.ros.driven import STOPPED, driving, hear, may_command, send_bool, site
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
 

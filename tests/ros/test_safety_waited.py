@@ -6,9 +6,8 @@ import asyncio
 import signal
 from pathlib import Path
 
-from driven import STOPPED, driving, hear, may_command, send, send_bool, site
-from test_safety_shared import told
-
+from tests.ros.driven import STOPPED, driving, hear, may_command, send, send_bool, site
+from tests.ros.test_safety_shared import told
 from tests.support.links import counted
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until

@@ -13,7 +13,6 @@ import pytest
 from geometry_msgs.msg import Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool, String
-from test_agent import ROBOT, headset, robot  # noqa: F401 - fixtures
 
 from bridge.ros.agent import RobotAgent
 from bridge.ros.interface import Robot
@@ -28,6 +27,7 @@ from macs_zenoh.mesh import now_s
 from macs_zenoh.protocol.messages import ROS, UNITY, Metadata, NodeType
 from macs_zenoh.protocol.routing import unicast_key
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from tests.ros.test_agent import ROBOT, headset, robot  # noqa: F401 - fixtures
 from tests.support.ros_peer import Peer, adding
 from tests.support.waiting import get, until
 

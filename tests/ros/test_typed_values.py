@@ -12,12 +12,12 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
-from test_types import _installed
 
 from bridge.headset.verbs import json_object
 from bridge.ros.fields import filled
 from macs_zenoh.errors import Refused, UsageError
 from macs_zenoh.typed import BadCdr, BadValue, Types, UnknownType
+from tests.ros.test_types import _installed
 
 pytestmark = pytest.mark.timeout(600)  # the first of them compiles its messages, on a busy machine for minutes
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import unity_serializer
 from geometry_msgs.msg import Point
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import BatteryState, CameraInfo, JointState, LaserScan, PointCloud2
@@ -35,6 +34,7 @@ from macs_zenoh.protocol.existing import Data, fitting
 from macs_zenoh.protocol.messages import Metadata, NodeType, node_name
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import encode_frame, encode_message, parse_frame
+from tests.ros import unity_serializer
 from tests.support.ros_peer import Peer, adding, command
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, get, until

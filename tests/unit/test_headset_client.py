@@ -9,7 +9,6 @@ import socket
 from collections.abc import AsyncIterator
 
 import pytest
-from scripted_router import WELCOME, ScriptedRouter, recorded, welcome
 
 from bridge.headset.client import Headset, Link
 from bridge.headset.nodes import ServiceRequest
@@ -17,6 +16,7 @@ from macs_zenoh.errors import CallTimeout, TooManyDestinations, Unreachable, Usa
 from macs_zenoh.protocol.messages import EXTENSIONS, Metadata, NodeType, node_name
 from macs_zenoh.protocol.wire import Frame, encode_message, parse_frame
 from tests.support.waiting import PATIENCE_S
+from tests.unit.scripted_router import WELCOME, ScriptedRouter, recorded, welcome
 
 STRING = "std_msgs/String"
 SET_BOOL = "std_srvs/SetBool"

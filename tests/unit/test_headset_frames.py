@@ -7,13 +7,13 @@ import re
 from pathlib import Path
 
 import pytest
-from scripted_router import VECTORS, rows
 
 from bridge.headset import frames
 from bridge.headset.frames import NodeSpec
 from macs_zenoh.errors import OutOfRange, TooManyDestinations
 from macs_zenoh.protocol.messages import NodeType
 from macs_zenoh.protocol.wire import parse_frame
+from tests.unit.scripted_router import VECTORS, rows
 
 SENT = [
     pytest.param(bytes.fromhex(row["hex"]), id=f"{path.stem}-{number}")

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scripted_router import recorded
 
 from macs_zenoh import typed
 from macs_zenoh.protocol.wire import parse_frame, split_message
 from macs_zenoh.typed import BadCdr, BadValue, MissingRosbags, Types, UnknownType, request_of, response_of
+from tests.unit.scripted_router import recorded
 
 
 @pytest.fixture(scope="module")
