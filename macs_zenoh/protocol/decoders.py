@@ -20,8 +20,8 @@ from .wire import (
     Frame,
     Frames,
     Layout,
+    Run,
     data_at,
-    frames_of,
     run_end,
 )
 
@@ -160,7 +160,11 @@ class FrameDecoder:
                 continue
             if self.runs and stop != end and not management_bytes:
                 stop = run_end(data, start, body_at, size, min(end, start + RUN_BYTES))
-            frames.append(frames_of(bytes(view[start:stop]), layout, message_at, body_at - start, size))
+            piece = bytes(view[start:stop])
+            if stop - start == size:
+                frames.append(Frame(piece, layout, message_at, body_at - start))
+            else:
+                frames.append(Run(piece, layout, message_at, body_at - start, size))
             start = stop
         if start != end:
             self._partial = bytearray(view[start:end])

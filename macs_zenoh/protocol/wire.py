@@ -340,7 +340,10 @@ def _parse(data: bytes | bytearray, layout: Layout, *, alike: bool) -> list[Any]
         if alike and stop != end and not management_bytes:
             stop = run_end(data, start, body_at, size, end)
         piece = data[start:stop] if start or stop != end else data
-        frames.append(frames_of(piece, layout, message_at, body_at - start, size))
+        if stop - start == size:
+            frames.append(Frame(piece, layout, message_at, body_at - start))
+        else:
+            frames.append(Run(piece, layout, message_at, body_at - start, size))
         if stop == end:
             return frames
         start = stop
@@ -353,13 +356,6 @@ def run_end(data: bytes | bytearray, start: int, body_at: int, size: int, end: i
     while at + size <= end and data.startswith(beginning, at):
         at += size
     return at
-
-
-def frames_of(data: bytes | bytearray, layout: Layout, message_at: int, body_at: int, size: int) -> Frames:
-    """What is in ``data``, whose frames are of this size each."""
-    if len(data) == size:
-        return Frame(data, layout, message_at, body_at)
-    return Run(data, layout, message_at, body_at, size)
 
 
 def encode_frame(
