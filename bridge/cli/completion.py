@@ -129,6 +129,7 @@ def _ask(args: argparse.Namespace, offers: bool, found: dict[int, Any]) -> None:
 
 async def _collect(args: argparse.Namespace, offers: bool, found: dict[int, Any]) -> None:
     from bridge.cli import robots
+    from macs_zenoh.protocol.robot_state import Offered
 
     settings = options.settings(args) if hasattr(args, "connect") else options.defaults()
     caller = AgentId(OPERATOR, settings.operator.id or 0)
@@ -138,7 +139,7 @@ async def _collect(args: argparse.Namespace, offers: bool, found: dict[int, Any]
         async def tell(robot: int) -> None:
             with suppress(Exception):
                 answer = await operator.ask(robot, "offers", timeout_s=WITHIN_S)
-                found[robot] = robots.read(answer, robots.Offers)[1]
+                found[robot] = robots.read(answer, Offered)[1]
 
         if offers:
             await asyncio.gather(*map(tell, ids))

@@ -35,14 +35,17 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from msgspec import UNSET
+
 from bridge.cli import options, output, robots, running, terminal
-from bridge.cli.robots import Node, Offers, Operator, Router, Status
+from bridge.cli.robots import Operator, Router
 from bridge.cli.terminal import BAD, HEADING, ODD, Block, Cell, Columns
 from macs_zenoh.errors import MacsError, NotServed, Refused, Unreachable
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.named import Named
 from macs_zenoh.protocol.ping import Pong
+from macs_zenoh.protocol.robot_state import NodeStatus, Offered, RobotStatus, TopicQos
 
 SUMMARY = "who is online, and what robots are doing"
 VERBOSE = "all about each robot"
@@ -63,8 +66,8 @@ class RobotReport:
     """
 
     problem: str = ""
-    status: Status | None = None
-    offers: Offers | None = None
+    status: RobotStatus | None = None
+    offers: Offered | None = None
     raw_status: dict[str, Any] | None = None
     raw_offers: dict[str, Any] | None = None
 
@@ -120,10 +123,10 @@ async def _ask(
 ) -> RobotReport:
     told = RobotReport()
     try:
-        raw, status = robots.read(await operator.ask(robot.id, "status", timeout_s=timeout_s), Status)
+        raw, status = robots.read(await operator.ask(robot.id, "status", timeout_s=timeout_s), RobotStatus)
         told = RobotReport(status=status, raw_status=raw)
         if offers:
-            raw, offered = robots.read(await operator.ask(robot.id, "offers", timeout_s=timeout_s), Offers)
+            raw, offered = robots.read(await operator.ask(robot.id, "offers", timeout_s=timeout_s), Offered)
             told = replace(told, offers=offered, raw_offers=raw)
     except NotServed:
         told = replace(told, problem=await operator.why_silent(robot, gateways, timeout_s=timeout_s))
@@ -242,7 +245,7 @@ def _state(robot: RobotReport | None) -> Cell:
     if robot is None or robot.status is None:
         return ("?", ODD) if robot is not None and robot.problem else ""
     stopped = [f"stopped by {robot.status.stop.by}"] if robot.status.stopped else []
-    controls = [(node.name, node.control.holder) for node in robot.status.nodes if node.control is not None]
+    controls = [(node.name, node.control.holder) for node in robot.status.nodes if node.control is not UNSET]
     state = ", ".join(stopped + [f"{topic}: {holder}" for topic, holder in controls if holder])
     return (state, BAD) if stopped else state
 
@@ -271,13 +274,13 @@ def _facts(*facts: tuple[str, str]) -> Columns:
     return Columns([(f"{name:<{FACT_WIDTH}}", fact) for name, fact in facts], indent=2)
 
 
-def _nothing(status: Status) -> str:
+def _nothing(status: RobotStatus) -> str:
     """Why a robot may offer nothing, which most often is a mistake."""
     graph = "its ROS graph" if status.ros_domain is None else f"the ROS graph of domain {status.ros_domain}"
     return f"nothing: {graph} is empty, or hidden by its rules; is that the ROS_DOMAIN_ID of its nodes?"
 
 
-def _stop(status: Status) -> str:
+def _stop(status: RobotStatus) -> str:
     if not any(node.role == "emergency stop" for node in status.nodes):
         return "none"
     before = f", {status.stop.times} in all" if status.stop.times else ""
@@ -286,28 +289,30 @@ def _stop(status: Status) -> str:
     return f"by {status.stop.by}, {status.stop.seconds:.0f} s ago{before}"
 
 
-def _registrants(node: Node) -> str:
+def _registrants(node: NodeStatus) -> str:
     busy = [f"{node.open_calls} open calls"] if node.open_calls else []
-    running = sum(not goal.finished for goal in node.goals)
+    running = sum(not goal.finished for goal in node.goals or ())
     busy += [f"{running} goals running"] if running else []
     return ", ".join([*node.registrants, *busy]) or "-"
 
 
-def _safety(node: Node) -> Iterator[tuple[str, ...]]:
-    if node.control is not None:
+def _safety(node: NodeStatus) -> Iterator[tuple[str, ...]]:
+    if node.control is not UNSET:
         held = node.control
         free = "free" if held.holder is None else f"for {held.seconds_held:.0f} s, free in {held.seconds_left:.1f} s"
         yield ("control", node.name, held.holder or "-", free)
-    if node.deadman is not None:
+    if node.deadman is not UNSET:
         guard = node.deadman
         trips = f"trips: {guard.trips}, last: {guard.last}" if guard.trips else "trips: none"
         yield ("dead-man", node.name, guard.commander or "-", trips)
 
 
-def _offered(offers: Offers) -> Iterator[tuple[str, ...]]:
+def _offered(offers: Offered) -> Iterator[tuple[str, ...]]:
     for what, named in (("publishes", offers.publishers), ("subscribes", offers.subscribers)):
         for topic, of_type in named.items():
-            yield (what, topic, of_type, ", ".join(offers.qos.get(topic, {}).values()).replace("_", " "))
+            qos = offers.qos.get(topic, TopicQos())
+            policies = ", ".join(filter(None, (qos.reliability, qos.durability)))
+            yield (what, topic, of_type, policies.replace("_", " "))
     for what, named in (("service", offers.services), ("action", offers.actions)):
         for name, of_type in named.items():
             yield (what, name, of_type)

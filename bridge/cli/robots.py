@@ -43,62 +43,6 @@ USUALLY_S = 0.4
 WITHOUT_A_ROUTER = "(start one with `macs router`, or name it with -e; `macs doctor` looks closer)"
 
 
-class Control(Struct, frozen=True):
-    """Who commands a topic."""
-
-    holder: str | None = None
-    seconds_held: float = 0
-    seconds_left: float = 0
-
-
-class DeadMan(Struct, frozen=True):
-    """What happens when commands stop, and how often it has."""
-
-    silence_s: float | None = None
-    commander: str | None = None
-    trips: int = 0
-    last: str = ""
-
-
-class Goal(Struct, frozen=True):
-    """A goal that an action works on, or whose result waits."""
-
-    owner: str
-    finished: bool = False
-
-
-class Node(Struct, frozen=True):
-    """An interface node and what is going on there."""
-
-    role: str
-    name: str
-    type: str
-    registrants: list[str] = []
-    control: Control | None = None
-    deadman: DeadMan | None = None
-    open_calls: int = 0
-    goals: list[Goal] = []
-
-
-class Stop(Struct, frozen=True):
-    """The emergency stop."""
-
-    by: str = ""
-    seconds: float = 0
-    times: int = 0
-
-
-class Status(Struct, frozen=True):
-    """What a robot says of itself (verb ``status``, docs/robot.md)."""
-
-    ros_node: str
-    stopped: bool
-    stop: Stop
-    nodes: list[Node]
-    drops: dict[str, int] = {}
-    ros_domain: int | None = None
-
-
 class Router(Struct, frozen=True):
     """A router, as its admin space has it."""
 
@@ -110,16 +54,6 @@ class Router(Struct, frozen=True):
     def release(self) -> str:
         """``1.10.2`` of ``v1.10.2-release built with rustc …``."""
         return self.version.partition(" ")[0].partition("-")[0].removeprefix("v")
-
-
-class Offers(Struct, frozen=True):
-    """What a robot offers (verb ``offers``): name -> type."""
-
-    subscribers: dict[str, str] = {}
-    publishers: dict[str, str] = {}
-    services: dict[str, str] = {}
-    actions: dict[str, str] = {}
-    qos: dict[str, dict[str, str]] = {}
 
 
 def chosen_caller(args: argparse.Namespace, settings: OperatorSettings) -> AgentId:

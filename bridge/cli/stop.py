@@ -28,11 +28,12 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 
 from bridge.cli import options, output, robots, running
-from bridge.cli.robots import Operator, Status
+from bridge.cli.robots import Operator
 from bridge.settings import Settings
 from macs_zenoh.errors import CallTimeout, MacsError, NotServed, Refused, Unreachable, UsageError
 from macs_zenoh.plain import plain
 from macs_zenoh.protocol.messages import ROS
+from macs_zenoh.protocol.robot_state import RobotStatus
 
 SUMMARY = "stop robots, and release them"
 
@@ -125,7 +126,7 @@ async def _settle(operator: Operator, robot: int, args: argparse.Namespace) -> O
             answer = await operator.ask(
                 robot, "stop", b"true" if wanted else b"false", timeout_s=min(patience_s, left_s), urgent=True
             )
-            _, status = robots.read(answer, Status)
+            _, status = robots.read(answer, RobotStatus)
         except Refused as refusal:
             return Outcome(robot, False, problem=refusal.reason)
         except CallTimeout:
@@ -150,7 +151,8 @@ async def _look_again(operator: Operator, stopped: Outcome, times: int, timeout_
     """Whether a stop that was confirmed still holds a moment later, and has held all the time."""
     await asyncio.sleep(LOOK_AGAIN_S)
     try:
-        _, status = robots.read(await operator.ask(stopped.id, "status", timeout_s=timeout_s, urgent=True), Status)
+        answer = await operator.ask(stopped.id, "status", timeout_s=timeout_s, urgent=True)
+        _, status = robots.read(answer, RobotStatus)
     except MacsError as error:
         return replace(stopped, done=False, problem=f"it stopped, and does not say whether it still does: {error}")
     if not status.stopped:

@@ -18,6 +18,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coro
 from typing import Any, NamedTuple
 
 from macs_zenoh.errors import MacsError, Unreachable, UsageError
+from macs_zenoh.protocol.robot_state import STATUS
 from macs_zenoh.timeouts import within
 from macs_zenoh.typed import Types, part_of_action, request_of, response_of
 
@@ -37,8 +38,6 @@ _LAST_MESSAGES_S = 0.2
 carried the message."""
 _SILENCE_S = 2.0
 """How long `sub` waits for a first message before it says where nobody publishes the topic."""
-STATUS = "RobotStatus"
-"""The request that robots answer from what they know, without looking around (docs/robot.md)."""
 _CONFIRM_S = 1.0
 """How long a robot may take, after the last message of `pub`, until it is clear that it refused none of them."""
 _RETRY_S = 0.1

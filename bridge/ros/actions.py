@@ -26,6 +26,7 @@ from bridge.ros.unity_cdr import UnityCdr, to_ros
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import ROS, ActionVerb, AddNode, NodeType
 from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.robot_state import GoalStatus, NodeStatus
 
 log = logging.getLogger("macs.ros")
 
@@ -145,8 +146,8 @@ class ActionNode(InterfaceNode):
             for goal in self._goals.values():
                 self._cancel(goal)
 
-    def status(self) -> dict[str, Any]:
-        return {**super().status(), "goals": [_shown(goal) for goal in self._goals.values()]}
+    def status(self) -> NodeStatus:
+        return structs.replace(super().status(), goals=[_shown(goal) for goal in self._goals.values()])
 
     # -- what headsets say ---------------------------------------------------------------------------------------
 
@@ -391,10 +392,6 @@ def tell_no_goal(robot: Robot, message: Message, reason: str) -> None:
     robot.send(Registrant.of(message), answer, goal_id + b"\0" + reason.encode())
 
 
-def _shown(goal: Goal) -> dict[str, Any]:
-    return {
-        "goal": goal.id.hex(),
-        "status": goal.status,
-        "owner": str(goal.owner or goal.former or ""),
-        "finished": goal.finished_at is not None,
-    }
+def _shown(goal: Goal) -> GoalStatus:
+    owner = str(goal.owner or goal.former or "")
+    return GoalStatus(goal.id.hex(), goal.status, owner, finished=goal.finished_at is not None)

@@ -1,7 +1,7 @@
 """The robot agent: an agent of type ``ros`` on the mesh that serves registrations of interface nodes.
 
 Verbs: ``add_node`` (data: AddNode) and ``remove_node`` (RemoveNode), answered with nothing or a refusal that says why;
-``offers`` (no data), answered with `graph.Offered`; ``status`` (no data), ``control`` (`requests.ControlRequest`) and
+``offers`` (no data), answered with `robot_state.Offered`; ``status`` (no data), ``control`` (`ControlRequest`) and
 ``stop`` (``true`` or ``false``), answered with JSON. See docs/robot.md.
 """
 
@@ -21,7 +21,7 @@ from bridge.ros.checked import CheckedSettings
 from bridge.ros.graph import NamesAndTypes, Offers
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
-from bridge.ros.requests import STATUS, ControlReply, ControlRequest, control, status
+from bridge.ros.requests import control, status
 from bridge.ros.rules import Rules
 from bridge.ros.safety import EmergencyStop
 from bridge.ros.session import RosSession
@@ -40,6 +40,7 @@ from macs_zenoh.protocol.keyexpr import type_name, type_number
 from macs_zenoh.protocol.messages import AddNode, FunctionalityRequest, Metadata, RemoveNode, decode_data, encode_data
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.registrations import check_own
+from macs_zenoh.protocol.robot_state import STATUS, ControlReply, ControlRequest
 from macs_zenoh.protocol.wire import Layout
 from macs_zenoh.serving import Call
 from macs_zenoh.streams import Streams

@@ -13,8 +13,6 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-import msgspec
-from msgspec import Struct
 from rclpy.node import NodeNameNonExistentError
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
@@ -23,8 +21,9 @@ from bridge.ros.interface import PublishStream, Registrant, Robot
 from bridge.ros.rules import Rules
 from bridge.ros.stream import StreamFraming
 from macs_zenoh.errors import MacsError, WireError
-from macs_zenoh.protocol.messages import ROS, Functionality, FunctionalityRequest, Metadata, decode_data, encode_data
+from macs_zenoh.protocol.messages import ROS, FunctionalityRequest, Metadata, decode_data, encode_data
 from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.robot_state import FollowRequest, Offered, TopicQos
 
 log = logging.getLogger("macs.ros")
 
@@ -44,26 +43,6 @@ NamesAndTypes = list[tuple[str, list[str]]]
 
 SEND_GOAL = "/_action/send_goal"
 """What the goal service of an action is called, after the action; its type is the action's with ``_SendGoal``."""
-
-
-class TopicQos(Struct, frozen=True):
-    """What a subscription to a topic has to ask for, or a publisher to offer, to match everybody there."""
-
-    reliability: str
-    durability: str
-
-
-class Offered(Functionality, frozen=True, rename="camel"):
-    """What a robot offers, with what the existing program does not tell: actions, and QoS by topic."""
-
-    actions: dict[str, str] = msgspec.field(default_factory=dict)
-    qos: dict[str, TopicQos] = msgspec.field(default_factory=dict)
-
-
-class FollowRequest(Struct, frozen=True):
-    """The data of a FunctionalityGetter request, if it has any: ``follow`` asks for every change as well."""
-
-    follow: bool = False
 
 
 def offers(node: Any, rules: Rules | None = None) -> Offered:

@@ -27,6 +27,7 @@ from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.keyexpr import type_name, type_number
 from macs_zenoh.protocol.messages import ROS, AddNode, Metadata, NodeType, RemoveNode, encode_data
 from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.robot_state import NodeStatus
 from macs_zenoh.protocol.wire import MACS, Layout
 
 log = logging.getLogger("macs.ros")
@@ -262,10 +263,10 @@ class InterfaceNode(ABC):
             data_exchange_type=self.interface.short,
         )
 
-    def status(self) -> dict[str, Any]:
-        """What there is to see from outside, as JSON."""
+    def status(self) -> NodeStatus:
+        """What there is to see from outside."""
         registrants = [str(registrant) for registrant in sorted(self.registrants)]
-        return {"role": self.ROLE, "name": self.topic, "type": str(self.interface), "registrants": registrants}
+        return NodeStatus(self.ROLE, self.topic, str(self.interface), registrants)
 
 
 _NODE_NAME = re.compile(r"[A-Za-z0-9_]{1,260}")

@@ -8,38 +8,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
 
 import msgspec
-from msgspec import Struct
 
 from bridge.ros.interface import Registrant, full_name
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.topics import PublisherNode
 from macs_zenoh.errors import Refused
-from macs_zenoh.protocol.messages import AgentId, AgentType, NodeType
-
-
-class ControlRequest(Struct, frozen=True, rename="camel"):
-    """Take control over a topic, release it, or give it to another agent (``to``, a headset unless ``toType``)."""
-
-    manager: ClassVar[str] = "RobotControl"
-    action: Literal["take", "release", "give"]
-    topic: str
-    to: AgentId = 0
-    to_type: AgentType = 2
-
-
-class ControlReply(Struct, frozen=True, rename="camel", omit_defaults=True):
-    """Whether it was done, who holds control now, and why not."""
-
-    done: bool
-    holder: str = ""
-    reason: str = ""
-
-
-STATUS = "RobotStatus"
-"""Manager of a request for the robot's state; its data is ignored."""
+from macs_zenoh.protocol.messages import NodeType
+from macs_zenoh.protocol.robot_state import ControlReply, ControlRequest, RobotStatus, StopStatus
 
 
 def control(nodes: InterfaceNodes, sender: Registrant, request: ControlRequest, now: float) -> ControlReply:
@@ -71,18 +48,18 @@ def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int])
     ``lost_before`` counts what was lost between the mesh and the nodes.
     """
     stop = nodes.robot.stop
-    state: dict[str, Any] = {
-        "ros_node": ros_name,
-        "ros_domain": nodes.robot.session.domain,
-        "stopped": stop.stopped,
-        "stop": {
-            "by": stop.by,
-            "pressed": stop.pressed,
-            "seconds": round(time.time() - stop.since, 1) if stop.stopped else 0,
-            "times": stop.times,
-            "history": stop.history,
-        },
-        "nodes": [node.status() for node in nodes],
-        "drops": {**lost_before, **nodes.drops},
-    }
+    state = RobotStatus(
+        ros_node=ros_name,
+        ros_domain=nodes.robot.session.domain,
+        stopped=stop.stopped,
+        stop=StopStatus(
+            by=stop.by,
+            pressed=list(stop.pressed),
+            seconds=round(time.time() - stop.since, 1) if stop.stopped else 0,
+            times=stop.times,
+            history=stop.history,
+        ),
+        nodes=[node.status() for node in nodes],
+        drops={**lost_before, **nodes.drops},
+    )
     return msgspec.json.encode(state)

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from msgspec import structs
 from rclpy.serialization import deserialize_message, serialize_message
 
 from bridge.ros import fields
@@ -25,6 +26,7 @@ from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
 from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.protocol.messages import AddNode, CallFailure, NodeType, decode_data
 from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.robot_state import NodeStatus
 
 PACE_FAILURES_S = 0.005
 REQUEST_IDS = 1 << 31
@@ -178,8 +180,8 @@ class ServiceNode(InterfaceNode):
         self._close_call(request_id)
         self.robot.session.submit(lambda: self._send(request_id, sender, call.header, answer))
 
-    def status(self) -> dict[str, Any]:
-        return {**super().status(), "open_calls": len(self._open_calls)}
+    def status(self) -> NodeStatus:
+        return structs.replace(super().status(), open_calls=len(self._open_calls))
 
     def _ask(self, request: bytes, header: Any) -> None:
         """Pass a ROS node's request to the headset. On the loop."""

@@ -10,6 +10,7 @@ import asyncio
 from collections.abc import Callable
 from typing import Any
 
+from msgspec import structs
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -21,6 +22,7 @@ from bridge.ros.types import resolve
 from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
 from macs_zenoh.protocol.messages import AddNode, NodeType
 from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.robot_state import NodeStatus
 from macs_zenoh.timeouts import within
 
 BURST = 8
@@ -104,8 +106,8 @@ class ClientNode(InterfaceNode):
     def refused(self, message: Message, reason: str) -> None:
         self._fail(message, CallFailed("refused", reason))
 
-    def status(self) -> dict[str, Any]:
-        return {**super().status(), "open_calls": len(self._calls)}
+    def status(self) -> NodeStatus:
+        return structs.replace(super().status(), open_calls=len(self._calls))
 
     async def _call(self, message: Message) -> None:
         try:

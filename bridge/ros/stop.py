@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from msgspec import UNSET, structs
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
@@ -27,6 +28,7 @@ from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.protocol.messages import ROS, AddNode, NodeType, node_name
 from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.robot_state import NodeStatus
 
 log = logging.getLogger("macs.ros")
 
@@ -147,9 +149,8 @@ class StopNode(InterfaceNode):
         """Ids of other robots whose agents work on this ROS graph."""
         return self._shared.others if self._shared is not None else []
 
-    def status(self) -> dict[str, Any]:
-        others = self.shared_with
-        return {**super().status(), **({"shared_with": others} if others else {})}
+    def status(self) -> NodeStatus:
+        return structs.replace(super().status(), shared_with=self.shared_with or UNSET)
 
     def _take_back(self, by: str) -> None:
         with self._lock:

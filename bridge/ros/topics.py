@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
+from msgspec import UNSET, UnsetType, structs
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.serialization import serialize_message
 
@@ -34,6 +35,7 @@ from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.protocol.messages import AddNode, NodeType, StreamData
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.recovery import SILENT_S
+from macs_zenoh.protocol.robot_state import ControlStatus, DeadManStatus, NodeStatus
 from macs_zenoh.timeouts import within
 
 log = logging.getLogger("macs.ros")
@@ -203,12 +205,10 @@ class SubscriberNode(TopicNode):
         if due is None:
             self._put(cdr)
         elif not waits:
-            self._loop.call_soon_threadsafe(self._loop.call_later, due - now, self._put_latest_soon)
-
-    def _put_latest_soon(self) -> None:
-        self.robot.session.submit(self._put_latest)
+            self._loop.call_soon_threadsafe(self._loop.call_later, due - now, self._put_latest)
 
     def _put_latest(self) -> None:
+        """What waited for its time, on the loop."""
         if self._rate is not None and self._subscription is not None:
             with self._rate_lock:
                 latest = self._rate.take(time.monotonic())
@@ -470,25 +470,24 @@ class PublisherNode(TopicNode):
             self._stopped_at = time.monotonic()
             log.log(level, "%s: %s; published the stop message", self.topic, why)
 
-    def status(self) -> dict[str, Any]:
-        status = super().status()
-        if self.control is not None:
-            now = time.monotonic()
-            holder = self.control.holder(now)
-            status["control"] = {
-                "holder": str(holder) if holder else None,
-                "seconds_held": round(self.control.seconds_held(now), 1),
-                "seconds_left": round(self.control.seconds_left(now), 1) if holder else 0,
-            }
-        if self.deadman is not None:
-            commander = self.deadman.commander
-            status["deadman"] = {
-                "silence_s": self.deadman.silence_s,
-                "commander": str(commander) if commander else None,
-                "trips": self.deadman.trips,
-                "last": self.deadman.why,
-            }
-        return status
+    def status(self) -> NodeStatus:
+        return structs.replace(super().status(), control=self._control_status(), deadman=self._deadman_status())
+
+    def _control_status(self) -> ControlStatus | UnsetType:
+        if self.control is None:
+            return UNSET
+        now = time.monotonic()
+        holder = self.control.holder(now)
+        left_s = round(self.control.seconds_left(now), 1) if holder else 0
+        return ControlStatus(str(holder) if holder else None, round(self.control.seconds_held(now), 1), left_s)
+
+    def _deadman_status(self) -> DeadManStatus | UnsetType:
+        if self.deadman is None:
+            return UNSET
+        commander = self.deadman.commander
+        return DeadManStatus(
+            self.deadman.silence_s, str(commander) if commander else None, self.deadman.trips, self.deadman.why
+        )
 
 
 def types_of_others(node: Any, endpoints: Iterable[Any]) -> set[str]:

@@ -32,7 +32,6 @@ from tests.attack.scene import BEGIN_S, MIB, ROBOT, descriptors, status_bytes, t
 from std_msgs.msg import String  # isort: skip
 
 from bridge.cli import robots
-from bridge.cli.robots import Status
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Subscription
 from bridge.ros.session import RosSession
@@ -40,6 +39,7 @@ from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.messages import OPERATOR, ROS
+from macs_zenoh.protocol.robot_state import RobotStatus
 from tests.support.links import Link, counted
 from tests.support.programs import ROOT, Program, free_port
 from tests.support.routers import Router
@@ -256,7 +256,7 @@ class Site:
             seen = sorted((agent.type, agent.id) for agent in await operator.online())
             if seen != sorted([(ROS, ROBOT), *((2, each) for each in ids)]):
                 return f"on the mesh are {seen}, here are {ids}"
-            _, status = robots.read(await operator.ask(ROBOT, "status", timeout_s=5), Status)
+            _, status = robots.read(await operator.ask(ROBOT, "status", timeout_s=5), RobotStatus)
         nodes = {node.name: sorted(node.registrants) for node in status.nodes if node.role != "emergency stop"}
         wanted = {TOPIC: sorted(f"unity/{each}" for each in ids)}
         return "" if nodes == wanted else f"the robot's nodes are {nodes}, wanted is {wanted}"

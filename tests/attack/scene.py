@@ -28,7 +28,7 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Bool
 
 from bridge.cli import robots
-from bridge.cli.robots import Operator, Status
+from bridge.cli.robots import Operator
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Publisher
 from bridge.ros.session import RosSession
@@ -37,6 +37,7 @@ from macs_zenoh.errors import MacsError
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.limits import UNFINISHED_IN_ALL_BYTES, WAITING_IN_ALL_BYTES
 from macs_zenoh.protocol.messages import OPERATOR
+from macs_zenoh.protocol.robot_state import RobotStatus
 from tests.attack import secured
 from tests.attack.judge import Memory, Report, Window
 from tests.attack.table import Attack
@@ -453,7 +454,7 @@ class Scene:
     async def _facts(self) -> dict[str, Any]:
         """What must be the same afterwards."""
         online = await self.presser.online(timeout_s=10)
-        _, status = robots.read(await self.operator.ask(ROBOT, "status", timeout_s=10), Status)
+        _, status = robots.read(await self.operator.ask(ROBOT, "status", timeout_s=10), RobotStatus)
         return {
             "who is online": (online.ros_agent_ids, online.unity_agent_ids),
             "interface nodes": sorted((node.role, node.name, tuple(node.registrants)) for node in status.nodes),
@@ -506,7 +507,7 @@ class Scene:
                 await headset.advertise("/cmd_vel", "geometry_msgs/Twist", agents=[ROBOT])
                 lamp = await headset.subscribe("/emergency_stop", "std_msgs/Bool", agents=[ROBOT])
                 await asyncio.wait_for(lamp.__anext__(), 5)
-                _, status = robots.read(await self.operator.ask(ROBOT, "status", timeout_s=5), Status)
+                _, status = robots.read(await self.operator.ask(ROBOT, "status", timeout_s=5), RobotStatus)
                 me = f"unity/{headset.id}"
                 if not any(node.name == "/cmd_vel" and me in " ".join(node.registrants) for node in status.nodes):
                     return [f"a newcomer may not drive: {[node.registrants for node in status.nodes]}"]

@@ -178,7 +178,7 @@ async def test_a_result_survives_a_lost_connection(site: SimpleNamespace) -> Non
     site.five.online = False
     site.nodes.forget(Registrant(2, 5))
     node = site.nodes.get(NodeType.ACTION, "nd__count")
-    await until(lambda: node.status()["goals"][0]["finished"])
+    await until(lambda: node.status().goals[0].finished)
     site.five.online = True
     await site.five.client.ask_again()
     assert (await goal.result(PATIENCE_S)).status == SUCCEEDED
@@ -211,7 +211,7 @@ async def test_a_goal_is_not_the_next_ones_who_has_the_id(site: SimpleNamespace)
     site.nodes.forget(Registrant(2, 9), for_good=True)  # another one came
     site.nodes.returned(Registrant(2, 9))
     heard = site.nine.heard
-    assert site.nodes.get(NodeType.ACTION, "nd__count").status()["goals"][0]["owner"] == ""
+    assert site.nodes.get(NodeType.ACTION, "nd__count").status().goals[0].owner == ""
     assert await site.nine.client.goals(7) == []
     await asyncio.sleep(0.1)
     assert site.nine.heard == heard + 1, "more than the empty list"
@@ -232,11 +232,11 @@ async def test_goals_end_with_their_headset_where_a_rule_says_so(site: SimpleNam
     ended, stays = await five.send_goal(7, site.goal(1000)), await six.send_goal(7, site.goal(1000))
     late = asyncio.create_task(five.send_goal(7, site.goal(1000)))
     node = site.nodes.get(NodeType.ACTION, "nd__other")
-    await until(lambda: len(node.status()["goals"]) == 3)
+    await until(lambda: len(node.status().goals) == 3)
     site.nodes.forget(Registrant(2, 5))
 
     def states(of: Any) -> dict[str, int]:
-        return {goal["goal"]: goal["status"] for goal in of.status()["goals"]}
+        return {goal.goal: goal.status for goal in of.status().goals}
 
     await until(lambda: list(states(node).values()).count(CANCELED) == 2)
     assert states(node)[ended.id.hex()] == CANCELED

@@ -16,7 +16,6 @@ from std_msgs.msg import Bool, String
 import macs_zenoh
 from bridge.ros.agent import RobotAgent, open_robot
 from bridge.ros.graph import Offered, TopicQos
-from bridge.ros.requests import STATUS
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings
@@ -33,6 +32,7 @@ from macs_zenoh.protocol.messages import (
     decode_management,
 )
 from macs_zenoh.protocol.messages import encode_data as encode
+from macs_zenoh.protocol.robot_state import STATUS
 from macs_zenoh.protocol.routing import call
 from macs_zenoh.protocol.wire import parse_frame
 from tests.support.ros_peer import Peer, adding, command, removing

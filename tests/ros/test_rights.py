@@ -18,7 +18,7 @@ import macs_zenoh
 from bridge.ros.agent import RobotAgent, open_robot
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
-from bridge.ros.requests import ControlRequest, control
+from bridge.ros.requests import control
 from bridge.ros.rules import Rules
 from bridge.ros.servers import servers_elsewhere
 from bridge.ros.session import RosSession
@@ -31,6 +31,7 @@ from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.keyexpr import PRESENCE
 from macs_zenoh.protocol.messages import ActionVerb, AddNode, CallFailure, Metadata, NodeType, encode_data
 from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.robot_state import ControlRequest
 from macs_zenoh.protocol.routing import call, inbox, keys_of
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, parse_frame
 from tests.support.ros_peer import Peer, adding, drive, removing
@@ -113,7 +114,7 @@ async def test_commands_go_to_the_topic_that_their_sender_registered(nodes: Inte
     assert nodes.drops == {}
     node = nodes.on_topic(NodeType.PUBLISHER, "/cmd_vel")
     assert node is not None
-    assert node.status()["control"]["holder"] == "unity/5"
+    assert node.status().control.holder == "unity/5"
 
 
 async def test_a_name_that_may_mean_two_topics_is_for_those_who_registered(
@@ -380,7 +381,7 @@ async def test_a_group_that_one_only_says_gives_no_right(router: str, domain: in
         operator.send(drive(1).data, to="ros", ids=[ROBOT], metadata=metadata)
         node = robot.nodes.on_topic(NodeType.PUBLISHER, "/cmd_vel")
         assert node is not None
-        await until(lambda: node.status()["control"]["holder"] == "unity/5")
+        await until(lambda: node.status().control.holder == "unity/5")
 
 
 # -- who serves ------------------------------------------------------------------------------------------------------
@@ -489,7 +490,7 @@ async def test_nothing_of_an_agent_is_its_successors(router: str, domain: int, p
         await get(asked)
         drive_node = robot.nodes.on_topic(NodeType.PUBLISHER, "/cmd_vel")
         assert drive_node is not None
-        assert drive_node.status()["control"]["holder"] == f"unity/{Lodging.ID}"
+        assert drive_node.status().control.holder == f"unity/{Lodging.ID}"
 
         lodging.next(2)
         await until(lambda: len(robot.nodes) == 0)

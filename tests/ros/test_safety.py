@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator
 from typing import Any
 
+import msgspec
 import pytest
 from geometry_msgs.msg import Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -177,7 +178,7 @@ async def test_silence_publishes_the_stop_message_once(nodes: InterfaceNodes, pe
     assert received.empty()
     node = nodes.get(2, "nd__cmd_vel")
     assert node is not None
-    assert node.status()["deadman"] == {
+    assert msgspec.to_builtins(node.status().deadman) == {
         "silence_s": SILENCE_S,
         "commander": None,
         "trips": 1,
@@ -245,7 +246,7 @@ async def test_control_is_given_on_request(nodes: InterfaceNodes, peer: Peer) ->
     assert control(nodes, FIVE, ControlRequest("give", "/cmd_vel", to=6), now()).holder == "unity/6"
     node = nodes.get(2, "nd__cmd_vel")
     assert node is not None
-    assert node.status()["control"]["holder"] == "unity/6"
+    assert node.status().control.holder == "unity/6"
     nodes.deliver(drive(0.5, 5))
     nodes.deliver(drive(0.6, 6))
     assert [(await get(received)).linear.x for _ in range(2)] == [0.5, 0.6]

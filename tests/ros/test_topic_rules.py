@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import AsyncIterator
 
 import pytest
@@ -76,6 +77,20 @@ async def test_a_limited_topic_sends_the_latest(
         sent.append(int(deserialize_message(bytes(frame.body), String).data))
     assert sent == sorted(sent)
     assert 8 <= len(sent) <= 25  # 10 per second; a busy machine needs longer than a second for 200
+
+
+async def test_what_waits_for_its_time_goes_straight_into_the_mesh(session: RosSession, peer: Peer) -> None:
+    """A limited topic's message that had to wait is put where its time ends, on the loop: not by way of ROS's thread,
+    which may be busy."""
+    putting: list[int] = []
+    put = lambda node, frame: putting.append(threading.get_ident())  # noqa: E731
+    nodes = InterfaceNodes(Robot(session, 7, put, rules=Rules(RobotSettings(rules=RULES))))
+    await nodes.add(adding("/fast"))
+    publisher = await peer.publisher(String, "/fast", matched=1)
+    while threading.get_ident() not in putting:
+        publisher.publish(String(data="x"))
+        await asyncio.sleep(0.005)
+    nodes.close()
 
 
 async def test_settings_replace_the_qos_of_a_topic(nodes: InterfaceNodes, peer: Peer) -> None:

@@ -27,6 +27,7 @@ from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.keyexpr import KEYS
 from macs_zenoh.protocol.named import Named
 from macs_zenoh.protocol.ping import Pong
+from macs_zenoh.protocol.robot_state import RobotStatus
 
 
 def parsed(*argv: str) -> argparse.Namespace:
@@ -363,7 +364,7 @@ def test_ls_prints_what_its_help_shows() -> None:
     control = {"holder": "unity/256"}
     node = {"role": "publisher", "name": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "control": control}
     said = {"ros_node": "/r", "stopped": True, "stop": {"by": "operator/5"}, "nodes": [node]}
-    told = {7: ls.RobotReport(status=msgspec.convert(said, robots.Status))}
+    told = {7: ls.RobotReport(status=msgspec.convert(said, RobotStatus))}
     pongs = {headset.zid: Pong(time_s=0.0, address="10.0.0.5:7000", macs="0.1.0", zenoh="1.10.2")}
     routers = [robots.Router("d8c1f2aa", "v1.10.2-release built", ["tcp/10.0.0.1:7447"])]
     agents = [robot, headset]

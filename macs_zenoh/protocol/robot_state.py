@@ -1,0 +1,115 @@
+"""What a robot says of itself, and what it is asked for besides: the same for the robot and for who asks. Pure.
+
+As JSON: verbs on the mesh, and plain messages to the robot whose manager is the name here. See docs/robot.md.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from msgspec import UNSET, Struct, UnsetType, field
+
+from .messages import AgentId, AgentType, Functionality
+
+STATUS = "RobotStatus"
+"""Manager of a request for a robot's state; its data is ignored."""
+
+
+class ControlStatus(Struct, frozen=True):
+    """Who commands a topic."""
+
+    holder: str | None = None
+    seconds_held: float = 0
+    seconds_left: float = 0
+
+
+class DeadManStatus(Struct, frozen=True):
+    """What happens when commands stop, and how often it has."""
+
+    silence_s: float | None = None
+    commander: str | None = None
+    trips: int = 0
+    last: str = ""
+
+
+class GoalStatus(Struct, frozen=True):
+    """A goal that an action works on, or whose result waits; ``status`` as ROS numbers it."""
+
+    goal: str = ""
+    status: int = 0
+    owner: str = ""
+    finished: bool = False
+
+
+class NodeStatus(Struct, frozen=True):
+    """An interface node and what is going on there: what it has none of is left out."""
+
+    role: str
+    name: str
+    type: str
+    registrants: list[str] = []
+    control: ControlStatus | UnsetType = UNSET
+    deadman: DeadManStatus | UnsetType = UNSET
+    open_calls: int | UnsetType = UNSET
+    goals: list[GoalStatus] | UnsetType = UNSET
+    shared_with: list[int] | UnsetType = UNSET
+    """Ids of other robots of the ROS graph, whose emergency stop this is as well."""
+
+
+class StopStatus(Struct, frozen=True):
+    """The emergency stop: who pressed it last, who has and has not taken that back, how long ago, how often in all."""
+
+    by: str = ""
+    pressed: list[str] = []
+    seconds: float = 0
+    times: int = 0
+    history: list[str] = []
+
+
+class RobotStatus(Struct, frozen=True):
+    """The whole: what an answer of a newer robot has besides is ignored."""
+
+    ros_node: str
+    stopped: bool
+    stop: StopStatus
+    nodes: list[NodeStatus]
+    drops: dict[str, int] = {}
+    ros_domain: int | None = None
+
+
+class TopicQos(Struct, frozen=True):
+    """What a subscription to a topic has to ask for, or a publisher to offer, to match everybody there."""
+
+    reliability: str = ""
+    durability: str = ""
+
+
+class Offered(Functionality, frozen=True, rename="camel"):
+    """What a robot offers, with what the existing program does not tell: actions, and QoS by topic."""
+
+    actions: dict[str, str] = field(default_factory=dict)
+    qos: dict[str, TopicQos] = field(default_factory=dict)
+
+
+class FollowRequest(Struct, frozen=True):
+    """The data of a FunctionalityGetter request, if it has any: ``follow`` asks for every change as well."""
+
+    follow: bool = False
+
+
+class ControlRequest(Struct, frozen=True, rename="camel"):
+    """Take control over a topic, release it, or give it to another agent (``to``, a headset unless ``toType``)."""
+
+    manager: ClassVar[str] = "RobotControl"
+    action: Literal["take", "release", "give"]
+    topic: str
+    to: AgentId = 0
+    to_type: AgentType = 2
+
+
+class ControlReply(Struct, frozen=True, rename="camel", omit_defaults=True):
+    """Whether it was done, who holds control now, and why not."""
+
+    done: bool
+    holder: str = ""
+    reason: str = ""
