@@ -53,9 +53,6 @@ NO_EFFECT_S = 4.0
 """A stop or a dead-man that has done nothing by then counts as none."""
 HOLDS_S = 0.15
 """How long after each stop the driver is watched driving in vain."""
-ON_THE_WAY_S = 0.05
-"""Lamp and wheels are two topics: a command published before the lamp was may be heard so long after it. Such a one
-counts as the moment of the effect; one that is later was carried out in spite of the stop."""
 RECOVERY_S = 60.0
 """By when everything must be as before. What a headset sent before it left is in the network still, up to 4 MB in its
 own kernel, and is worked off at the pace that a gateway allows: so long it is online."""
@@ -205,6 +202,8 @@ class Heard(NamedTuple):
     sent: float
     stop: bool
     """Whether it is the dead-man's message."""
+    published_ns: int
+    """When the robot agent published it."""
 
 
 class Wheels:
@@ -212,7 +211,8 @@ class Wheels:
 
     def __init__(self, domain: int) -> None:
         self.heard: list[Heard] = []
-        self.lamp: list[tuple[float, bool]] = []
+        self.lamp: list[tuple[float, bool, int]] = []
+        """When what was shown, and when the robot agent published that."""
         self._session = RosSession("wheels", domain_id=domain)
 
     async def start(self) -> None:
@@ -226,11 +226,11 @@ class Wheels:
 
         await self._session.run(make)
 
-    def _drive(self, twist: Any) -> None:
-        self.heard.append(Heard(time.monotonic(), twist.linear.y, twist.linear.z == -1))
+    def _drive(self, twist: Any, about: dict[str, int]) -> None:
+        self.heard.append(Heard(time.monotonic(), twist.linear.y, twist.linear.z == -1, about["source_timestamp"]))
 
-    def _show(self, state: Any) -> None:
-        self.lamp.append((time.monotonic(), state.data))
+    def _show(self, state: Any, about: dict[str, int]) -> None:
+        self.lamp.append((time.monotonic(), state.data, about["source_timestamp"]))
 
     @property
     def stopped(self) -> bool:
@@ -395,10 +395,11 @@ class Scene:
         if not self.wheels.stopped:
             window.stops.append(math.inf)
             return await self._release(by_headset=by_headset)
-        shown = self.wheels.lamp[-1][0]
+        shown, _, published_ns = self.wheels.lamp[-1]
         await asyncio.sleep(HOLDS_S)
-        after = [heard.at for heard in self.wheels.heard if heard.at > shown and not heard.stop]
-        settled = [at for at in after if at - shown <= ON_THE_WAY_S]
+        # lamp and wheels are two topics: what was published before may be heard after, and is the moment of the effect
+        after = [heard for heard in self.wheels.heard if heard.at > shown and not heard.stop]
+        settled = [heard.at for heard in after if heard.published_ns <= published_ns]
         window.stops.append(max([shown, *settled]) - pressed)
         window.late_commands += len(after) - len(settled)
         return await self._release(by_headset=by_headset)

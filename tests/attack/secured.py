@@ -13,11 +13,11 @@ from pathlib import Path
 
 import zenoh
 
+from bridge import settings
 from bridge.security import access, policy
 from bridge.security.access import INGRESS, Fields
 from bridge.security.generate import generate
 from bridge.security.policy import Client, Policy
-from macs_zenoh import config
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.protocol.keyexpr import (
     BROADCAST,
@@ -94,7 +94,7 @@ def made(directory: Path) -> str:
 
 def mesh_of(directory: Path, name: str) -> MeshSettings:
     """How somebody's programs reach the mesh."""
-    return config.load(directory / name / "macs.toml").mesh
+    return settings.load(directory / name / "macs.toml").mesh
 
 
 class Rights:
