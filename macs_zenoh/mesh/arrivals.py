@@ -32,9 +32,14 @@ def now_s() -> float:
     return time.clock_gettime(_CLOCK)
 
 
+Queue = deque[tuple[Callable[[Iterator[Any]], None], tuple[Any, ...], bool]]
+"""For whom, the sample, and whether the loop's own thread has put it."""
+
+
 class Arrivals:
     """Samples on their way from Zenoh's threads to the loop: one queue for all subscriptions, so that what one
-    sender sent on several keys is handled in the order in which it came.
+    sender sent on several keys is handled in the order in which it came. What this program has put itself has another
+    one, and the two take turns: what the mesh floods us with delays nothing that agents here say to each other.
 
     When the loop is behind, the delivering thread waits a moment, then drops: Zenoh must not be held up for long,
     or other programs' messages wait too. Topic data is dropped before that, without waiting.
@@ -56,7 +61,7 @@ class Arrivals:
     LARGE_BYTES = 16 << 10
     LIMIT_BYTES = 128 << 20
     """Of payloads that are large; the others are bounded by their number."""
-    UNWATCHED_BYTES = 128 << 10
+    UNWATCHED_BYTES = 16 << 10
     """Handled without a look at the time: it can be thousands of small frames."""
     SAMPLE_BYTES = 256
     """What each sample counts as besides its payload."""
@@ -81,8 +86,10 @@ class Arrivals:
         self._loop = loop
         self._loop_thread = threading.get_ident()
         self._wake = wake
-        self._queue: deque[tuple[Callable[[Iterator[Any]], None], tuple[Any, ...], bool]] = deque()
-        """For whom, the sample, and whether the loop's own thread has put it."""
+        self._queue: Queue = deque()
+        """From elsewhere."""
+        self._mine: Queue = deque()
+        """Of this program, from whichever of its threads."""
         self.looped = 0
         """How many of these the loop's own thread has put."""
         self._waiting = False
@@ -112,7 +119,7 @@ class Arrivals:
         """What Zenoh calls, in whatever thread, for each sample of one subscription; whether there was room for it.
         Samples that their source has numbered go to ``on_numbered``, if it is given; others are offered to
         ``at_once`` first."""
-        queue, limit, large, own = self._queue, self.TOPICS_LIMIT, self.LARGE_BYTES, self._own
+        others, mine, limit, large, own = self._queue, self._mine, self.TOPICS_LIMIT, self.LARGE_BYTES, self._own
 
         def receive(sample: zenoh.Sample) -> bool:
             try:
@@ -121,8 +128,9 @@ class Arrivals:
                 payload = own.payload = None
                 keep_attached()
             elsewhere = payload is None
+            queue = others if elsewhere else mine
             looped = not elsewhere and threading.get_ident() == self._loop_thread
-            if (self.looped if looped else len(queue)) >= limit and not self._has_room(sample, looped):
+            if (self.looped if looped else len(queue)) >= limit and not self._has_room(sample, queue, looped):
                 return False
             if elsewhere:
                 payload = sample.payload.to_bytes()
@@ -226,11 +234,11 @@ class Arrivals:
 
     def _taken_at_once(self, at_once: AtOnce, key: str, payload: Payload) -> bool:
         """Whether it was taken in this thread, one of Zenoh's."""
-        if self._queue or len(payload) > self.AT_ONCE_BYTES or not self._turn.acquire(blocking=False):
+        if self._queue or self._mine or len(payload) > self.AT_ONCE_BYTES or not self._turn.acquire(blocking=False):
             return False
         try:
             calm = time.monotonic() - self._busy_until > self.CALM_S
-            return calm and not self._queue and not self.asked and at_once(key, payload)
+            return calm and not (self._queue or self._mine or self.asked) and at_once(key, payload)
         except Exception:
             log.exception("handling a sample failed")  # it may have been half done: not once more
             return True
@@ -259,23 +267,25 @@ class Arrivals:
                 self._handing_over = False
 
     def _deliver_batch(self) -> None:
-        queue, now = self._queue, time.monotonic()
+        queue, other, now = self._mine, self._queue, time.monotonic()
         until = now + self.TURN_S
-        while queue and now < until:  # who sends large samples must feel soon where they wait
-            on_batch = queue[0][0]
-            waiting = self._taken_out(on_batch, now + self.BATCH_S)
-            if not self._hand_over(on_batch, waiting):  # it did not look at them
-                next(waiting, None)
-            now = time.monotonic()
+        while (queue or other) and now < until:  # who sends large samples must feel soon where they wait
+            if queue:
+                on_batch = queue[0][0]
+                waiting = self._taken_out(queue, on_batch, now + self.BATCH_S)
+                if not self._hand_over(on_batch, waiting):  # it did not look at them
+                    next(waiting, None)
+                now = time.monotonic()
+            queue, other = other, queue
         self._handled = None  # it may have megabytes
-        if queue and not self._waiting:
+        if (queue or other) and not self._waiting:
             self._waiting = True
             self._loop.call_soon(self._deliver)
 
-    def _taken_out(self, on_batch: Callable[[Iterator[Any]], None], until: float) -> Iterator[Any]:
-        """The samples in the queue as far as they are for this handler, which may have them for so long. Each is taken
+    def _taken_out(self, queue: Queue, on_batch: Callable[[Iterator[Any]], None], until: float) -> Iterator[Any]:
+        """The samples in a queue as far as they are for this handler, which may have them for so long. Each is taken
         out as it is handled."""
-        queue, unwatched = self._queue, self.UNWATCHED_BYTES
+        unwatched = self.UNWATCHED_BYTES
         while queue:
             handler, sample, looped = queue[0]
             if handler is not on_batch and handler != on_batch:
@@ -320,7 +330,7 @@ class Arrivals:
                     return asked
                 asked = True
 
-    def _has_room(self, sample: zenoh.Sample, looped: bool) -> bool:
+    def _has_room(self, sample: zenoh.Sample, queue: Queue, looped: bool) -> bool:
         """Whether there is room for one more. Topic data does not wait for it, nor can the loop's own thread."""
         if looped:
             room = self.looped < self.LIMIT
@@ -328,7 +338,7 @@ class Arrivals:
             self._behind("topics_behind")
             return False
         else:
-            room = self._patiently(lambda: len(self._queue) < self.LIMIT)
+            room = self._patiently(lambda: len(queue) < self.LIMIT)
         if not room:
             self._behind("loop_behind")
         return room

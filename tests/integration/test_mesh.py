@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -90,6 +91,37 @@ async def test_a_lost_router_costs_nothing_between_agents_of_one_program() -> No
             mesh.put(KEY, payload)
         await until(lambda: len(here) == 6)
         assert [end for _, end in here] == [i.to_bytes(4, "big") for i in range(6)]
+
+
+async def test_a_flood_from_elsewhere_delays_nothing_that_agents_of_one_program_say(router: str) -> None:
+    """What this program puts does not wait behind all that has come from the mesh, and is in its own order."""
+    handled: list[str] = []
+
+    def slow(batch: Iterator[Sample]) -> None:
+        for _ in batch:
+            handled.append("elsewhere")
+            time.sleep(0.001)
+
+    def own(batch: Iterator[Sample]) -> None:
+        handled.extend(bytes(payload).decode() for _, payload in batch)
+
+    async with (
+        await Mesh.open(MeshSettings(connect=[router])) as mesh,
+        await Mesh.open(MeshSettings(connect=[router])) as other,
+    ):
+        mesh.subscribe("test/flood", slow)
+        mesh.subscribe("test/own", own)
+        await until(lambda: (other.put("test/flood", b"begin"), handled)[1])
+        for _ in range(1500):
+            other.put("test/flood", b"x")
+        await until(lambda: len(mesh._arrivals._queue) > 500)
+        waiting, before = len(mesh._arrivals._queue), len(handled)
+        for word in ("one", "two"):
+            mesh.put("test/own", word.encode())
+        await until(lambda: "two" in handled)
+        since = handled[before:]
+        assert since.index("one") < since.index("two")
+        assert since.index("two") < waiting // 2, f"behind {since.index('two')} of {waiting} that waited"
 
 
 async def test_a_sample_that_fails_costs_itself(router: str, caplog: pytest.LogCaptureFixture) -> None:
