@@ -157,4 +157,6 @@ def _made(way: Callable[[Target, str], None], kind: str, name: str) -> Callable[
 
 for _kind, _name in INSIDERS.items():
     for _section, _way in WAYS.values():
-        enter(_made(_way, _kind, _name), _section, "certificate", seen=_section == 3)
+        _to_headsets = _way is puts and _kind in ("gateway", "watching_gateway", "robot")
+        _row = _made(_way, _kind, _name)
+        enter(_row, _section, "certificate", seen=_section == 3, addressed=_to_headsets)

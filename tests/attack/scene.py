@@ -199,11 +199,10 @@ class Heard(NamedTuple):
     """What the robot's wheels were told."""
 
     at: float
+    """When the robot agent published it: this process may be late to hear it, since it is everybody in the scene."""
     sent: float
     stop: bool
     """Whether it is the dead-man's message."""
-    published_ns: int
-    """When the robot agent published it."""
 
 
 class Wheels:
@@ -211,8 +210,9 @@ class Wheels:
 
     def __init__(self, domain: int) -> None:
         self.heard: list[Heard] = []
-        self.lamp: list[tuple[float, bool, int]] = []
-        """When what was shown, and when the robot agent published that."""
+        self.lamp: list[tuple[float, bool]] = []
+        """When the robot agent published what it shows."""
+        self._epoch = time.time() - time.monotonic()
         self._session = RosSession("wheels", domain_id=domain)
 
     async def start(self) -> None:
@@ -227,10 +227,13 @@ class Wheels:
         await self._session.run(make)
 
     def _drive(self, twist: Any, about: dict[str, int]) -> None:
-        self.heard.append(Heard(time.monotonic(), twist.linear.y, twist.linear.z == -1, about["source_timestamp"]))
+        self.heard.append(Heard(self._published(about), twist.linear.y, twist.linear.z == -1))
 
     def _show(self, state: Any, about: dict[str, int]) -> None:
-        self.lamp.append((time.monotonic(), state.data, about["source_timestamp"]))
+        self.lamp.append((self._published(about), state.data))
+
+    def _published(self, about: dict[str, int]) -> float:
+        return about["source_timestamp"] / 1e9 - self._epoch
 
     @property
     def stopped(self) -> bool:
@@ -338,8 +341,18 @@ class Scene:
             for name, m in memory.items()
             if m.kept > SLACK_BYTES and name in MEMORY_LIMITS
         ]
-        promised = attack.by not in ("mesh", "operator")
-        return Report(attack.name, attack.single, calm, benign, under, memory, MEMORY_LIMITS, promised, broken)
+        return Report(
+            attack.name,
+            attack.single,
+            calm,
+            benign,
+            under,
+            memory,
+            MEMORY_LIMITS,
+            commands_promised=attack.by not in ("mesh", "operator"),
+            neighbours_promised=not attack.addressed,
+            broken=broken,
+        )
 
     @asynccontextmanager
     async def _attacked(self, attack: Attack, site: Site, seconds: float, stops: int | None) -> AsyncIterator[None]:
@@ -395,13 +408,10 @@ class Scene:
         if not self.wheels.stopped:
             window.stops.append(math.inf)
             return await self._release(by_headset=by_headset)
-        shown, _, published_ns = self.wheels.lamp[-1]
+        shown = self.wheels.lamp[-1][0]
         await asyncio.sleep(HOLDS_S)
-        # lamp and wheels are two topics: what was published before may be heard after, and is the moment of the effect
-        after = [heard for heard in self.wheels.heard if heard.at > shown and not heard.stop]
-        settled = [heard.at for heard in after if heard.published_ns <= published_ns]
-        window.stops.append(max([shown, *settled]) - pressed)
-        window.late_commands += len(after) - len(settled)
+        window.stops.append(shown - pressed)
+        window.late_commands += sum(heard.at > shown and not heard.stop for heard in self.wheels.heard)
         return await self._release(by_headset=by_headset)
 
     async def _ask_stop(self, data: bytes) -> None:

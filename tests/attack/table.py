@@ -54,6 +54,8 @@ class Attack:
     single: bool
     seen: bool
     run: Callable[[Target], None]
+    addressed: bool = False
+    """Whether it sends to the neighbours themselves, who take it as well as they can."""
 
     @property
     def certified(self) -> bool:
@@ -80,9 +82,17 @@ def attack(
     return lambda run: enter(run, section, by, single=single, seen=seen)
 
 
-def enter(run: Callable[[Target], None], section: int, by: By, *, single: bool = False, seen: bool = False) -> Attack:
+def enter(
+    run: Callable[[Target], None],
+    section: int,
+    by: By,
+    *,
+    single: bool = False,
+    seen: bool = False,
+    addressed: bool = False,
+) -> Attack:
     """Put a function into the table, under its name."""
-    row = Attack(run.__name__, section, by, single, seen, run)
+    row = Attack(run.__name__, section, by, single, seen, run, addressed)
     assert row.says, f"{row.name} does not say what it sends"
     assert ATTACKS.setdefault(row.name, row) is row, f"two attacks are called {row.name}"
     return row
