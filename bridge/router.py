@@ -15,6 +15,9 @@ from macs_zenoh.protocol.addresses import is_local
 
 log = logging.getLogger("macs.router")
 
+KEPT_IN = "-l tcp/127.0.0.1:7447 keeps it to this machine, `macs security generate` says who may what"
+"""What to do about an endpoint that is `open_to_anybody`."""
+
 SETTLE_S = 1.0
 """How long after a link is back all must be known that is behind it."""
 ANSWER_S = 2.0

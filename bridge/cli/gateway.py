@@ -8,6 +8,7 @@ examples:
   macs gateway --workers 4                                 four processes behind one port
   macs gateway --robots 1,2                                existing robot programs too, as robots 1 and 2
   macs gateway --host 0.0.0.0 --without-token nobody       headsets with a token (macs token create)
+  macs gateway -m router -l tcp/127.0.0.1:7447             a router as well: for one machine, a hop less
   macs gateway --port 7001 -e tcp/10.0.0.1:7447 -e tcp/10.0.0.2:7447   two routers, for fail-over
 
 what it prints:
@@ -28,7 +29,9 @@ from bridge.cli import options, running
 from bridge.cli.supervisor import Child, stop_in_order
 from bridge.listening import bound
 from bridge.settings import GatewaySettings, Settings
-from macs_zenoh.errors import UsageError
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.errors import ConfigError, UsageError
+from macs_zenoh.protocol import endpoints
 from macs_zenoh.protocol.addresses import is_local, joined, reachable
 from macs_zenoh.sections import changed
 
@@ -74,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers", type=int, default=1, metavar="N", help="processes that share the port (default: 1)"
     )
     parser.add_argument(WORKER_ON, type=int, metavar="PORT", help=argparse.SUPPRESS)
-    options.add_mesh_options(parser)
+    options.add_mesh_options(parser, modes=("client", "peer", "router"))
 
 
 def _robots(text: str) -> list[int] | str:
@@ -107,6 +110,8 @@ def run(args: argparse.Namespace) -> int:
     )
     if args.workers < 1:
         raise UsageError(f"--workers is {args.workers}, at least 1 is needed")
+    if settings.mesh.mode == "router" and (args.workers > 1 or args.be_worker_on_port is not None):
+        raise UsageError("a gateway that is the router is one process: leave out --workers, or run macs router")
     if args.workers > 1 and args.be_worker_on_port is None:
         if listen_on.block is not None:
             raise UsageError("--block and --workers exclude each other: every worker leases a block of its own")
@@ -166,6 +171,18 @@ def _other_ports(gateway: Gateway) -> str:
     return tls + (f", http{secure}://{joined(reachable(ports.web_host), ports.web_port)}" if ports.web_port else "")
 
 
+def _judge_router(settings: MeshSettings) -> None:
+    """What a router says of its endpoints; and nobody holds a router's own program to the rules that it has. Raises
+    ConfigError."""
+    from bridge.router import KEPT_IN, open_to_anybody
+    from macs_zenoh.mesh import configuration
+
+    if endpoints.value_at(configuration(settings), "access_control/enabled"):
+        raise ConfigError("mesh.mode", "access rules do not hold a gateway that is the router: run macs router")
+    for endpoint in open_to_anybody(settings):
+        log.warning("%s is open: whoever reaches it sees all and drives robots; %s", endpoint, KEPT_IN)
+
+
 async def _serve(settings: Settings) -> int:
     from bridge.doctor.first import told_while_waiting
     from bridge.gateway import Gateway
@@ -175,6 +192,8 @@ async def _serve(settings: Settings) -> int:
 
     _raise_descriptor_limit()
     memory.give_back()
+    if settings.mesh.mode == "router":
+        _judge_router(settings.mesh)
     own = managers.load(settings.gateway.managers)
     waiting = told_while_waiting(settings.mesh)
     listening = settings.gateway

@@ -28,8 +28,6 @@ from macs_zenoh.sections import changed
 
 log = logging.getLogger("macs.router")
 
-KEPT_IN = "-l tcp/127.0.0.1:7447 keeps it to this machine, `macs security generate` says who may what"
-
 SUMMARY = "a Zenoh router, where robots and gateways meet"
 
 
@@ -45,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 async def _serve(settings: MeshSettings) -> int:
-    from bridge.router import open_to_anybody, serve
+    from bridge.router import KEPT_IN, open_to_anybody, serve
 
     memory.give_back()
 
