@@ -44,8 +44,12 @@ def read(path: Path) -> Tokens:
         return Tokens()
     except OSError as error:
         raise ConfigError(str(path), error.strerror or str(error)) from error
-    with os.fdopen(descriptor, "rb") as file:
+    try:
         _check_own(path, os.fstat(descriptor))
+    except BaseException:
+        os.close(descriptor)
+        raise
+    with os.fdopen(descriptor, "rb") as file:
         content = file.read(MOST_BYTES + 1)
     if len(content) > MOST_BYTES:
         raise ConfigError(str(path), f"has more than {MOST_BYTES} bytes: it is no file of tokens")

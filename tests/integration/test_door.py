@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import gc
 import json
 import os
@@ -19,7 +20,9 @@ import aiohttp
 import pytest
 
 from bridge.gateway import Gateway
+from bridge.headset import frames
 from bridge.headset.client import Headset
+from bridge.headset.frames import NodeSpec
 from bridge.headset.stream import Way
 from bridge.tokens import store
 from macs_zenoh.agent import Agent, join
@@ -29,15 +32,19 @@ from macs_zenoh.protocol.messages import (
     ROS,
     UNITY,
     AccessRefused,
+    AddNode,
     Configuration,
+    NodeRefused,
+    NodeType,
     decode_data,
     encode_data,
     encode_management,
 )
-from macs_zenoh.protocol.rights import Rights
+from macs_zenoh.protocol.rights import Right, Rights
 from macs_zenoh.protocol.tokens import Token, hash_of, new_pairing, new_secret
 from macs_zenoh.protocol.websocket import SUBPROTOCOL, TOKEN_SUBPROTOCOL
 from macs_zenoh.protocol.wire import encode_frame, split_message
+from macs_zenoh.serving import Call
 from tests.support.certificates import Authority
 from tests.support.given import StartGateway
 from tests.support.local import patient
@@ -193,6 +200,68 @@ async def test_a_token_is_held_to_its_rights(start_door: StartDoor, robots: list
         assert {refused.kind for refused in anna.forbidden} == {"not_permitted"}
         assert len(anna.forbidden) >= 4
     await until(lambda: (door.gateway.drops + door.other.drops)["NotPermitted"] == 5)
+
+
+@pytest.mark.parametrize("port", PORTS)
+async def test_each_right_holds_on_each_port(start_door: StartDoor, robots: list[Agent], port: str) -> None:
+    """For each kind of interface node: with its right robot 1 is asked for it and gets its data, by id and by group;
+    without it, at robot 2, in another group or for another topic nothing arrives, and the headset is told why."""
+    door = await start_door(**NOBODY)
+    asked: dict[int, list[tuple[int, str]]] = {1: [], 2: []}
+    heard: dict[int, list[tuple[int, bytes]]] = {1: [], 2: []}
+
+    async def answer(robot: int, call: Call) -> bytes:
+        node = decode_data(AddNode, call.data)
+        asked[robot].append((node.node_type, node.tos_name))
+        return b""
+
+    for robot in robots:
+        robot.serve("add_node", functools.partial(answer, robot.id))
+        robot.on_message(
+            lambda message, number=robot.id: heard[number].append((message.metadata.node_type, bytes(message.data)))
+        )
+    rights: dict[NodeType, Right] = {
+        NodeType.SUBSCRIBER: "see",
+        NodeType.PUBLISHER: "command",
+        NodeType.CLIENT: "call",
+        NodeType.SERVICE: "serve",
+        NodeType.ACTION: "act",
+    }
+    for kind, right in rights.items():
+        for books in (*asked.values(), *heard.values()):
+            books.clear()
+        others = [each for each in rights.values() if each != right]
+        may = door.tokens.make(f"may-{right}", may=[right], robots=[1], groups=[3], topics=["/camera/**"])
+        may_not = door.tokens.make(f"may-not-{right}", may=others, robots=[1], groups=[3], topics=["/camera/**"])
+        async with await door.come(port, may) as one, await door.come(port, may_not) as two:
+            await until(lambda: {agent.id for agent in robots} <= set(door.gateway.directory.ids(ROS)))
+            spec, other = NodeSpec(kind, "/camera/image", "pkg/T"), NodeSpec(kind, "/cmd_vel", "pkg/T")
+            attempts: list[tuple[Headset, NodeSpec, list[int], list[int], bytes]] = [
+                (one, other, [1], [], b"\0\1\0\0 another topic"),
+                (one, spec, [2], [], b"\0\1\0\0 another robot"),
+                (one, spec, [], [4], b"\0\1\0\0 another group"),
+                (two, spec, [1], [], b"\0\1\0\0 no right"),
+                (one, spec, [1], [], b"\0\1\0\0 by id"),
+                (one, spec, [], [3], b"\0\1\0\0 by group"),
+            ]
+            for headset, node, ids, groups, data in attempts:
+                await headset.send_frame(frames.registration(headset.id, node, ids, groups))
+                if kind is not NodeType.SUBSCRIBER:
+                    await headset.send_frame(frames.node_data(headset.id, node, data, ids, groups))
+            await until(lambda kind=kind: (kind, "/camera/image") in asked[1])
+            if kind is not NodeType.SUBSCRIBER:
+                await until(lambda: len(heard[1]) == 2)
+            for headset, count in ((one, 3), (two, 1)):
+                reasons: set[str] = set()
+                while len(reasons) < count:
+                    message = await headset.receive(10)
+                    if message.metadata.message_manager == NodeRefused.manager:
+                        reasons.add(decode_data(NodeRefused, message.data).reason)
+            await asyncio.sleep(0.1)
+            assert set(asked[1]) == {(kind, "/camera/image")}
+            assert asked[2] == []
+            assert heard[2] == []
+            assert [data[5:] for _, data in heard[1]] in ([], [b"by id", b"by group"])
 
 
 async def test_a_revoked_token_ends_its_connections(start_door: StartDoor) -> None:
