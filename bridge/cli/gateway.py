@@ -113,6 +113,8 @@ def run(args: argparse.Namespace) -> int:
     if settings.mesh.mode == "router" and (args.workers > 1 or args.be_worker_on_port is not None):
         raise UsageError("a gateway that is the router is one process: leave out --workers, or run macs router")
     if args.workers > 1 and args.be_worker_on_port is None:
+        if 0 in (listen_on.tls_port, listen_on.web_port):
+            raise UsageError("--workers share their ports: say which, and not 0, for --tls-port and --web-port")
         if listen_on.block is not None:
             raise UsageError("--block and --workers exclude each other: every worker leases a block of its own")
         return running.until_stopped(lambda: _supervise(args.workers, listen_on, args.words))

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Collection, Hashable, Sequence
 from typing import Protocol, cast
 
+from macs_zenoh.errors import NotAdmitted
 from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.addresses import joined, of_peer
 from macs_zenoh.protocol.budget import Toll
@@ -135,6 +136,7 @@ class Connection(asyncio.BufferedProtocol):
         self.entrance = entrance
         self.stranger = False
         """Whether a token is wanted of its agent, and it has shown none yet."""
+        self._not_let_in = False
         self.shown_token: str | None = None
         """What was shown before the first frame, where that is possible."""
         self.peer: TcpAgent
@@ -297,6 +299,9 @@ class Connection(asyncio.BufferedProtocol):
                 if type(event) is Sent:
                     self.owner.forward(self, event)
                 elif isinstance(event, Rejected):
+                    if isinstance(event.error, NotAdmitted):
+                        self._not_let_in = True  # the door tells of all who try, by their addresses
+                        continue
                     self._warn_once(type(event.error).__name__, str(event.error))  # the peer has counted it
                 elif isinstance(event, Left):
                     self.close(event.reason)
@@ -546,6 +551,7 @@ class Connection(asyncio.BufferedProtocol):
             return
         self.peer.lost()
         level = logging.INFO if reason == "went offline" else logging.WARNING
+        level = logging.DEBUG if self._not_let_in else level
         log.log(level, "%s leaves: %s", self, reason)
         self._writer.close()
 

@@ -16,6 +16,8 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
+from macs_zenoh.losses import Losses
+
 log = logging.getLogger("macs.gateway")
 
 BACKLOG = 1024
@@ -43,14 +45,13 @@ def descriptors() -> int:
 
 
 class Listener:
-    """One listening socket. ``on_turned_away(address)`` hears of whom there was no descriptor for, or, over TLS, no
-    place."""
+    """One listening socket. ``drops`` counts those for whom there was no descriptor or, over TLS, no place."""
 
     def __init__(
         self,
         listening: socket.socket,
         protocol: Callable[[], asyncio.BaseProtocol],
-        on_turned_away: Callable[[str], None],
+        drops: Losses,
         *,
         context: ssl.SSLContext | None = None,
         handshake_s: float = 10.0,
@@ -62,7 +63,7 @@ class Listener:
         self._greeting: Counter[str] = Counter()
         self._listening = listening
         self._protocol = protocol
-        self._on_turned_away = on_turned_away
+        self._drops = drops
         self._loop = asyncio.get_running_loop()
         self._again: asyncio.TimerHandle | None = None
         self._accepting: set[asyncio.Task[object]] = set()
@@ -89,24 +90,30 @@ class Listener:
             except (BlockingIOError, InterruptedError, ConnectionAbortedError):
                 return
             except OSError as error:  # EMFILE, ENFILE, ENOBUFS, ENOMEM
-                self._on_turned_away(error.strerror or str(error))
+                self._turned_away(error.strerror or str(error))
                 self._loop.remove_reader(self._listening.fileno())
                 self._again = self._loop.call_later(PAUSE_S, self._listen)
                 return
             if accepted.fileno() >= descriptors():  # the lowest free number: so many are in use
                 accepted.close()
-                self._on_turned_away(str(address[0]))
+                self._turned_away(str(address[0]))
                 continue
             host = str(address[0])
             if self._context is not None and not self._has_place(host):
                 accepted.close()
-                self._on_turned_away(host)
+                problem = "%s: turned away, for too many are in the middle of TLS's greeting"
+                self._drops.once("too_many_greetings", problem, host)
                 continue
             self._greeting[host] += 1
             accepted.setblocking(False)
             task: asyncio.Task[object] = self._loop.create_task(self._connected(accepted, host))
             self._accepting.add(task)
             task.add_done_callback(self._accepting.discard)
+
+    def _turned_away(self, whom: str) -> None:
+        """There was no descriptor for a connection."""
+        problem = "%s: turned away, for there are no descriptors left (ulimit -n)"
+        self._drops.once("no_descriptors", problem, whom, level=logging.ERROR)
 
     def _has_place(self, host: str) -> bool:
         return self._greeting.total() < GREETING and self._greeting[host] < GREETING_PER_ADDRESS

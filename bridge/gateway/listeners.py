@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 from bridge.listening import bound
 from bridge.settings import GatewaySettings
 from macs_zenoh.errors import ConfigError, MissingExtra, Unreachable
+from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.addresses import is_local, joined
 
 from .connection import Connection
@@ -94,14 +95,14 @@ class Listeners:
         entrances: Entrances,
         door: Door,
         connect: Connect,
-        on_turned_away: Callable[[str], None],
+        drops: Losses,
     ) -> None:
         """``connect`` makes what a socket becomes. Raises ConfigError: the certificate cannot be used."""
         self._settings = settings
         self._entrances = entrances
         self._door = door
         self._connect = connect
-        self._on_turned_away = on_turned_away
+        self._drops = drops
         self._open: list[Closable] = []
         self._few = False
         self._web: WebPort | None = None
@@ -138,7 +139,7 @@ class Listeners:
         sockets = bound(self.web_host, port, shared=self._settings.reuse_port)
         number: int = sockets[0].getsockname()[1]
         self._web = WebPort(
-            self._settings, self._entrances.web, self._door, self._connect, self._on_turned_away, self.web_context
+            self._settings, self._entrances.web, self._door, self._connect, self._drops, self.web_context
         )
         try:
             await self._web.open(sockets)
@@ -185,7 +186,7 @@ class Listeners:
                         Listener(
                             listening,
                             protocol,
-                            self._on_turned_away,
+                            self._drops,
                             context=context,
                             handshake_s=settings.handshake_timeout_s,
                         )

@@ -141,7 +141,7 @@ class Gateway:
             on_ended=self._token_ended,
             on_look=lambda: self.listeners.look(),
         )
-        self.listeners = Listeners(settings, entrances(settings), self._door, self._connection, self._turned_away)
+        self.listeners = Listeners(settings, entrances(settings), self._door, self._connection, self._drops)
         self.directory = self._presence.directory
         """Who is online."""
         self._robot_ids = RobotIds(settings.robots)
@@ -203,11 +203,6 @@ class Gateway:
         self._door.start()
         self.mesh.address = joined(for_others(self.settings.host), self.port)
         log.info("listening on %s", self.address)
-
-    def _turned_away(self, whom: str) -> None:
-        """There was no descriptor for a connection."""
-        problem = "%s: turned away, for there are no descriptors left (ulimit -n)"
-        self._drops.once("no_descriptors", problem, whom, level=logging.ERROR)
 
     @property
     def address(self) -> str:

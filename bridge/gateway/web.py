@@ -20,8 +20,10 @@ from contextlib import suppress
 from typing import Any, cast
 
 from aiohttp import WSCloseCode, WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from bridge.settings import GatewaySettings
+from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.addresses import of_peer
 from macs_zenoh.protocol.credit import Credit
 from macs_zenoh.protocol.origins import host_problem, origin_problem
@@ -62,14 +64,14 @@ class WebPort:
         entrance: Entrance,
         door: Door,
         connect: Callable[[Entrance], Connection],
-        on_turned_away: Callable[[str], None],
+        drops: Losses,
         context: ssl.SSLContext | None,
     ) -> None:
         self._settings = settings
         self._entrance = entrance
         self._door = door
         self._connect = connect
-        self._on_turned_away = on_turned_away
+        self.drops = drops
         self._context = context
         self._allow = networks(settings.allow)
         own = socket.gethostname().lower()
@@ -82,7 +84,12 @@ class WebPort:
         app.router.add_post("/login", self._login)
         app.router.add_post("/pair", self._pair)
         self._runner = web.AppRunner(
-            app, handle_signals=False, access_log=None, keepalive_timeout=REQUEST_S, shutdown_timeout=0.1
+            app,
+            handle_signals=False,
+            access_log=None,
+            logger=_HttpLog(drops),
+            keepalive_timeout=REQUEST_S,
+            shutdown_timeout=0.1,
         )
 
     async def open(self, sockets: Sequence[socket.socket]) -> None:
@@ -90,7 +97,7 @@ class WebPort:
         await self._runner.setup()
         for listening in sockets:
             self._listeners.append(
-                Listener(listening, self._outer, self._on_turned_away, context=self._context, handshake_s=REQUEST_S)
+                Listener(listening, self._outer, self.drops, context=self._context, handshake_s=REQUEST_S)
             )
 
     def close(self) -> None:
@@ -112,9 +119,10 @@ class WebPort:
     def enter(self, host: str) -> bool:
         """Whether one more HTTP connection of this address is let in."""
         if self._allow and not is_in(host, self._allow):
+            self.drops.once("address_not_allowed", "%s is refused: its address is not in gateway.allow", host)
             return False
         if self._at_http[host] >= HTTP_PER_ADDRESS or self._at_http.total() >= HTTP_IN_ALL:
-            self._on_turned_away(host)
+            self.drops.once("too_many_requests", "%s is refused: %d web requests wait", host, self._at_http[host])
             return False
         self._at_http[host] += 1
         return True
@@ -135,7 +143,7 @@ class WebPort:
             origin = request.headers.get("Origin")
             problem = host_problem(host, self._names) or origin_problem(origin, host, self._settings.web_origins)
             if problem is not None:
-                log.warning("%s: a web request is refused: %s", outer.host, problem)
+                self.drops.once("other_page", "%s: a web request is refused: %s", outer.host, problem)
                 return web.json_response({"error": problem}, status=403)
             try:
                 response = await handler(request)
@@ -183,7 +191,10 @@ class WebPort:
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
         offered = [each.strip() for each in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
         shown = next((each[len(TOKEN_SUBPROTOCOL) :] for each in offered if each.startswith(TOKEN_SUBPROTOCOL)), None)
-        shown = request.cookies.get(COOKIE) if shown is None else shown
+        if shown is None:
+            shown = request.cookies.get(COOKIE)
+            if self._door.find(shown) is None and not self._entrance.wants_token(_outer_of(request).host):
+                shown = None  # left over from another time, and nobody asks for it
         if shown is not None and self._door.find(shown) is None:
             return self._wrong(request)
         socket = web.WebSocketResponse(
@@ -205,6 +216,22 @@ class WebPort:
         finally:
             stream.lost(None)
         return socket
+
+
+class _HttpLog(logging.Logger):
+    """What aiohttp says: what a client did wrong is counted, the rest is for us to mend."""
+
+    def __init__(self, drops: Losses) -> None:
+        super().__init__("macs.gateway.web")
+        self.parent = log
+        self._drops = drops
+
+    def handle(self, record: logging.LogRecord) -> None:
+        error = record.exc_info[1] if record.exc_info else None
+        if isinstance(error, HttpProcessingError | ConnectionError):
+            self._drops.once("bad_http", "%s (%s)", record.getMessage(), type(error).__name__)
+        else:
+            super().handle(record)
 
 
 def _outer_of(request: web.Request) -> _Outer:

@@ -550,7 +550,11 @@ class TcpAgent:
             if why is not None and isinstance(node, AddNode):
                 del self._registered[key]
                 withdrawn.append((node, why))
-        return [Withdrawn(withdrawn)] if withdrawn else []
+        events: list[Event] = [Withdrawn(withdrawn)] if withdrawn else []
+        if grant.rights is not None and not grant.rights.may_be_in(self.group):
+            self.group = 0
+            events.append(Joined(self.agent_type, 0, None))
+        return events
 
     def _go_offline(self, message: GoOffline, events: list[Event]) -> None:
         if message.agent_id not in {0, self.agent_id, *self.former_ids}:
