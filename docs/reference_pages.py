@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import functools
 import inspect
 import os
 import re
@@ -309,6 +310,7 @@ def sources() -> list[Path]:
     return sorted(path for folder in ("macs_zenoh", "bridge") for path in (ROOT / folder).rglob("*.py"))
 
 
+@functools.cache
 def where_counted() -> dict[str, list[str]]:
     """Each counter, and the modules that count it."""
     found: dict[str, list[str]] = {}

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
@@ -33,12 +34,16 @@ SOAK = (
     "tests/attack/",
     "tests/network/",
     "tests/integration/test_deploy_doc.py",
+    "tests/integration/test_door.py::test_ten_thousand_attempts_leave_nothing_behind",
     "tests/integration/test_limits.py::test_a_thousand_headsets",
     "tests/integration/test_wheel.py::test_a_shipped_interface_package_builds",
     "tests/ros/test_awareness_robots.py",
     "tests/ros/test_interfaces.py",
 )
 """What takes minutes, and seldom finds what others do not: marked ``soak``, run by ``make test-all`` and CI."""
+
+LOGGERS = ("macs", "macs.mesh", "macs.demo")
+"""Those whose level our programs set."""
 
 # Hundreds of processes are started, which must not compile all of our modules each: environments made for containers
 # often forbid to keep what was compiled.
@@ -91,6 +96,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.alone)
         if item.nodeid.startswith(SOAK):
             item.add_marker(pytest.mark.soak)
+
+
+@pytest.fixture(autouse=True)
+def _logging_as_before() -> Iterator[None]:
+    """What a command line that ran in the process of a test logs, and where, is nothing to the tests after it."""
+    root, ours = logging.getLogger(), [logging.getLogger(name) for name in LOGGERS]
+    levels, handlers = [each.level for each in (root, *ours)], set(root.handlers)
+    yield
+    for each, level in zip((root, *ours), levels, strict=True):
+        each.setLevel(level)
+    for added in set(root.handlers) - handlers:
+        root.removeHandler(added)
 
 
 @pytest.fixture

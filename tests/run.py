@@ -13,10 +13,9 @@ import sys
 
 from tests.support import tools
 
-WORKERS = 6
-"""More than this machine may have cores: most tests wait most of the time."""
-BUSY_WORKERS = max(2, os.cpu_count() or 1)
-"""For tests that do not wait."""
+CORES = os.cpu_count() or 1
+WORKERS = min(4 * CORES, 12)
+"""More than there are cores: most tests wait most of the time."""
 
 TIERS = "not chaos and not kin"
 
@@ -39,7 +38,7 @@ def part(name: str, *argv: str, workers: int = 0) -> tuple[bool, int, int]:
 def run(words: list[str]) -> list[tuple[bool, int, int]]:
     """The parts that were asked for."""
     if "--fast" in words:
-        return [part("fast", "tests/unit", workers=BUSY_WORKERS)]
+        return [part("fast", "tests/unit", workers=max(2, CORES))]
     tiers = TIERS if "--all" in words else f"{TIERS} and not soak"
     parts = [part("together", "-m", f"{tiers} and not alone", workers=WORKERS)]
     os.environ.pop("MACS_NEED_ROS_TESTS", None)  # judged by the first part
