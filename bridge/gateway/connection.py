@@ -12,7 +12,7 @@ import sys
 import termios
 import time
 from collections import Counter
-from collections.abc import Collection, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from typing import Protocol, cast
 
 from macs_zenoh.errors import NotAdmitted
@@ -20,16 +20,13 @@ from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.addresses import joined, of_peer
 from macs_zenoh.protocol.budget import Toll
 from macs_zenoh.protocol.decoders import FrameDecoder
-from macs_zenoh.protocol.existing import Asked, OwnNode, Verdict, to_headset, to_newer, to_robot
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.protocol.limits import REQUESTS_PER_S, UNFINISHED_FREE_BYTES
-from macs_zenoh.protocol.messages import ROS, AddNode, AgentsGone, GoneAgent, Metadata, NodeType, encode_data
-from macs_zenoh.protocol.offers import short_type
+from macs_zenoh.protocol.messages import AgentsGone, GoneAgent
 from macs_zenoh.protocol.outbox import Chunk, Outbox
 from macs_zenoh.protocol.rate_limit import Pace
-from macs_zenoh.protocol.robot_nodes import RobotNodes
+from macs_zenoh.protocol.recipient import Recipient, to_agent
 from macs_zenoh.protocol.tcp_agent import Event, Joined, Left, Rejected, Sent, State, TcpAgent
-from macs_zenoh.protocol.wire import Header, encode_message
 
 from .backpressure import Backpressure
 from .door import OPEN_TO_ALL, Entrance
@@ -48,18 +45,9 @@ stands still acknowledges all the same."""
 LOOK_S = 1.0
 """How often it is looked whether the host of an agent that is away is gone."""
 
-LAST_NODES = 4096
-"""Of how many names it is remembered which node the agent last had."""
-
-VERDICTS = 1024
-"""How many metadata are remembered per connection as already judged."""
-
 TELL_S = 1.0
 """How often an agent is told the same of what it may not do, while it goes on."""
 TOLD = 256
-
-USUAL_DEPTH = (10, False)
-"""What waits of a topic whose registration is not known any more."""
 
 IN_FLIGHT = 4
 """While senders are held, so many times the outbox's limit may wait beyond it: what is on its way from those behind
@@ -76,22 +64,6 @@ one socket many times before it looks at the next."""
 MOST_READ_BYTES = FrameDecoder.SPACE_BYTES
 FIRST_READ_BYTES = 64 << 10
 LEAST_READ_BYTES = 1024
-
-
-Subject = tuple[object, ...]
-"""Metadata without its request id."""
-
-
-def subject(metadata: Metadata) -> Subject:
-    """What a verdict depends on."""
-    return (
-        metadata.sender_agent_id,
-        metadata.node_name,
-        metadata.message_manager,
-        metadata.node_type,
-        metadata.data_exchange_type,
-        metadata.sender_agent_type,
-    )
 
 
 class Owner(Protocol):
@@ -115,9 +87,6 @@ class Owner(Protocol):
     def closed(self, connection: Connection) -> None:
         """The socket is gone."""
 
-    def registered_there(self, connection: Connection, metadata: Metadata) -> bool:
-        """Whether the agent registered a message's node on the robot that sends it."""
-
 
 class Connection(asyncio.BufferedProtocol):
     """A TCP agent's socket. Everything it means is decided in `TcpAgent` and by its gateway."""
@@ -130,7 +99,6 @@ class Connection(asyncio.BufferedProtocol):
         memory: Memory,
         outbox_bytes: int,
         write_timeout_s: float,
-        robot_packages: Collection[str] = (),
     ) -> None:
         self.owner = owner
         self.entrance = entrance
@@ -140,6 +108,8 @@ class Connection(asyncio.BufferedProtocol):
         self.shown_token: str | None = None
         """What was shown before the first frame, where that is possible."""
         self.peer: TcpAgent
+        self.recipient: Recipient
+        """What may be said to the agent."""
         self.pace: Pace
         self.greeted = False
         self.host = self.address = "?"
@@ -153,21 +123,6 @@ class Connection(asyncio.BufferedProtocol):
         self._timer: asyncio.TimerHandle | None = None
         self._told: dict[Hashable, float] = {}
         """What the agent was told of its rights, and when."""
-        self._nodes: dict[str, set[int]] = {}
-        self._depths: dict[str, tuple[int, bool]] = {}
-        """How many messages of a topic may wait, and whether new ones are dropped rather than old ones, by node."""
-        self.topic_types: dict[str, str] = {}
-        """Of which type the agent takes a topic's messages, by node, as existing robots write it."""
-        self.node_count = 0
-        """How many interface nodes the agent has, by type and name."""
-        self._last: dict[str, OwnNode] = {}
-        """An existing headset keeps its nodes by name: of two under one name it has the last."""
-        self._verdicts: dict[Subject, Verdict] = {}
-        self.existing = True
-        """Whether the agent is an existing program, which gets only what those are known to survive."""
-        self.asked = Asked()
-        self.robot_nodes = RobotNodes(robot_packages)
-        """Of a robot program: what it was told."""
         self._refused = False
         self._pauses = 0
         self._spent_s = 0.0
@@ -229,6 +184,7 @@ class Connection(asyncio.BufferedProtocol):
     def greet(self, peer: TcpAgent) -> None:
         """The agent has an id: tell it, and begin to listen."""
         self.peer = peer
+        self.recipient = peer.recipient
         self.greeted = True
         self.pace = self.owner.pace()
         self._writer.write([peer.welcome()])
@@ -306,9 +262,6 @@ class Connection(asyncio.BufferedProtocol):
                 elif isinstance(event, Left):
                     self.close(event.reason)
                 else:
-                    if isinstance(event, Joined):
-                        self.existing = not self.peer.extensions
-                        self._verdicts.clear()
                     self.owner.handle(self, event)
                     if isinstance(event, Joined):
                         if self._transport.is_closing():
@@ -366,7 +319,7 @@ class Connection(asyncio.BufferedProtocol):
         since its sender is held back."""
         if not self._writer.full:
             return self._gather(messages)
-        depth, drop_new = (sys.maxsize, False) if keep else self._depths.get(node, USUAL_DEPTH)
+        depth, drop_new = (sys.maxsize, False) if keep else self.recipient.depth_of(node)
         for message in messages:
             if self._has_room(len(message)):
                 self._outbox.put_stream(node, message, depth=depth, drop_new=drop_new)
@@ -404,87 +357,15 @@ class Connection(asyncio.BufferedProtocol):
             return False
         return self._writer.gather(messages, size)
 
-    def registered(self, node: AddNode) -> None:
-        """The agent has this interface node."""
-        node_name, node_type = node.node_name, node.node_type
-        types = self._nodes.setdefault(node_name, set())
-        self.node_count += node_type not in types
-        types.add(node_type)
-        data_type = short_type(node.data_exchange_type)
-        self._last.pop(node_name, None)
-        self._last[node_name] = OwnNode(node_type, data_type)
-        if len(self._last) > LAST_NODES:
-            del self._last[next(name for name in self._last if name not in self._nodes)]
-        self._verdicts.clear()
-        if node_type == NodeType.SUBSCRIBER:
-            self._depths[node_name] = node.buffer_size, node.drop_new
-            self.topic_types[node_name] = data_type
-            self._writer.open_direct()
-
-    def is_registered(self, node: AddNode) -> bool:
-        """Whether the agent has this interface node already."""
-        return node.node_type in self._nodes.get(node.node_name, ())
-
-    def unregistered(self, node_name: str, node_type: int) -> None:
-        """The agent has taken it back from everybody."""
-        types = self._nodes.get(node_name, set())
-        self.node_count -= node_type in types
-        types.discard(node_type)
-        if node_type == NodeType.SUBSCRIBER:
-            self._depths.pop(node_name, None)
-            self.topic_types.pop(node_name, None)
-        if not types:
-            self._nodes.pop(node_name, None)
-        self._verdicts.clear()
-
-    def verdict(self, metadata: Metadata, about: Subject | None = None) -> Verdict:
-        """Whether a message with this metadata may be sent, and what its data must be. ``about`` is its `subject`, for
-        who asks several."""
-        about = about or subject(metadata)
-        verdict = self._verdicts.get(about)
-        if verdict is None:
-            verdict = self._judge(metadata)
-            if verdict.stays:
-                if len(self._verdicts) >= VERDICTS:
-                    self._verdicts.clear()
-                self._verdicts[about] = verdict
-        return verdict
-
-    def _judge(self, metadata: Metadata) -> Verdict:
-        if not self.existing:
-            return to_newer(metadata, self._nodes)
-        if self.peer.agent_type == ROS:
-            node = self.robot_nodes.find(metadata.node_type, metadata.node_name)
-            return to_robot(metadata, node, self.asked)
-        registered_there = bool(metadata.node_name) and self.owner.registered_there(self, metadata)
-        return to_headset(metadata, self._last, self.asked, registered_there=registered_there)
-
-    def asks(self, metadata: Metadata, header: Header) -> None:
-        """The agent sends a request to others, which they may answer."""
-        self.asked.note(metadata, header)
-        if not metadata.node_name:
-            self._verdicts.clear()  # from now on a plain message may be the answer
-
-    def nodes_change(self) -> None:
-        """A robot program is told of another node, or of the end of one: judge anew."""
-        self._verdicts.clear()
-
-    def other_type(self, node: AddNode) -> int | None:
-        """The type that this node's name had until now, if it is another one."""
-        before = self._last.get(node.node_name)
-        return None if before is None or before.node_type == node.node_type else before.node_type
-
-    def has(self, metadata: Metadata) -> bool:
-        """Whether the agent registered the node of this name and type itself."""
-        return metadata.node_type in self._nodes.get(metadata.node_name, ())
-
     def tell_gone(self, gone: list[GoneAgent]) -> None:
         """Tell a robot program that these have left, if there are any."""
         if gone:
-            self.robot_nodes.gone(gone)
-            self.nodes_change()
-            metadata = Metadata(message_manager=AgentsGone.manager)
-            self.send_call(encode_message(metadata.encode(), encode_data(AgentsGone(gone))))
+            self.recipient.gone(gone)
+            self.send_call(to_agent(AgentsGone(gone)))
+
+    def open_direct(self) -> None:
+        """The agent takes a topic, whose messages may go past the loop."""
+        self._writer.open_direct()
 
     def flush(self) -> None:
         """Write what was gathered since the last flush, in one go."""

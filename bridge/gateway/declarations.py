@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import asyncio
 
-from msgspec import UNSET, structs
-
 from macs_zenoh.errors import Refused
 from macs_zenoh.mesh import Mesh, Subscription
 from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.keyexpr import CALL
-from macs_zenoh.protocol.messages import ROS, UNITY, AddNode, GoneAgent, Metadata, RemoveNode, decode_data, encode_data
+from macs_zenoh.protocol.messages import ROS, UNITY, AddNode, GoneAgent, RemoveNode, decode_data
 from macs_zenoh.protocol.registrations import AgentKey, check_own
 from macs_zenoh.protocol.routing import inbox
-from macs_zenoh.protocol.wire import Layout, encode_message, parse_frame
+from macs_zenoh.protocol.wire import Layout, parse_frame
 
 from .agents import Agents
 from .connection import Connection
@@ -81,21 +79,10 @@ class AgentDeclarations:
 
     def _register(self, robot: Connection, node: AddNode | RemoveNode) -> None:
         """Tell a robot of a registration or its end. Raises Refused for what it would not survive."""
-        if isinstance(node, AddNode):
-            node = structs.replace(node, unity_cdr=UNSET)  # a robot program passes CDR on as it is
-        known, offered = robot.robot_nodes, robot.peer.functionality
-        if isinstance(node, AddNode):
-            to_tell = known.add(node, offered, existing=robot.existing)
-        else:
-            to_tell = known.remove(node)
-        if not to_tell:
-            return
-        robot.nodes_change()
-        caller = (node.registrant_agent_type, node.registrant_agent_id)
-        self._expect(robot, caller)
-        metadata = Metadata(*caller, message_manager=node.manager)
-        # written anew: a robot program reads of it what was judged here, however it takes keys named twice
-        robot.send_call(encode_message(metadata.encode(), encode_data(node)))
+        message = robot.recipient.tell(node, robot.peer.functionality)
+        if message is not None:
+            self._expect(robot, (node.registrant_agent_type, node.registrant_agent_id))
+            robot.send_call(message)
 
     def _expect(self, robot: Connection, registrant: AgentKey) -> None:
         """Whoever registers on a robot program is online now or soon. One who left while that was on its way never

@@ -20,6 +20,7 @@ from macs_zenoh.protocol.judging import Judge
 from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST
 from macs_zenoh.protocol.least_bytes import TEXT_TYPE, is_whole
 from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, decode_management
+from macs_zenoh.protocol.recipient import subject
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.routing import takes_group_copy
 from macs_zenoh.protocol.wire import Buffer, Frame, Frames, Layout, is_probe, parse_frame, parse_runs
@@ -27,7 +28,7 @@ from macs_zenoh.protocol.wire import Buffer, Frame, Frames, Layout, is_probe, pa
 from .afar import Afar
 from .agents import Agents
 from .backpressure import ROBOT_HOLD_S
-from .connection import Connection, subject
+from .connection import Connection
 from .judged import JudgedFrames, Read
 from .stead import Stead
 
@@ -181,7 +182,7 @@ class Delivery:
                             keep = may_hold and connection.robot_backpressure.hold(
                                 robot, connection.moved, ROBOT_HOLD_S
                             )
-                        if connection.existing and not (fits and connection.topic_types.get(stream.node) == data_type):
+                        if not connection.recipient.takes(stream.node, data_type, fits):
                             self._send_topic(connection, frame, metadata, keep)
                         else:
                             self._gather_stream(connection, stream.node, messages, keep=keep)
@@ -208,7 +209,7 @@ class Delivery:
             if connection is not None:
                 if registrant not in stream.registrants or not connection.free:
                     return False
-                if connection.existing and connection.topic_types.get(stream.node) != seen.data_type:
+                if not connection.recipient.takes(stream.node, seen.data_type):
                     return False
                 receivers.append(connection)
         message = bytes(payload[seen.message_at :])
@@ -263,7 +264,7 @@ class Delivery:
         size = sum(map(len, messages))
         about = subject(metadata)
         for connection in connections:
-            verdict = connection.verdict(metadata, about)
+            verdict = connection.recipient.verdict(metadata, about)
             if verdict is PASS or verdict is PASS_ONCE:
                 if connection.gather_calls(messages, size):
                     self._gathered.append(connection)
@@ -271,7 +272,7 @@ class Delivery:
                 self._send_judged(connection, frame, metadata, verdict, by_id=False)
 
     def _send(self, connection: Connection, frame: Frames, metadata: Metadata, *, by_id: bool = False) -> None:
-        verdict = connection.verdict(metadata)
+        verdict = connection.recipient.verdict(metadata)
         if verdict is PASS or verdict is PASS_ONCE:
             self._gather_calls(connection, frame.messages)
         else:
@@ -281,7 +282,7 @@ class Delivery:
         """The frames of one sample that was sent to the agent's id."""
         messages: list[Buffer] = []
         for frame, metadata in read:
-            verdict = connection.verdict(metadata)
+            verdict = connection.recipient.verdict(metadata)
             if verdict is PASS or verdict is PASS_ONCE:
                 messages += frame.messages
                 continue
@@ -299,9 +300,9 @@ class Delivery:
         if verdict.name:
             self._refuse(connection, frame, metadata, verdict, by_id=by_id)
         elif verdict.answers:
-            connection.asked.answered(metadata)
+            connection.recipient.asked.answered(metadata)
             first = frame.each()[0]
-            if connection.existing and not metadata.request_id and refuses(first):
+            if connection.recipient.existing and not metadata.request_id and refuses(first):
                 return  # what is not meant as a question has number 0 as well, and then the next question may have it
             self._send_fitting(connection, first, metadata, verdict.data)
         else:
@@ -309,7 +310,7 @@ class Delivery:
 
     def _send_topic(self, connection: Connection, frame: Frames, metadata: Metadata, keep: bool) -> None:
         """Topic data that does not simply pass to an existing program."""
-        verdict = connection.verdict(metadata)
+        verdict = connection.recipient.verdict(metadata)
         if verdict.name:
             self._refuse(connection, frame, metadata, verdict, by_id=False)
         else:
@@ -318,7 +319,7 @@ class Delivery:
     def _refuse(
         self, connection: Connection, frame: Frames, metadata: Metadata, verdict: Verdict, *, by_id: bool
     ) -> None:
-        if connection.existing and connection.peer.agent_type == ROS:
+        if connection.recipient.existing and connection.peer.agent_type == ROS:
             singles = frame.each() if metadata.message_manager else ()  # each question of a run is answered
             answered = [self._stead.answered(connection, metadata, verdict.why, by_id=by_id) for _ in singles]
             if answered and all(answered):
@@ -350,7 +351,7 @@ class Delivery:
     def _unregistered(self, connection: Connection, frame: Frames, metadata: Metadata) -> None:
         """Topic data for who did not register it there: a forged list; or it is older than the agent, which has
         another's id."""
-        verdict = connection.verdict(metadata)
+        verdict = connection.recipient.verdict(metadata)
         if verdict.name == "wrong_node_type":
             connection.complain(verdict.name, verdict.why, frame.count)
             return
@@ -415,7 +416,7 @@ class Delivery:
         connection = self._agents.former.get((fields.type, fields.id))
         if connection is not None:
             for frame, metadata in self._read(key, payload, fields.sender):
-                if metadata.node_type in ANSWERS and connection.has(metadata):
+                if metadata.node_type in ANSWERS and connection.recipient.has(metadata):
                     self._send(connection, frame, metadata)
 
     def _hold_sender(self, sender: AgentKey, receivers: list[Connection]) -> None:
@@ -431,7 +432,7 @@ class Delivery:
     def _all_are_full(self, robot: Connection) -> bool:
         """Whether nobody who registered on a robot program of this gateway could take more, so that it may be held: a
         headset that reads slowly must not slow down the others' topics."""
-        for registrant in robot.robot_nodes.registrants():
+        for registrant in robot.recipient.robot_nodes.registrants():
             other = self._agents.find(registrant.agent_type, registrant.agent_id)
             if other is None or not other.full:
                 return False

@@ -107,7 +107,7 @@ class Forwarding:
         metadata = sent.metadata
         traffic = COMMAND if metadata.node_type == PUBLISHER else CALL
         if traffic is CALL and (metadata.node_type or metadata.message_manager) and asks(metadata):
-            connection.asks(metadata, frame.header)
+            connection.recipient.asks(metadata, frame.header)
         if route.to_robots and not self._may_go(connection, sent, route, traffic):
             return
         if route.limited:

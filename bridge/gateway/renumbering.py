@@ -203,7 +203,7 @@ class Renumbering:
         self._later(ANSWER_S, lambda: self._forget_former(old, connection))
         if old[0] == ROS:
             # who registered on a robot program asked for its old id, which is another robot's now
-            connection.tell_gone(connection.robot_nodes.registrants())
+            connection.tell_gone(connection.recipient.robot_nodes.registrants())
         else:
             connection.send_call(connection.peer.welcome())
             await self._robots.rename(old, new_id, told, slow)

@@ -12,6 +12,7 @@ import logging
 import time
 from collections import Counter
 from contextlib import suppress
+from functools import partial
 
 from msgspec import structs
 
@@ -47,11 +48,13 @@ from macs_zenoh.protocol.messages import (
     GoneAgent,
     Metadata,
     NodeRefused,
+    NodeType,
     OnlineReply,
     Refusal,
     encode_data,
 )
 from macs_zenoh.protocol.rate_limit import Pace
+from macs_zenoh.protocol.recipient import Recipient, to_agent
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.rights import Grant
 from macs_zenoh.protocol.tcp_agent import (
@@ -68,7 +71,7 @@ from macs_zenoh.protocol.tcp_agent import (
     TcpAgent,
     Withdrawn,
 )
-from macs_zenoh.protocol.wire import Layout, encode_message
+from macs_zenoh.protocol.wire import Layout
 from macs_zenoh.registration_calls import RobotCalls, StreamChanges
 from macs_zenoh.timeouts import within
 
@@ -253,7 +256,6 @@ class Gateway:
             memory=self._memory,
             outbox_bytes=settings.outbox_bytes,
             write_timeout_s=settings.write_timeout_s,
-            robot_packages=settings.robot_packages,
         )
 
     def opened(self, connection: Connection) -> bool:
@@ -293,6 +295,7 @@ class Gateway:
                 closed_groups=self._admission.closed_groups(connection.host),
                 admit=self._door.admit(connection),
                 stranger=connection.stranger,
+                recipient=Recipient(partial(self._registered_there, connection), self.settings.robot_packages),
             )
             self.agents.enter(agent_id, connection)
             self._forwarding.enter(connection)
@@ -360,7 +363,7 @@ class Gateway:
         if group is not None:
             self._unsubscribe(GROUP.every(type=group[0], group=group[1]))
 
-    def registered_there(self, connection: Connection, metadata: Metadata) -> bool:
+    def _registered_there(self, connection: Connection, metadata: Metadata) -> bool:
         """Whether an agent registered a message's node on the robot that sends it."""
         sender = metadata.sender_agent_type, metadata.sender_agent_id
         return sender[0] == ROS and self._robots.registered(connection.key, metadata, int(sender[1] or 0))
@@ -404,7 +407,7 @@ class Gateway:
         node = structs.replace(event.node, registrant_agent_type=kind, registrant_agent_id=agent_id)
         if isinstance(node, AddNode):
             why = None
-            if not connection.is_registered(node):
+            if not connection.recipient.is_registered(node):
                 why = self._nodes.judge(connection, connection.host)
             naming = self._robots.naming(node, event.robot_ids, event.groups)
             why = why or self._named.judge(connection, connection.host, naming)
@@ -412,16 +415,18 @@ class Gateway:
                 connection.complain("too_many_nodes", why)
                 self._robots.refuse(node, next(iter(event.robot_ids), 0), why)
                 return
-            if connection.existing and (other := connection.other_type(node)) is not None:
+            if connection.recipient.existing and (other := connection.recipient.other_type(node)) is not None:
                 self._robots.take_back_all(connection.key, other, node.node_name)
-                connection.unregistered(node.node_name, other)
-            connection.registered(node)
+                connection.recipient.unregistered(node.node_name, other)
+            connection.recipient.registered(node)
+            if node.node_type == NodeType.SUBSCRIBER:
+                connection.open_direct()
             if not connection.peer.extensions:  # an existing program, which cannot say it itself
                 node = structs.replace(node, unity_cdr=True)
         self._robots.register(node, event.robot_ids, event.groups)
         if not isinstance(node, AddNode) and self._robots.find(connection.key, node.node_type, node.node_name) is None:
-            connection.unregistered(node.node_name, node.node_type)
-        self._nodes.set(connection, connection.host, connection.node_count)
+            connection.recipient.unregistered(node.node_name, node.node_type)
+        self._nodes.set(connection, connection.host, connection.recipient.node_count)
         self._named.set(connection, connection.host, self._robots.named(connection.key))
 
     def _manage(self, connection: Connection, event: Asked) -> None:
@@ -433,24 +438,24 @@ class Gateway:
         except Refused as refusal:
             connection.complain("refused_by_manager", f"{event.manager}: {refusal.reason}")
             if connection.peer.extensions:  # an existing program expects its manager's own answer, or none
-                self._reply(connection, Metadata(request_id=event.request_id), encode_data(Refusal(refusal.reason)))
+                connection.send_call(to_agent(Refusal(refusal.reason), request_id=event.request_id))
             return
         except Exception:
             log.exception("%s failed on a message of %s", event.manager, connection)
             connection.complain("manager_failed", f"{event.manager} failed, see above")
             return
         if data is not None:
-            self._reply(connection, Metadata(request_id=event.request_id), data)
+            connection.send_call(to_agent(data, request_id=event.request_id))
 
     def _tell_refusal(self, agent: AgentKey, refused: NodeRefused) -> None:
         connection = self.agents.find(*agent)
         if connection is not None and self.settings.tell_refusals:
-            self._reply(connection, Metadata(message_manager=NodeRefused.manager), encode_data(refused))
+            connection.send_call(to_agent(refused))
 
     # -- what a token does not permit ------------------------------------------------------------------------------
 
     def _tell_access(self, connection: Connection, refused: AccessRefused) -> None:
-        self._reply(connection, Metadata(message_manager=AccessRefused.manager), encode_data(refused))
+        connection.send_call(to_agent(refused))
 
     def _tell_forbidden(self, connection: Connection, event: Forbidden) -> None:
         """A message was not let pass: say so, in the way that robots say it to who knows that."""
@@ -464,16 +469,16 @@ class Gateway:
             return
         for robot in event.robots or (0,):
             refused = DataRefused(robot, about.node_type, about.node_name, about.node_name, kind, event.reason)
-            self._reply(connection, Metadata(message_manager=DataRefused.manager), encode_data(refused))
+            connection.send_call(to_agent(refused))
 
     def _withdraw(self, connection: Connection, event: Withdrawn) -> None:
         """Registrations are not permitted any more."""
         for node, why in event.nodes:
             self._robots.take_back_all(connection.key, node.node_type, node.node_name)
-            connection.unregistered(node.node_name, node.node_type)
+            connection.recipient.unregistered(node.node_name, node.node_type)
             refused = NodeRefused(0, node.node_type, node.node_name, node.tos_name, why)
             self._tell_refusal(connection.key, refused)
-        self._nodes.set(connection, connection.host, connection.node_count)
+        self._nodes.set(connection, connection.host, connection.recipient.node_count)
         self._named.set(connection, connection.host, self._robots.named(connection.key))
 
     def _rights_changed(self, connection: Connection, grant: Grant) -> None:
@@ -488,9 +493,6 @@ class Gateway:
         """A token holds no longer, and so do the connections of who came in by it."""
         self._tell_access(connection, AccessRefused("ended", "this token holds no longer"))
         connection.close("its token holds no longer")
-
-    def _reply(self, connection: Connection, metadata: Metadata, data: bytes) -> None:
-        connection.send_call(encode_message(metadata.encode(), data))
 
     def _joined(self, connection: Connection, event: Joined) -> None:
         if self.agents.find(*connection.key) is connection:
@@ -558,7 +560,7 @@ class Gateway:
                 ids.setdefault(own.key[0], set()).add(own.agent_id)
             reply = OnlineReply(ros_agent_ids=sorted(ids[ROS]), unity_agent_ids=sorted(ids[UNITY]))
             self._online_reply = encode_data(reply)
-        self._reply(connection, Metadata(request_id=request_id), self._online_reply)
+        connection.send_call(to_agent(self._online_reply, request_id=request_id))
 
     # -- subscriptions -------------------------------------------------------------------------------------------
 
@@ -596,11 +598,9 @@ class Gateway:
         self._online_reply = b""
         gone = [GoneAgent(agent.type, agent.id) for agent, online in changes if not online]
         if gone:
-            metadata = Metadata(message_manager=AgentsGone.manager)
-            message = encode_message(metadata.encode(), encode_data(AgentsGone(gone)))
+            message = to_agent(AgentsGone(gone))
             for connection in self.agents.online():
-                connection.robot_nodes.gone(gone)
-                connection.nodes_change()
+                connection.recipient.gone(gone)
                 connection.send_call(message)
         for change in changes:
             try:

@@ -56,10 +56,10 @@ from .messages import (
     Welcome,
     decode_data,
     decode_management,
-    encode_data,
 )
+from .recipient import Recipient, to_agent
 from .rights import OPEN, Grant, Rights
-from .wire import MACS, MAX_FRAME_BYTES, Frame, Frames, Layout, encode_message
+from .wire import MACS, MAX_FRAME_BYTES, Frame, Frames, Layout
 
 
 class State(Enum):
@@ -229,6 +229,7 @@ class TcpAgent:
         closed_groups: Collection[int] = (),
         admit: Admit | None = None,
         stranger: bool = False,
+        recipient: Recipient | None = None,
     ) -> None:
         """``credit`` is what an earlier connection left, if there was one; ``closed_groups`` are not to be chosen.
         ``admit`` judges the token in the first configuration; without it whoever comes is let in. ``stranger``: a
@@ -257,6 +258,8 @@ class TcpAgent:
         """How much memory a frame has that has begun and is not whole."""
         self._limits = limits
         self._custom = custom
+        self.recipient = recipient or Recipient()
+        """What may be said to the agent."""
         self.credit = credit or Credit(limits.frames_per_s, now)
         self._layout = layout
         self._decoder = FrameDecoder(limits.max_frame_bytes, layout, scratch)
@@ -281,8 +284,7 @@ class TcpAgent:
     def welcome(self) -> bytes:
         """The first message on every connection; agents give up when anything else comes before it. A headset takes a
         later one as its new id, and answers again."""
-        metadata = Metadata(request_id=self.connection_number, message_manager=Welcome.manager)
-        return encode_message(metadata.encode(), encode_data(Welcome(agent_id=self.agent_id)))
+        return to_agent(Welcome(agent_id=self.agent_id), request_id=self.connection_number)
 
     @property
     def dials_a_router(self) -> bool:
@@ -511,6 +513,7 @@ class TcpAgent:
         if kind != self.agent_type:
             self._judge = Judge(kind, self.agent_id)
         self.agent_type, self.group = kind, group
+        self.recipient.configured(kind, existing=not self.extensions)
         events.append(Joined(kind, group, configuration.functionality))
         while self._held:
             frame = self._held.popleft()

@@ -241,7 +241,9 @@ class Nobody:
 
     def opened(self, connection: Connection) -> bool:
         connection.greet(TcpAgent(256, 1, time.monotonic()))
-        connection.registered(AddNode(2, 256, NodeType.SUBSCRIBER, TOPIC.name, "/image", "sensor_msgs/Image", 100))
+        node = AddNode(2, 256, NodeType.SUBSCRIBER, TOPIC.name, "/image", "sensor_msgs/Image", 100)
+        connection.recipient.registered(node)
+        connection.open_direct()
         return True
 
     def __getattr__(self, name: str) -> Callable[..., None]:

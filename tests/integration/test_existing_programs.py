@@ -484,7 +484,7 @@ async def test_what_its_own_robot_says_is_of_its_type(
                     asking = {"requestId": number, "nodeType": 3, "nodeName": name, "dataExchangeType": TYPES[name]}
                     headset.say(ROS, [by], HEADER + b"\x01", **asking)
                     answer = Metadata(ROS, by, number, "", 3, name)
-                    await until(lambda answer=answer: connection.asked.awaits(answer))
+                    await until(lambda answer=answer: connection.recipient.asked.awaits(answer))
                 for _, data in itertools.product(range(3), data_of):
                     await say(Metadata(ROS, by, number, manager, kind, name, said_type), data)
 

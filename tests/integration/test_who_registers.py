@@ -219,7 +219,7 @@ async def test_too_much_is_refused(start_gateway: StartGateway) -> None:
         await until(lambda: (greedy.id, "nd__one_more") in robot.nodes())
         connection = gateway.agents.find(UNITY, greedy.id)
         assert connection is not None
-        assert connection.node_count == NODES_EACH
+        assert connection.recipient.node_count == NODES_EACH
 
 
 async def test_who_names_robots_without_end_is_refused(start_gateway: StartGateway) -> None:
@@ -257,4 +257,4 @@ async def test_names_are_forgotten(start_gateway: StartGateway, count: int) -> N
         await until(lambda: robot.nodes() == {(headset.id, "nd__last")}, 60)
         connection = gateway.agents.find(UNITY, headset.id)
         assert connection is not None
-        assert connection.node_count == 1
+        assert connection.recipient.node_count == 1
