@@ -22,7 +22,7 @@ from bridge.ros.interface import InterfaceNode, Registrant, Robot, first_line, r
 from bridge.ros.servers import ABSENT_S, Search
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import resolve
-from bridge.ros.unity_cdr import UnityCdr, to_ros
+from bridge.ros.unity_cdr import Parts, TooManyParts, UnityCdr, readable
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import ROS, ActionVerb, AddNode, NodeType
 from macs_zenoh.protocol.reading import Message
@@ -74,6 +74,7 @@ class ActionNode(InterfaceNode):
         self._client: Any = None
         self._types: Any = None
         self._goal_cdr: UnityCdr | None = None
+        self._parts: Parts | None = None
         self._goals: dict[bytes, Goal] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._watching: asyncio.TimerHandle | None = None
@@ -104,6 +105,7 @@ class ActionNode(InterfaceNode):
         self.interface.check(self.topic, {of_type.removesuffix("_SendGoal") for of_type in goals})
         self._types = resolve(str(self.interface), "action")
         self._goal_cdr = UnityCdr.of(self._types.Goal)
+        self._parts = Parts.of(self._types.Goal)
         # 12 MB, of which robots without actions need nothing
         from rclpy.action import ActionClient
 
@@ -181,7 +183,12 @@ class ActionNode(InterfaceNode):
             return
         goal = self._asked(message, goal_id)
         goal.group = self.robot.group_of(sender)
-        body = to_ros(self._goal_cdr, message.data[ID_BYTES:])
+        body = message.data[ID_BYTES:]
+        try:
+            body = readable(self._goal_cdr, self._parts, body, self.robot.rules.settings.max_message_parts)
+        except TooManyParts as error:
+            self._reject(goal, f"the goal of {len(body)} bytes is too much: {error}")
+            return
         problem = cdr_problem(body)
         if problem is not None:
             self._reject(goal, f"the goal is no {self.interface}: {problem}")

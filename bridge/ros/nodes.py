@@ -204,7 +204,7 @@ class InterfaceNodes:
         self.stop = stop
 
     def _stopped(self, by: str) -> None:
-        for node in self:
+        for node in sorted(self, key=_has_no_stop_message):  # what moves the robot now comes first
             try:
                 node.emergency_stop(by)
             except Exception:  # the others are stopped all the same
@@ -524,6 +524,10 @@ class InterfaceNodes:
 
 def _work(node: InterfaceNode) -> Work:
     return node.key if node.NODE_TYPE == NodeType.SUBSCRIBER else (node.NODE_TYPE, node.topic)
+
+
+def _has_no_stop_message(node: InterfaceNode) -> bool:
+    return not (isinstance(node, PublisherNode) and node.deadman is not None)
 
 
 def _retrieve(task: asyncio.Task[None]) -> None:

@@ -22,7 +22,7 @@ from bridge.ros.servers import check_service_type, servers_elsewhere
 from bridge.ros.services import BURST, DEPTH
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import resolve
-from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
+from bridge.ros.unity_cdr import Parts, TooManyParts, UnityCdr, readable, to_unity
 from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.protocol.messages import AddNode, CallFailure, NodeType, decode_data
 from macs_zenoh.protocol.reading import Message
@@ -71,6 +71,7 @@ class ServiceNode(InterfaceNode):
         self._types: Any = None
         self._request_cdr: UnityCdr | None = None
         self._response_cdr: UnityCdr | None = None
+        self._parts: Parts | None = None
         self._respond: Callable[[Any, Any], None]
         self._deadline_s = robot.rules.call_timeout_s(self.topic)
         self._open_calls: dict[int, OpenCall] = {}
@@ -90,6 +91,7 @@ class ServiceNode(InterfaceNode):
         self._types = resolve(str(self.interface), "srv")
         self._request_cdr = UnityCdr.of(self._types.Request)
         self._response_cdr = UnityCdr.of(self._types.Response)
+        self._parts = Parts.of(self._types.Response)
         fields.failure(self._types.Response, "", self.rule.error_response, "error_response")
         node = self.robot.session.node
         check_service_type(node, self.topic, self.interface)
@@ -172,7 +174,12 @@ class ServiceNode(InterfaceNode):
                 reason = "it did not say why"
             self._fail(request_id, f"{sender} failed: {reason}")
             return
-        answer = to_ros(self._response_cdr, message.data)
+        try:
+            most = self.robot.rules.settings.max_message_parts
+            answer = readable(self._response_cdr, self._parts, message.data, most)
+        except TooManyParts as error:
+            self._bad_answer(request_id, sender, f"{len(message.data)} bytes are too much: {error}")
+            return
         problem = cdr_problem(answer)
         if problem is not None:
             self._bad_answer(request_id, sender, problem)

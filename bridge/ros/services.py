@@ -19,7 +19,7 @@ from bridge.ros.interface import InterfaceNode, Registrant, Robot, first_line, r
 from bridge.ros.servers import ABSENT_S, Search, check_service_type
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import resolve
-from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
+from bridge.ros.unity_cdr import Parts, TooManyParts, UnityCdr, readable, to_unity
 from macs_zenoh.protocol.messages import AddNode, NodeType
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.robot_state import NodeStatus
@@ -50,6 +50,7 @@ class ClientNode(InterfaceNode):
         self._service: Any = None
         self._request_cdr: UnityCdr | None = None
         self._response_cdr: UnityCdr | None = None
+        self._parts: Parts | None = None
         self._exists = False
         self._deadline_s = robot.rules.call_timeout_s(self.topic)
         self._calls: dict[asyncio.Task[None], Message] = {}
@@ -59,6 +60,7 @@ class ClientNode(InterfaceNode):
     def open(self) -> None:
         self._service = resolve(str(self.interface), "srv")
         self._request_cdr = UnityCdr.of(self._service.Request)
+        self._parts = Parts.of(self._service.Request)
         self._response_cdr = UnityCdr.of(self._service.Response)
         node = self.robot.session.node
         self._exists = check_service_type(node, self.topic, self.interface)
@@ -126,7 +128,10 @@ class ClientNode(InterfaceNode):
             self.robot.send(asker, answer_metadata(self.robot.agent_id, message.metadata), response)
 
     async def _ask(self, data: bytes) -> bytes:
-        request = to_ros(self._request_cdr, data)
+        try:
+            request = readable(self._request_cdr, self._parts, data, self.robot.rules.settings.max_message_parts)
+        except TooManyParts as error:
+            raise CallFailed("invalid", f"the request of {len(data)} bytes is too much: {error}") from None
         problem = cdr_problem(request)
         if problem is not None:
             raise CallFailed("invalid", f"the request is no {self.interface}: {problem}")

@@ -30,7 +30,7 @@ from bridge.ros.rules import DEFAULT_HOLD_S
 from bridge.ros.safety import Control, DeadMan
 from bridge.ros.stream import Fanout, cdr_problem
 from bridge.ros.types import InterfaceName, least_cdr_bytes, resolve
-from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
+from bridge.ros.unity_cdr import TooManyParts, UnityCdr, to_ros, to_unity
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.protocol.messages import AddNode, NodeType, StreamData
 from macs_zenoh.protocol.reading import Message
@@ -393,17 +393,24 @@ class PublisherNode(TopicNode):
             node.destroy_publisher(publisher)
 
     def receive(self, message: Message) -> None:
+        try:  # before the lock, for which a stop message may wait
+            cdr = to_ros(self._cdr, message.data, self.robot.rules.settings.max_message_parts)
+        except TooManyParts as error:
+            self._refuse(message, TOO_LARGE, f"refused {len(message.data)} bytes for {self.interface}: {error}")
+            return
         with self.lock:
             refusal = self._refusal(message)
-            if refusal is not None:
-                name, why = refusal
-                self.robot.drops.note(name, f"{self.topic} from {Registrant.of(message)}", why)
-                self.robot.tell_refused(message, self.topic, name, why)
+            if refusal is None:
+                if self._publish(cdr) and self.deadman is not None:
+                    self.deadman.command(Registrant.of(message), time.monotonic() - message.age_s)
+                    if self._watch is None:
+                        self._watch_silence()
                 return
-            if self._publish(to_ros(self._cdr, message.data)) and self.deadman is not None:
-                self.deadman.command(Registrant.of(message), time.monotonic() - message.age_s)
-                if self._watch is None:
-                    self._watch_silence()
+        self._refuse(message, *refusal)
+
+    def _refuse(self, message: Message, name: str, why: str) -> None:
+        self.robot.drops.note(name, f"{self.topic} from {Registrant.of(message)}", why)
+        self.robot.tell_refused(message, self.topic, name, why)
 
     def refused(self, message: Message, reason: str) -> None:
         self.robot.tell_refused(message, self.topic, "not_allowed", reason)
@@ -448,11 +455,11 @@ class PublisherNode(TopicNode):
         self.left(registrant)
 
     def emergency_stop(self, by: str) -> None:
-        # whether commands were under way or not
-        with self.lock:
-            if self.deadman is not None:
-                self.deadman.disarm(f"emergency stop by {by}")
-                self._publish_stop(f"emergency stop by {by}")
+        if self.deadman is None:  # nothing to say, and no reason to wait for what is published now
+            return
+        with self.lock:  # whether commands were under way or not
+            self.deadman.disarm(f"emergency stop by {by}")
+            self._publish_stop(f"emergency stop by {by}")
 
     def _watch_silence(self) -> None:
         """Look when the dead-man may be due; a command in between costs nothing."""

@@ -21,6 +21,7 @@ from typing import Any
 from rosidl_parser import definition as idl  # type: ignore[import-untyped, import-not-found, unused-ignore]
 
 from bridge.ros.types import PRIMITIVE_BYTES
+from macs_zenoh.protocol.limits import REQUEST_BYTES
 
 HEADER = b"\x00\x01\x00\x00"
 """Plain CDR, little endian: all that Unity's serializer knows."""
@@ -30,12 +31,25 @@ _LARGE = 8
 _MAX_NOTHINGS = 65536
 """Structures without fields in one sequence: in Unity's form they take no bytes, so their number bounds nothing."""
 
+PARTS = 1 << 15
+"""What a message may consist of, unless the settings say otherwise: about 0.1 s to translate."""
+_FEW_BYTES = REQUEST_BYTES
+"""What is not larger has few parts."""
+_LETTERS = 32
+"""So many letters of a wstring cost as much as one part."""
+_OBJECTS = 64
+"""So many items of which Python makes an object each, as of bool[], cost as much as one part."""
+
 _U32 = struct.Struct("<I")
 _Part = Callable[["_Copy"], None]
 
 
 class _Misfit(Exception):
     """The bytes are not of this type, or not in this form."""
+
+
+class TooManyParts(Exception):
+    """What somebody sent takes too long to translate or to read."""
 
 
 class UnityCdr:
@@ -49,20 +63,26 @@ class UnityCdr:
         """For a message class, or None when Unity's serializer and ROS agree on it."""
         return UnityCdr(_structure(message)) if _differs(message) else None
 
-    def to_ros(self, cdr: bytes) -> bytes:
+    def to_ros(self, cdr: bytes, most: int = PARTS) -> bytes:
         """A headset's message as ROS reads it; unchanged when ROS reads it as it is, or nobody does.
 
         Who wrote it is not asked: bytes that are whole in the one form end too late or too early in the other. Where
-        both fit, they are ROS's.
+        both fit, they are ROS's. Raises TooManyParts.
         """
+        too_many: TooManyParts | None = None
         try:
-            self._copied(cdr, from_unity=False, to_unity=False)
+            self._copied(cdr, from_unity=False, to_unity=False, most=most)
+            return cdr
         except _Misfit:
-            try:
-                return self._copied(cdr, from_unity=True, to_unity=False)
-            except _Misfit:
-                pass
-        return cdr
+            pass
+        except TooManyParts as error:  # in the other form the same bytes may be few numbers
+            too_many = error
+        try:
+            return self._copied(cdr, from_unity=True, to_unity=False, most=most)
+        except _Misfit:
+            if too_many is not None:
+                raise too_many from None
+            return cdr
 
     def to_unity(self, cdr: bytes) -> bytes | None:
         """ROS's message as an existing headset reads it; None when it is not of this type."""
@@ -71,18 +91,52 @@ class UnityCdr:
         except _Misfit:
             return None
 
-    def _copied(self, cdr: bytes, *, from_unity: bool, to_unity: bool, strict: bool = True) -> bytes:
+    def _copied(
+        self, cdr: bytes, *, from_unity: bool, to_unity: bool, strict: bool = True, most: int | None = None
+    ) -> bytes:
         if cdr[:_HEADER_BYTES] != HEADER:
             raise _Misfit
-        copy = _Copy(cdr, from_unity=from_unity, to_unity=to_unity, strict=strict)
+        copy = _Copy(cdr, from_unity=from_unity, to_unity=to_unity, strict=strict, most=most)
         self._copy(copy)
         copy.end()
         return bytes(copy.out)
 
 
-def to_ros(both: UnityCdr | None, cdr: bytes) -> bytes:
-    """A headset's message as ROS reads it, of a type on which both may agree."""
-    return cdr if both is None else both.to_ros(cdr)
+class Parts:
+    """Bounds what it takes to read messages of one type as Python objects: not bytes, of which an array of numbers has
+    many, but strings and structures. Made by `of`."""
+
+    def __init__(self, copy: _Part) -> None:
+        self._copy = copy
+
+    @staticmethod
+    def of(message: type[Any]) -> Parts | None:
+        """For a message class, or None when no message of it has many."""
+        return Parts(_structure(message)) if any(map(_may_have_many, message.SLOT_TYPES)) else None
+
+    def check(self, cdr: bytes, most: int = PARTS) -> None:
+        """Raises TooManyParts, also for what is too large to be read without knowing."""
+        if len(cdr) <= _FEW_BYTES:
+            return
+        try:
+            if cdr[:_HEADER_BYTES] != HEADER:
+                raise _Misfit
+            self._copy(_Copy(cdr, from_unity=False, to_unity=False, strict=False, most=most))
+        except _Misfit:
+            raise TooManyParts(f"{len(cdr)} bytes, and their parts cannot be counted") from None
+
+
+def to_ros(both: UnityCdr | None, cdr: bytes, most: int = PARTS) -> bytes:
+    """A headset's message as ROS reads it, of a type on which both may agree. Raises TooManyParts."""
+    return cdr if both is None else both.to_ros(cdr, most)
+
+
+def readable(both: UnityCdr | None, parts: Parts | None, cdr: bytes, most: int = PARTS) -> bytes:
+    """A headset's message as ROS reads it, one that Python can read soon. Raises TooManyParts."""
+    cdr = to_ros(both, cdr, most)
+    if parts is not None:
+        parts.check(cdr, most)
+    return cdr
 
 
 def to_unity(both: UnityCdr | None, cdr: bytes) -> bytes:
@@ -98,14 +152,17 @@ def to_unity(both: UnityCdr | None, cdr: bytes) -> bytes:
 
 
 class _Copy:
-    """Reads one form and writes the other. ``strict``: padding is zero, and nothing but padding follows the end."""
+    """Reads one form and writes the other. ``strict``: padding is zero, and nothing but padding follows the end.
+    ``most``: parts that may be read; None: any."""
 
-    def __init__(self, cdr: bytes, *, from_unity: bool, to_unity: bool, strict: bool) -> None:
+    def __init__(self, cdr: bytes, *, from_unity: bool, to_unity: bool, strict: bool, most: int | None) -> None:
         self._cdr = memoryview(cdr)
         self._at = _HEADER_BYTES
         self._from_unity = from_unity
         self._to_unity = to_unity
         self._strict = strict
+        self._most = most
+        self._parts = 0
         self.out = bytearray(HEADER)
 
     def end(self) -> None:
@@ -114,15 +171,23 @@ class _Copy:
         if self._strict and (rest and (self._from_unity or rest >= _LARGE or any(self._cdr[self._at :]))):
             raise _Misfit
 
+    def spend(self, parts: int) -> None:
+        """So many parts will be read. Once per sequence, so that it costs what is sent next to nothing."""
+        self._parts += parts
+        if self._most is not None and self._parts > self._most:
+            raise TooManyParts(f"it has more than {self._most} parts")
+
     def values(self, size: int, count: int = 1) -> None:
         """So many numbers of this size, one at least."""
         self._align_in(size)
         self._align_out(size)
         self.out += self._take(size * count)
 
-    def sequence_of_values(self, size: int) -> None:
-        """A length, and so many numbers."""
+    def sequence_of_values(self, size: int, each: int = 0) -> None:
+        """A length, and so many numbers. ``each``: so many of them count as a part."""
         if count := self.length():
+            if each:
+                self.spend(count // each)
             self.values(size, count)
             return
         if self._from_unity:
@@ -148,9 +213,12 @@ class _Copy:
     def wide_text(self) -> None:
         """A wstring."""
         if self._from_unity:
-            text = bytes(self._text_in()).decode("utf-8", "replace")
+            utf8 = bytes(self._text_in())
+            self.spend(len(utf8) // _LETTERS)
+            text = utf8.decode("utf-8", "replace")
         else:
             units = self._take(_U32.size * self._length_in())
+            self.spend(len(units) // _U32.size // _LETTERS)
             text = bytes(b for at in range(0, len(units), _U32.size) for b in units[at : at + 2]).decode(
                 "utf-16-le", "replace"
             )
@@ -266,15 +334,41 @@ def _array(item: Any, count: int) -> _Part:
 
 def _sequence(item: Any) -> _Part:
     if isinstance(item, idl.BasicType):
-        size = PRIMITIVE_BYTES[item.typename]
-        return lambda copy: copy.sequence_of_values(size)
-    part = _part(item)
+        size, each = PRIMITIVE_BYTES[item.typename], _OBJECTS * (item.typename in _MADE_OBJECTS)
+        return lambda copy: copy.sequence_of_values(size, each)
+    part, parts = _part(item), _parts_of(item)
 
     def copy_items(copy: _Copy) -> None:
-        for _ in range(copy.length()):
+        count = copy.length()
+        copy.spend(count * parts)
+        for _ in range(count):
             part(copy)
 
     return copy_items
+
+
+_MADE_OBJECTS = frozenset({"boolean", "octet", "char", "wchar"})
+"""rclpy has arrays of the other numbers."""
+
+
+def _may_have_many(slot: Any) -> bool:
+    if isinstance(slot, idl.AbstractSequence):
+        item = slot.value_type
+        return not isinstance(item, idl.BasicType) or item.typename in _MADE_OBJECTS
+    if isinstance(slot, idl.Array):
+        return _may_have_many(slot.value_type)
+    if isinstance(slot, idl.NamespacedType):
+        return any(map(_may_have_many, _class_of(slot).SLOT_TYPES))
+    return isinstance(slot, idl.AbstractWString)
+
+
+def _parts_of(slot: Any) -> int:
+    """What one item of a sequence has at least."""
+    if isinstance(slot, idl.NamespacedType):
+        return 1 + sum(map(_parts_of, _class_of(slot).SLOT_TYPES))
+    if isinstance(slot, idl.Array) and not isinstance(slot.value_type, idl.BasicType):
+        return int(slot.size) * _parts_of(slot.value_type)
+    return 1
 
 
 def _class_of(slot: Any) -> type[Any]:

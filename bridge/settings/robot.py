@@ -142,6 +142,9 @@ class RobotSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     max_frame_bytes: Bytes = 32 * 1024 * 1024
     """A larger message to headsets is not sent, and they are told. Gateways and headsets have limits of their own, by
     which such a message can end a connection."""
+    max_message_parts: Annotated[int, Meta(ge=1024, le=10_000_000)] = 1 << 15
+    """Strings and structures in a command, a request, an answer or a goal of a headset, where this robot has to
+    translate or read it. More is refused: it would hold up everything else. An array of numbers is one part."""
     rules: list[TopicRule] = []
     """What holds for topics, services and actions by name, each a ``[[robot.rules]]`` table."""
     groups: dict[str, list[AgentPattern]] = {}
