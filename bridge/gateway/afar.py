@@ -95,7 +95,7 @@ class Afar:
     # -- senders here --------------------------------------------------------------------------------------------
 
     def has_read(self, connection: Connection) -> None:
-        """Something was read from one of `slowed`: not again for a while."""
+        """A frame was read from one of `slowed`: no more for a while."""
         slowed = self.slowed[connection]
         if slowed.timer is None:
             connection.pause()
@@ -124,10 +124,12 @@ class Afar:
                     self._end(connection, slowed)
 
     def _slow_down(self, connection: Connection, receiver: AgentKey) -> None:
-        slowed = self.slowed.setdefault(connection, _Slowed())
+        slowed = self.slowed.get(connection)
+        if slowed is None:
+            slowed = self.slowed[connection] = _Slowed()
+            self.has_read(connection)  # later on only after a frame: a large one must come to its end
         if receiver in slowed.receivers or len(slowed.receivers) < RECEIVERS:
             slowed.receivers[receiver] = self._loop.time() + NOTED_S
-        self.has_read(connection)
 
     def _read_again(self, connection: Connection, slowed: _Slowed) -> None:
         """It has waited."""

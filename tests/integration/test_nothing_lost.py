@@ -187,6 +187,21 @@ async def test_slower_receivers_in_a_group_behind_another_gateway(two_ports: tup
             assert [n for who, n in thread.numbers if who == sender.id] == list(range(count))
 
 
+async def test_large_frames_to_many_slow_receivers_elsewhere(two_ports: tuple[int, int]) -> None:
+    """However many receivers are full at once, a sender's frame comes to its end: four a second go on."""
+    sender = Headset.join(two_ports[0], 0)
+    receivers = [Headset.join(two_ports[1], 0) for _ in range(10)]
+    await asyncio.sleep(1)
+    ids = [receiver.id for receiver in receivers]
+    load = pieces(sequence.messages(sender.id, 3 << 20, 6, [{"ids": ids, "groups": []}]))
+    reading = [Receiver(receiver, 6, 6e6) for receiver in receivers]
+    for thread in reading:
+        thread.start()
+    await ended(send(sender, load), *reading)
+    for thread in reading:
+        assert [n for _, n in thread.numbers] == list(range(6))
+
+
 async def test_a_receiver_elsewhere_that_has_stopped_stops_nobody(two_ports: tuple[int, int]) -> None:
     """Whose receiver behind another gateway reads nothing at all is soon read from as before."""
     sender, stalled = Headset.join(two_ports[0], 0), Headset.join(two_ports[1], 0)
