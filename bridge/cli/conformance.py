@@ -11,6 +11,8 @@ examples:
   macs conformance gateway 127.0.0.1:7000                     a router; let robots in with macs gateway --robots any
   macs conformance gateway 127.0.0.1:7000 --level compatible
   macs conformance gateway --list                             what it would try
+  macs conformance headset --listen 7000                      now start your headset, with this machine as its router
+  macs conformance headset --listen 0 --run './headset 127.0.0.1 {port}' --junit headset.xml
 
 what it prints:
   failed  routing.broadcast: Type 0 without management data: to everybody. Copies: 1.
@@ -27,6 +29,7 @@ from typing import TYPE_CHECKING
 
 from bridge.cli import output, running
 from macs_zenoh.errors import ConfigError, UsageError
+from macs_zenoh.protocol.addresses import joined
 
 if TYPE_CHECKING:
     from bridge.conformance.checks import Check, Verdict
@@ -49,6 +52,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     _add_common(gateway)
     gateway.set_defaults(judge=_judge_gateway)
+    headset = kinds.add_parser("headset", help="a headset: be its router", description=_judge_headset.__doc__)
+    headset.add_argument("--listen", type=int, metavar="PORT", help="where it shall connect to (0 for any free port)")
+    headset.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
+    headset.add_argument(
+        "--run",
+        dest="command",
+        metavar="COMMAND",
+        help="start the headset with this, and again after what ended it; {port} is the port",
+    )
+    headset.add_argument(
+        "--wait", type=float, default=30.0, metavar="S", help="how long to wait until it connects (default: 30)"
+    )
+    _add_common(headset)
+    headset.set_defaults(judge=_judge_headset)
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
@@ -94,6 +111,39 @@ def _judge_gateway(args: argparse.Namespace) -> int:
     async def judge() -> int:
         began = time.monotonic()
         found = await gateway.judge(host, port, level=Level(args.level), patience_s=args.patience, group=args.group)
+        return _report(args, found, time.monotonic() - began)
+
+    return running.until_stopped(judge, interrupted=running.INTERRUPTED)
+
+
+def _judge_headset(args: argparse.Namespace) -> int:
+    """Be the router of a headset, and judge what it says and what it outlives. It should connect again by itself, or
+    --run says how to start it. Of what it never does, as registering or serving, nothing is judged."""
+    from bridge.conformance import headset
+    from bridge.conformance.checks import Level
+    from bridge.conformance.program import Command
+
+    if args.list:
+        return _list(args, headset.CHECKS)
+    if args.listen is None:
+        raise UsageError("where shall it connect to? --listen PORT is missing")
+    program = None if args.command is None else Command(args.command)
+
+    async def judge() -> int:
+        began = time.monotonic()
+        try:
+            found = await headset.judge(
+                args.host,
+                args.listen,
+                level=Level(args.level),
+                patience_s=args.patience,
+                start_s=args.wait,
+                on_listening=lambda port: output.note(f"listening on {joined(args.host, port)}: connect the headset"),
+                program=program,
+            )
+        finally:
+            if program is not None:
+                await program.stop()
         return _report(args, found, time.monotonic() - began)
 
     return running.until_stopped(judge, interrupted=running.INTERRUPTED)

@@ -29,11 +29,14 @@ namespace Macs
         const int HeaderBytes = 39;
         const double HeartbeatS = 4.0;          // the gateway wants a sign of life; existing programs send one after 5 s
         const int AnswerMs = 5000;
+        const int MaxMessageBytes = 256 << 20;  // no gateway sends so much: behind such a size no message can be found
 
         public event Action<int> Connected = id => { };
         public event Action<string> Disconnected = reason => { };
         // Robot, topic or service, reason: a sentence for the person with the headset.
         public event Action<int, string, string> Refused = (robot, name, reason) => { };
+        // A message that could not be read, or whose handler failed. It costs that message and nothing else.
+        public event Action<Exception> Failed = error => { };
 
         public int Id { get; private set; }
         // Messages from the gateway that may wait for Dispatch; while that many wait, it reads no more.
@@ -43,7 +46,7 @@ namespace Macs
         readonly int port, group;
         readonly object writing = new object();
         readonly Dictionary<string, Node> nodes = new Dictionary<string, Node>();
-        readonly Dictionary<int, TaskCompletionSource<byte[]>> calls = new Dictionary<int, TaskCompletionSource<byte[]>>();
+        readonly Dictionary<uint, TaskCompletionSource<byte[]>> calls = new Dictionary<uint, TaskCompletionSource<byte[]>>();
         readonly ConcurrentQueue<Action> waiting = new ConcurrentQueue<Action>();
         readonly Timer heartbeat;
         NetworkStream stream;
@@ -89,7 +92,7 @@ namespace Macs
             lock (nodes)
                 if (!nodes.ContainsKey(NodeName(service)))
                     Add(new Node(NodeType.Client, service, type, new[] { robot }, null));
-            int number = Interlocked.Increment(ref nextRequest);
+            uint number = (uint)Interlocked.Increment(ref nextRequest);
             var answer = new TaskCompletionSource<byte[]>();
             lock (calls) calls[number] = answer;
             Metadata metadata = Find(service).Metadata(Id, number);
@@ -118,7 +121,11 @@ namespace Macs
         public void Dispatch()
         {
             Action next;
-            for (int left = waiting.Count; left > 0 && waiting.TryDequeue(out next); left--) next();
+            for (int left = waiting.Count; left > 0 && waiting.TryDequeue(out next); left--)
+            {
+                try { next(); }
+                catch (Exception error) { Failed(error); }
+            }
         }
 
         public void Dispose()
@@ -164,8 +171,15 @@ namespace Macs
         {
             byte[] metadataBytes = ReadExactly(ReadSize());
             byte[] data = ReadExactly(ReadSize());
+            try { Handle(metadataBytes, data); }
+            catch (Exception error) when (!(error is IOException)) { waiting.Enqueue(() => Failed(error)); }
+        }
+
+        // Throws what the JSON reader throws: the message is lost, the one behind it is not.
+        void Handle(byte[] metadataBytes, byte[] data)
+        {
             var metadata = FromJson<Metadata>(metadataBytes);
-            if (metadata.NodeName != "") Deliver(metadata, data);
+            if (!string.IsNullOrEmpty(metadata.NodeName)) Deliver(metadata, data);
             else if (metadata.MessageManager == "AgentConfigurer") Configure(metadata, FromJson<Welcome>(data));
             else if (metadata.MessageManager == "InterfaceNodeRefused")
             {
@@ -192,7 +206,7 @@ namespace Macs
         {
             Node node;
             lock (nodes) if (!nodes.TryGetValue(metadata.NodeName, out node)) return;
-            if (metadata.NodeType != (int)node.Type) return;
+            if (metadata.NodeType != (int)node.Type || metadata.SenderAgentType != Robot) return;
             int robot = metadata.SenderAgentId ?? 0;
             if (node.Type == NodeType.Subscriber) waiting.Enqueue(() => node.OnMessage(robot, data));
             else if (node.Type == NodeType.Client) Answered(metadata, data);
@@ -230,7 +244,12 @@ namespace Macs
             catch (IOException) { }
         }
 
-        int ReadSize() { return BitConverter.ToInt32(ReadExactly(4), 0); }
+        int ReadSize()
+        {
+            int size = BitConverter.ToInt32(ReadExactly(4), 0);
+            if (size < 0 || size > MaxMessageBytes) throw new IOException("the gateway declared " + (uint)size + " bytes");
+            return size;
+        }
 
         byte[] ReadExactly(int size)
         {
@@ -313,7 +332,11 @@ namespace Macs
         static T FromJson<T>(byte[] bytes)
         {
             using (var stream = new MemoryStream(bytes))
-                return (T)new DataContractJsonSerializer(typeof(T)).ReadObject(stream);
+                {
+                var value = (T)new DataContractJsonSerializer(typeof(T)).ReadObject(stream);
+                if (value == null) throw new SerializationException("null is no " + typeof(T).Name);
+                return value;
+            }
         }
 
         sealed class Node
@@ -336,7 +359,7 @@ namespace Macs
                 Groups = groups ?? new int[0];
             }
 
-            public Metadata Metadata(int id, int request)
+            public Metadata Metadata(int id, uint request)
             {
                 return new Metadata {
                     SenderAgentType = Headset, SenderAgentId = id, RequestId = request, NodeType = (int)Type,
@@ -351,14 +374,14 @@ namespace Macs
     {
         [DataMember(Name = "senderAgentType")] public int? SenderAgentType;
         [DataMember(Name = "senderAgentId")] public int? SenderAgentId;
-        [DataMember(Name = "requestId")] public int RequestId;
+        [DataMember(Name = "requestId")] public uint RequestId;
         [DataMember(Name = "messageManager")] public string MessageManager = "";
         [DataMember(Name = "nodeType")] public int NodeType;
         [DataMember(Name = "nodeName")] public string NodeName = "";
         [DataMember(Name = "dataExchangeType")] public string DataExchangeType = "";
     }
 
-    [DataContract] class Welcome { [DataMember(Name = "agentId")] public int AgentId; }
+    [DataContract] class Welcome { [DataMember(Name = "agentId", IsRequired = true)] public ushort AgentId; }
 
     [DataContract] class Configuration
     {
@@ -366,7 +389,7 @@ namespace Macs
         [DataMember(Name = "agentType")] public int AgentType;
         [DataMember(Name = "agentId")] public int AgentId;
         [DataMember(Name = "groupId")] public int GroupId;
-        [DataMember(Name = "requestId")] public int RequestId;
+        [DataMember(Name = "requestId")] public uint RequestId;
         // "I read what newer gateways say": an existing program leaves it out (docs/protocol.md).
         [DataMember(Name = "extensions")] public int Extensions = 1;
     }
@@ -493,6 +516,7 @@ namespace Macs
                 int[] robot = { 1 };
                 headset.Connected += id => Say("connected as headset " + id);
                 headset.Disconnected += reason => Say("disconnected: " + reason);
+                headset.Failed += error => Say("a message was lost: " + error.Message);
                 headset.Refused += (id, name, reason) => Say("robot " + id + " refused " + name + ": " + reason);
                 headset.Subscribe("/chatter", "std_msgs/String",
                     (id, message) => Say("/chatter of robot " + id + ": " + new CdrReader(message).String()), robot);

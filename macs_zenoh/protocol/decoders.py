@@ -210,6 +210,10 @@ class FrameDecoder:
             return error.with_traceback(None)
 
 
+_NO_SIZE = 1 << 31
+"""Nobody sends so much: existing programs take it for a negative number. Who waited for it would hear nothing more."""
+
+
 class Skipped(NamedTuple):
     """A message that was too large: its size, and its metadata."""
 
@@ -267,7 +271,7 @@ class MessageDecoder:
         if available < MESSAGE_OVERHEAD + metadata_bytes:
             return None
         data_bytes: int = U32.unpack_from(self._buffer, at + 4 + metadata_bytes)[0]
-        if not self._skip_large:
+        if not self._skip_large or data_bytes >= _NO_SIZE:
             self._judge(MESSAGE_OVERHEAD + metadata_bytes + data_bytes)
         return MESSAGE_OVERHEAD + metadata_bytes + data_bytes
 
