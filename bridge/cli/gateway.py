@@ -22,7 +22,6 @@ import logging
 import resource
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
 
 from bridge import memory
 from bridge.cli import options, running
@@ -32,11 +31,8 @@ from bridge.settings import GatewaySettings, Settings
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, UsageError
 from macs_zenoh.protocol import endpoints
-from macs_zenoh.protocol.addresses import is_local, joined, reachable
+from macs_zenoh.protocol.addresses import is_local, joined
 from macs_zenoh.sections import changed
-
-if TYPE_CHECKING:
-    from bridge.gateway import Gateway
 
 log = logging.getLogger("macs.gateway")
 
@@ -165,14 +161,6 @@ def _raise_descriptor_limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
-def _other_ports(gateway: Gateway) -> str:
-    """The ports besides the plain one, for who reads what is printed."""
-    ports = gateway.listeners
-    tls = f", TLS on port {ports.tls_port}" if ports.tls_port else ""
-    secure = "s" if ports.web_context is not None else ""
-    return tls + (f", http{secure}://{joined(reachable(ports.web_host), ports.web_port)}" if ports.web_port else "")
-
-
 def _judge_router(settings: MeshSettings) -> None:
     """What a router says of its endpoints; and nobody holds a router's own program to the rules that it has. Raises
     ConfigError."""
@@ -211,7 +199,7 @@ async def _serve(settings: Settings) -> int:
                         " --without-token nobody that a token is wanted (macs token)",
                         gateway.address,
                     )
-                running.say_ready(f"gateway on {gateway.address}{_other_ports(gateway)}")
+                running.say_ready(f"gateway on {gateway.address}")
                 await locked_out(mesh)
                 listening = changed(  # headsets that come back look for it there
                     listening,

@@ -14,7 +14,7 @@ from bridge.listening import bound
 from bridge.settings import GatewaySettings
 from macs_zenoh.errors import ConfigError, MissingExtra, Unreachable
 from macs_zenoh.losses import Losses
-from macs_zenoh.protocol.addresses import is_local, joined
+from macs_zenoh.protocol.addresses import is_local, joined, reachable
 
 from .connection import Connection
 from .door import Door, Entrance, Entrances
@@ -115,6 +115,14 @@ class Listeners:
     def web_host(self) -> str:
         """Where the web port is."""
         return self._settings.host if self._settings.web_host is None else self._settings.web_host
+
+    @property
+    def others(self) -> str:
+        """The ports besides the plain one, as a log says them."""
+        tls = f", over TLS on port {self.tls_port}" if self.tls_port else ""
+        scheme = "http" if self.web_context is None else "https"
+        web = f", and on {scheme}://{joined(reachable(self.web_host), self.web_port)}" if self.web_port else ""
+        return tls + web
 
     @property
     def web_context(self) -> ssl.SSLContext | None:

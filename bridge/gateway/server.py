@@ -205,7 +205,7 @@ class Gateway:
         self.port = self.listeners.port
         self._door.start()
         self.mesh.address = joined(for_others(self.settings.host), self.port)
-        log.info("listening on %s", self.address)
+        log.info("listening on %s%s", self.address, self.listeners.others)
 
     @property
     def address(self) -> str:
