@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from bridge.awareness.afferent import Mode as Mode
     from bridge.awareness.client import GatewayClient as GatewayClient
     from bridge.headset.client import Headset as Headset
+    from bridge.headset.stream import Way as Way
 
     from .agent import Agent as Agent
     from .agent import join as join
@@ -63,6 +64,7 @@ _WHERE = {
     "bridge.awareness.afferent": ("GatewayClientAfferent", "Mode"),
     "bridge.awareness.client": ("GatewayClient",),
     "bridge.headset.client": ("Headset",),
+    "bridge.headset.stream": ("Way",),
     "macs_zenoh.agent": ("Agent", "join"),
     "macs_zenoh.config": ("MeshSettings", "TrafficRule"),
     "macs_zenoh.errors": (

@@ -231,6 +231,8 @@ class Gateway:
         self._waiting.close()
         if connections:
             for connection in connections:
+                if connection.greeted and connection.peer.extensions:
+                    self._tell_access(connection, AccessRefused("stops", "the gateway stops"))
                 connection.finish("the gateway stops")
             with suppress(asyncio.TimeoutError):
                 await within(self._all_closed.wait(), FLUSH_S)
@@ -449,7 +451,10 @@ class Gateway:
 
     def _tell_refusal(self, agent: AgentKey, refused: NodeRefused) -> None:
         connection = self.agents.find(*agent)
-        if connection is not None and self.settings.tell_refusals:
+        if connection is None:
+            return
+        connection.peer.registration_refused(refused)
+        if self.settings.tell_refusals:
             connection.send_call(to_agent(refused))
 
     # -- what a token does not permit ------------------------------------------------------------------------------

@@ -181,9 +181,10 @@ class _WebSocketStream:
     def abort(self) -> None:
         self._finishing = True
         self._sending.cancel()
-        response = self._socket._response
+        response = self._socket._response  # its socket has no way to end without a goodbye
         if response.connection is not None and response.connection.transport is not None:
             response.connection.transport.abort()
+        response.close()
 
     async def _send(self) -> None:
         try:

@@ -291,7 +291,8 @@ class AccessRefused(Management, frozen=True):
 
     ``kind`` is ``no_token``: no valid token was shown where one is wanted, and the connection ends; ``not_permitted``:
     a message was not passed on; ``changed``: the token has other rights now; ``ended``: it holds no longer, and the
-    connection ends. ``reason`` is for a person. ``request_id`` is that of the message.
+    connection ends; ``stops``: the gateway does, and so do all connections. ``reason`` is for a person, ``request_id``
+    that of the message.
     """
 
     manager: ClassVar[str] = "AccessRefused"

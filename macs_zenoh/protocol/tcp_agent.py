@@ -59,7 +59,7 @@ from .messages import (
 )
 from .recipient import Recipient, to_agent
 from .rights import OPEN, Grant, Rights
-from .wire import MACS, MAX_FRAME_BYTES, Frame, Frames, Layout
+from .wire import MACS, MAX_FRAME_BYTES, Frame, Frames, Header, Layout
 
 
 class State(Enum):
@@ -198,9 +198,8 @@ Event = (
 Admit = Callable[[str | None], Grant | None]
 """What somebody gets who shows this token, or none; None: it is not let in."""
 
-STRANGER_FRAME_BYTES = CONFIGURATION_BYTES + MANAGEMENT_BYTES
 STRANGER_HELD_BYTES = 64 << 10
-"""What a frame may have, and what may wait, of somebody who has yet to show a token: less than of an agent."""
+"""What may wait of somebody who has yet to show a token: less than of an agent."""
 
 
 class TcpAgent:
@@ -242,6 +241,8 @@ class TcpAgent:
         """Of an agent with a token: why what goes there, and is that, may not go on."""
         self._registered: dict[tuple[int, str], Registering] = {}
         """Of an agent with a token: what it registered, by node type and name, and where."""
+        self._refused_at: dict[tuple[int, str], set[int]] = {}
+        """Of these, which robots refused which."""
         self.agent_id = agent_id
         self.former_ids: set[int] = set()
         self.connection_number = connection_number
@@ -263,8 +264,7 @@ class TcpAgent:
         self.credit = credit or Credit(limits.frames_per_s, now)
         self._layout = layout
         self._decoder = FrameDecoder(limits.max_frame_bytes, layout, scratch)
-        if stranger:
-            self._decoder.max_frame_bytes = min(limits.max_frame_bytes, STRANGER_FRAME_BYTES)
+        if stranger:  # a frame behind its configuration may have come with it: its size is judged as an agent's
             self._limits = limits._replace(held_bytes=min(limits.held_bytes, STRANGER_HELD_BYTES))
         self._held: deque[Frames] = deque()
         self._held_bytes = 0
@@ -537,7 +537,6 @@ class TcpAgent:
             events += [NotLetIn(), self._leave("it has no valid token")]
             return False
         self.grant, self._rights = grant, grant.rights
-        self._decoder.max_frame_bytes = self._limits.max_frame_bytes
         return True
 
     def rights_change(self, grant: Grant) -> list[Event]:
@@ -621,6 +620,15 @@ class TcpAgent:
         elif len(self._registered) >= NODES_EACH:
             raise NotPermitted(f"each may have {NODES_EACH} interface nodes")
         self._registered[key] = Registering(node, robots, groups)
+        self._refused_at.pop(key, None)
+
+    def registration_refused(self, refused: NodeRefused) -> None:
+        """A robot refused what the agent registered. Messages say only the name of a node, which there may be another
+        topic's, so those of an agent with a token are not let pass to that robot."""
+        key = refused.node_type, refused.node_name
+        if key in self._registered:
+            self._refused_at.setdefault(key, set()).add(refused.robot_id)
+            self._permitted.clear()
 
     def _permit(self, frame: Frames, metadata: Metadata, rights: Rights) -> None:
         """Whether a frame for others may go on: judged once for each destination and node. Raises NotPermitted."""
@@ -630,12 +638,19 @@ class TcpAgent:
         except KeyError:
             registered = self._registered.get((metadata.node_type, metadata.node_name))
             name = registered.node.tos_name if registered and isinstance(registered.node, AddNode) else None
-            why = rights.of_frame(frame.header, metadata, name)
+            why = rights.of_frame(frame.header, metadata, name) or self._refusal_there(frame.header, metadata)
             if len(self._permitted) >= self.PERMITTED:
                 self._permitted.clear()
             self._permitted[about] = why
         if why is not None:
             raise NotPermitted(why)
+
+    def _refusal_there(self, header: Header, metadata: Metadata) -> str | None:
+        """Whether a robot that would get a message has refused its node; in a group it may be any."""
+        refused = self._refused_at.get((metadata.node_type, metadata.node_name))
+        if not refused or (not header.groups and header.agent_type and refused.isdisjoint(header.ids)):
+            return None
+        return f"robot {min(refused)} refused this node"
 
     def _stream(self, stream: StreamData, frame: Frame) -> Streamed:
         if self.agent_type != ROS:

@@ -8,6 +8,7 @@ import functools
 import gc
 import json
 import os
+import re
 import ssl
 import time
 import tracemalloc
@@ -48,6 +49,7 @@ from macs_zenoh.serving import Call
 from tests.support.certificates import Authority
 from tests.support.given import StartGateway
 from tests.support.local import patient
+from tests.support.programs import Program, ended, free_port, macs
 from tests.support.waiting import until
 
 PORTS = ["plain", "tls", "web", "web_tls"]
@@ -375,6 +377,42 @@ async def test_a_new_certificate_is_shown_without_a_restart(start_door: StartDoo
         assert time.monotonic() < deadline
     with pytest.raises(Unreachable):
         await Headset.connect("127.0.0.1", port, way=way)
+
+
+async def test_programs_keep_to_tokens(router: str, tokens: Tokens, tmp_path: Path) -> None:
+    """The command line, on the loop that it uses, with two workers: a token lets in at each port, one that is made
+    meanwhile as well, and its end is known to both; what is printed for programs is as it was."""
+    authority = Authority(tmp_path / "ca")
+    certificate, key = map(str, authority.issue("gateway"))
+    tls, web = free_port(), free_port()
+    ports = ["--port", "0", "--tls-port", str(tls), "--web-port", str(web), "--certificate", certificate, "--key", key]
+    rules = ["--tokens", str(tokens.path), "--without-token", "nobody"]
+    async with Program("gateway", "-e", router, "--workers", "2", *ports, *rules) as gateway:
+        assert re.fullmatch(r"gateway on 127\.0\.0\.1:\d+", gateway.ready)
+        secret = tokens.make("anna", may=["send"])
+        ways = [
+            [f"127.0.0.1:{gateway.port}"],
+            [f"127.0.0.1:{tls}", "--ca", str(authority.ca)],
+            [f"ws://127.0.0.1:{web}"],
+        ]
+        for way in ways:
+            assert (await macs("headset", *way, "--token", secret, "online"))["ros"] == []
+            code, out, errors = await ended("headset", *way, "--token", secret[:-1], "online")
+            assert (code, out) == (1, "")
+            assert "a valid token is wanted here" in errors
+        sent = ("send", "x", "--to", "ros", "--ids", "1")
+        code, out, _ = await ended("headset", *ways[0], "--token", secret, *sent)
+        assert code == 1
+        assert json.loads(out)["refused"] == "robot 1 is not among the robots of this token"
+        anna = [await Headset.connect("127.0.0.1", gateway.port, token=secret) for _ in range(8)]
+        tokens.revoke("anna")
+        reasons = await asyncio.wait_for(asyncio.gather(*(headset.wait_ended() for headset in anna)), 30)
+        assert set(reasons) == {"this token holds no longer"}
+        for headset in anna:
+            await headset.close()
+    code, _, errors = await ended("gateway", "-e", router, "--workers", "2", "--web-port", "0")
+    assert code == 2
+    assert "--web-port" in errors
 
 
 # -- the web port ----------------------------------------------------------------------------------------------------

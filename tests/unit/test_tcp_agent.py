@@ -18,11 +18,14 @@ from macs_zenoh.errors import (
     BadJson,
     BadSizes,
     FrameTooLarge,
+    NotAdmitted,
     NotAllowed,
+    NotPermitted,
     TooFast,
     UnknownManager,
     WireError,
 )
+from macs_zenoh.protocol.credit import Credit
 from macs_zenoh.protocol.messages import (
     MANAGERS,
     OPERATOR,
@@ -45,11 +48,14 @@ from macs_zenoh.protocol.messages import (
     Welcome,
     encode_data,
     encode_management,
+    node_name,
 )
+from macs_zenoh.protocol.rights import Grant, Rights
 from macs_zenoh.protocol.tcp_agent import (
     Asked,
     AskedOnline,
     Event,
+    Forbidden,
     Joined,
     Left,
     Limits,
@@ -60,6 +66,7 @@ from macs_zenoh.protocol.tcp_agent import (
     State,
     Streamed,
     TcpAgent,
+    Withdrawn,
 )
 from macs_zenoh.protocol.wire import MACS, Layout, encode_frame, encode_message, parse_frame, split_message
 from tests.support.recordings import BY_NAME, RECORDINGS, Recording, one_by_one, reading
@@ -918,3 +925,112 @@ def test_a_group_that_is_not_to_be_chosen() -> None:
         assert [event.group for event in joined] == [got]
         assert peer.group == got
     assert peer.drops["NotAllowed"] == 2
+
+
+# -- tokens ----------------------------------------------------------------------------------------------------------
+
+
+def guarded(rights: Rights | None, **options: Any) -> TcpAgent:
+    """Agent 7, for whom the token "good" is good for these rights."""
+    return TcpAgent(
+        7, 42, 0.0, limits=LIMITS, admit=lambda shown: Grant("g", rights) if shown == "good" else None, **options
+    )
+
+
+def shown(token: str | None, group: int = 0, agent_type: int = UNITY) -> bytes:
+    """A configuration with a token."""
+    return encode_frame(management=encode_management(Configuration(agent_type, 7, group, 42, token=token)))
+
+
+def node_data(name: str, ids: tuple[int, ...] = (1,), groups: tuple[int, ...] = ()) -> bytes:
+    """A command to robots."""
+    metadata = Metadata(UNITY, 7, node_type=2, node_name=name).encode()
+    return encode_frame(ROS, ids, groups, message=encode_message(metadata, b"x"))
+
+
+def registered(topic: str, ids: list[int]) -> bytes:
+    """A registration to publish a topic of robots."""
+    name = node_name(topic)
+    added = encode_data(AddNode(UNITY, 7, 2, name, topic, "pkg/T"))
+    return encode_frame(
+        management=encode_management(Registration(7, 2, name, ids)),
+        message=encode_message(Metadata(UNITY, 7, message_manager=AddNode.manager).encode(), added),
+    )
+
+
+@pytest.mark.parametrize("token", [None, "", "bad", "goo", "goodgood"])
+@pytest.mark.parametrize("agent_type", [UNITY, ROS])
+def test_who_shows_no_valid_token_is_out(token: str | None, agent_type: int) -> None:
+    """It is told, it leaves, and nothing that it sent before or behind is passed on."""
+    peer = guarded(Rights(may=["send"]))
+    events = peer.receive(message() + shown(token, agent_type=agent_type) + message(), 0.0)
+    assert [type(event).__name__ for event in events] == ["Rejected", "NotLetIn", "Left"]
+    assert peer.state is State.GONE
+    assert peer.receive(shown("good"), 1.0) == []
+
+
+def test_a_stranger_may_say_little() -> None:
+    """What comes before its token waits in less room than an agent's; what comes with it is an agent's already."""
+    limits = LIMITS._replace(held_frames=100, held_bytes=1 << 20)
+    large = encode_frame(UNITY, (5,), message=encode_message(Metadata(UNITY, 7).encode(), bytes(90_000)))
+    for stranger, passed in ((True, 1), (False, 2)):
+        peer = TcpAgent(7, 42, 0.0, limits=limits, admit=lambda _: Grant(), stranger=stranger)
+        events = peer.receive(large + shown("good") + large, 0.0)
+        assert [type(event) for event in events] == [Joined] + [Sent] * passed
+        assert peer.drops["before_configuration"] == 2 - passed
+
+
+def test_only_a_token_for_robots_makes_a_robot() -> None:
+    """Whoever may command robots is not one."""
+    assert errors(guarded(Rights(may=["see"])).receive(shown("good", agent_type=ROS), 0.0)) == [NotAdmitted]
+    assert errors(guarded(Rights(may=["robot"])).receive(shown("good", agent_type=ROS), 0.0)) == []
+
+
+def test_rights_hold_for_what_was_registered() -> None:
+    """Data goes where its node was registered, by the name that was judged; not before, not elsewhere, and not to a
+    robot that has refused the node, since another topic may have its name there."""
+    peer = guarded(Rights(may=["command"], robots=[1, 2], groups=[3], topics=["/a_b"]))
+    peer.receive(shown("good"), 0.0)
+    assert errors(peer.receive(node_data("nd__a_b"), 0.0)) == [NotPermitted]
+    assert errors(peer.receive(registered("/a/b", [1]), 0.0)) == [NotPermitted]
+    assert [type(event) for event in peer.receive(registered("/a_b", [1, 2]), 0.0)] == [Registering]
+    assert [type(event) for event in peer.receive(node_data("nd__a_b"), 0.0)] == [Sent]
+    assert errors(peer.receive(node_data("nd__a_b", (9,)), 0.0)) == [NotPermitted]
+    peer.registration_refused(NodeRefused(1, 2, "nd__a_b", "/a_b", "no such type"))
+    assert errors(peer.receive(node_data("nd__a_b", (1, 2)), 0.0)) == [NotPermitted]
+    assert errors(peer.receive(node_data("nd__a_b", (), (3,)), 0.0)) == [NotPermitted]
+    assert errors(peer.receive(node_data("nd__a_b", (2,)), 0.0)) == []
+    peer.receive(registered("/a_b", [1]), 0.0)
+    assert errors(peer.receive(node_data("nd__a_b"), 0.0)) == []
+
+
+def test_changed_rights_take_back_what_they_do_not_permit() -> None:
+    """Registrations, the group and what was remembered as permitted end with the right to them."""
+    peer = guarded(Rights(may=["command"], robots=[1], groups=[3]))
+    peer.receive(shown("good", group=3) + registered("/talk", [1]) + node_data("nd__talk"), 0.0)
+    assert peer.group == 3
+    events = peer.rights_change(Grant("g", Rights(may=["command"], robots=[2])))
+    assert [type(event) for event in events] == [Withdrawn, Joined]
+    assert (peer.group, peer.agent_type) == (0, UNITY)
+    assert errors(peer.receive(node_data("nd__talk"), 0.0)) == [NotPermitted]
+    assert peer.rights_change(Grant("g", Rights(may=["see"], robots=[2]))) == []
+
+
+def test_a_group_of_others_is_not_to_be_chosen() -> None:
+    """Who asks for a group that its token does not name is in none, and is told."""
+    peer = guarded(Rights(groups=[3]))
+    events = peer.receive(shown("good", group=4), 0.0)
+    assert [type(event) for event in events] == [Rejected, Forbidden, Joined]
+    assert peer.group == 0
+
+
+def test_all_who_have_a_token_share_its_rate() -> None:
+    """Two connections with one token may together send what it says."""
+    credit = Credit(3.0, 0.0)
+    grant = Grant("g", Rights(may=["send"], frames_per_s=3.0), credit)
+    peers = [TcpAgent(number, 42, 0.0, limits=LIMITS, admit=lambda _: grant) for number in (7, 8)]
+    for peer in peers:
+        peer.receive(shown("good"), 0.0)
+    events = [event for peer in peers for _ in range(4) for event in peer.receive(message(), 0.0)]
+    assert len([event for event in events if isinstance(event, Sent)]) == 3
+    assert errors(events) == [TooFast] * 5
