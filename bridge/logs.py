@@ -1,9 +1,20 @@
-"""The log of our programs: one line on stderr for each record, whatever others put into it."""
+"""The log of our programs: one line on stderr for each record, whatever others put into it.
+
+A terminal that was stopped with Ctrl-S, or a pipe that nobody reads, holds up whoever writes to it. What logs may be
+in the middle of stopping a robot, so a thread writes that does nothing else.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
+import select
+import sys
+import threading
+from contextlib import suppress
+from queue import SimpleQueue
 from types import TracebackType
+from typing import TextIO
 
 from macs_zenoh.plain import LONGEST, plain, plain_lines
 
@@ -27,11 +38,84 @@ class PlainFormatter(logging.Formatter):
         return "\n".join(f"  {plain_lines(line)}" for line in super().formatException(ei).split("\n"))
 
 
+class Written(logging.Handler):
+    """Writes lines in a thread of its own. Those that find no room are lost, and counted in the log itself."""
+
+    MOST = 4096
+    """Lines that wait."""
+    LAST_S = 0.3
+    """How long `flush` waits for a stream that takes nothing: less than a program has for its last words."""
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__()
+        self.lost = 0
+        self._told = 0
+        self._stream = stream
+        self._descriptor = _descriptor(stream)
+        # one that may be put into by what the garbage collector calls, in the middle of a put
+        self._waiting: SimpleQueue[str | threading.Event] = SimpleQueue()
+        threading.Thread(target=self._write_all, name="macs-log", daemon=True).start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Never waits for the stream."""
+        try:
+            line = self.format(record)
+        except Exception:  # noqa: BLE001 - as every handler of logging does
+            self.handleError(record)
+            return
+        if self._waiting.qsize() >= self.MOST:
+            self.lost += 1
+        else:
+            self._waiting.put(line)
+
+    def flush(self) -> None:
+        """Wait until what was logged is written, but not for long."""
+        written = threading.Event()
+        self._waiting.put(written)
+        written.wait(self.LAST_S)
+
+    def _write_all(self) -> None:
+        while True:
+            item = self._waiting.get()
+            if (lost := self.lost - self._told) > 0:
+                self._told += lost
+                self._write(self.format(_lost_lines(lost)))
+            if isinstance(item, threading.Event):
+                item.set()
+            else:
+                self._write(item)
+
+    def _write(self, line: str) -> None:
+        with suppress(OSError, ValueError):  # nobody is there any more, and there is nobody to tell
+            if self._descriptor is None:
+                self._stream.write(line + "\n")
+                self._stream.flush()
+                return
+            left = memoryview((line + "\n").encode(self._stream.encoding or "utf-8", "backslashreplace"))
+            while left:  # past Python's own buffer, whose lock must be free when the program ends
+                try:
+                    left = left[os.write(self._descriptor, left) :]
+                except BlockingIOError:
+                    select.select([], [self._descriptor], [])
+
+
+def _descriptor(stream: TextIO) -> int | None:
+    """To be written to itself; None where the stream has to."""
+    with suppress(OSError, ValueError, AttributeError):
+        return stream.fileno() if os.name == "posix" else None
+    return None
+
+
+def _lost_lines(count: int) -> logging.LogRecord:
+    text = "%d lines of this log were lost: what it is written to took nothing"
+    return logging.LogRecord("macs.log", logging.WARNING, __file__, 0, text, (count,), None)
+
+
 def log_to_stderr() -> None:
     """Log to stderr, unless somebody has set that up before; other libraries only from WARNING on."""
     root = logging.getLogger()
     if not root.handlers:
-        root.addHandler(logging.StreamHandler())
+        root.addHandler(Written(sys.stderr))
         prefix_logs("")
 
 

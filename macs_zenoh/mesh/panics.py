@@ -49,13 +49,18 @@ def end_if_panic(error: object) -> None:
 def _end(error: object) -> None:
     """End the program: past all that would be cleaned up, as with an open session that would hang."""
     log.critical("Zenoh has panicked: %s; this program ends, exit code %d", error, PANICKED)
-    saying = threading.Thread(target=_say_last_words, name="macs-last-words", daemon=True)
-    saying.start()
-    saying.join(LAST_WORDS_S)
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(Exception):
-            stream.flush()
+    for last in (_say_last_words, _write_out):  # neither may keep this program from ending
+        ending = threading.Thread(target=last, name="macs-last-words", daemon=True)
+        ending.start()
+        ending.join(LAST_WORDS_S)
     os._exit(PANICKED)
+
+
+def _write_out() -> None:
+    """What was logged, and printed: nothing does that after `os._exit`."""
+    for written in (*logging.getLogger().handlers, sys.stdout, sys.stderr):
+        with suppress(Exception):
+            written.flush()
 
 
 def _say_last_words() -> None:

@@ -1,0 +1,59 @@
+"""The log is written by a thread of its own: all of it in the usual case, and nobody waits where it is not taken."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+
+from bridge.logs import PlainFormatter, Written
+from tests.support.programs import ROOT
+
+LINES = 3000
+LOGS = f"""
+import logging, os, sys
+from bridge.logs import log_to_stderr
+log_to_stderr()
+for number in range({LINES}):
+    logging.warning("line %d", number)
+"""
+
+
+def record(text: str) -> logging.LogRecord:
+    return logging.LogRecord("macs", logging.WARNING, __file__, 0, text, (), None)
+
+
+def test_all_is_written_when_a_program_ends() -> None:
+    """In its order, though the program ends at once."""
+    ended = subprocess.run([sys.executable, "-c", LOGS], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert [line.rpartition(" ")[2] for line in ended.stderr.splitlines()] == [str(n) for n in range(LINES)]
+
+
+def test_a_program_ends_though_nobody_takes_its_log() -> None:
+    """What does not fit into the pipe is lost, and the program is not."""
+    reads, writes = os.pipe()
+    try:
+        more = LOGS.replace("line %d", "line %d " + "." * 500)
+        subprocess.run([sys.executable, "-c", more], cwd=ROOT, stderr=writes, check=True, timeout=60)
+    finally:
+        os.close(reads)
+        os.close(writes)
+
+
+def test_lost_lines_are_counted() -> None:
+    """More than find room do not make anybody wait; the log says how many they were when it is taken again."""
+    reads, writes = os.pipe()
+    with os.fdopen(reads) as taken, os.fdopen(writes, "w") as stream:
+        log = Written(stream)
+        log.setFormatter(PlainFormatter())
+        for _ in range(log.MOST + 10_000):
+            log.handle(record("." * 100))
+        assert log.lost > 0
+        told = 0
+        for _ in range(log.MOST + 10_000 - log.lost):
+            while " lines of this log were lost" in (line := taken.readline()):
+                told += int(line.split(": ")[1].split()[0])
+            assert line.endswith("." * 100 + "\n")
+        assert told == log.lost
+        log.flush()
