@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 import shutil
@@ -12,28 +11,17 @@ import sys
 import pytest
 
 import macs_zenoh
-from tests.support.programs import ROOT, ended
+from tests.support.processes import finished
+from tests.support.programs import ended
 
 
 async def offered(line: str, **environment: str) -> list[str]:
     """What Tab offers behind a line."""
-    process = await asyncio.create_subprocess_exec(
-        *("bash", "-c", f"{sys.executable} -m bridge 8>&1 9>/dev/null 1>/dev/null"),
-        cwd=ROOT,
-        env={
-            **os.environ,
-            **environment,
-            "_ARGCOMPLETE": "1",
-            "_ARGCOMPLETE_IFS": "\n",
-            "COMP_LINE": line,
-            "COMP_POINT": str(len(line)),
-        },
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-    )
-    out, errors = await asyncio.wait_for(process.communicate(), 60)
-    assert errors == b""
-    return [word.strip() for word in out.decode().split("\n") if word.strip()]
+    asked = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "COMP_LINE": line, "COMP_POINT": str(len(line))}
+    command = f"{sys.executable} -m bridge 8>&1 9>/dev/null 1>/dev/null"
+    _, out, errors = await finished("bash", "-c", command, env={**environment, **asked})
+    assert errors == ""
+    return [word.strip() for word in out.split("\n") if word.strip()]
 
 
 async def test_words_are_completed() -> None:

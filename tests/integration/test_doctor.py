@@ -17,7 +17,7 @@ from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import LEASE, NAME, PRESENCE
 from tests.integration.test_access_rules import RULES, USERS, credentials
 from tests.support.certificates import Authority
-from tests.support.programs import ROOT, Program, free_port
+from tests.support.programs import ROOT, Program, ended, free_port
 from tests.support.routers import Router
 
 POLICY = """\
@@ -58,16 +58,9 @@ class Report:
 async def doctor(*argv: str, cfg: Sequence[str] = ()) -> Report:
     """Run `macs doctor --json` to its end."""
     options = [word for value in cfg for word in ("--cfg", value)]
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "bridge", "doctor", "--json", *argv, *options),
-        cwd=ROOT,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-    )
-    out, errors = await asyncio.wait_for(process.communicate(), 60)
-    assert process.returncode is not None
-    assert out, errors.decode()
-    return Report(process.returncode, json.loads(out))
+    code, out, errors = await ended("doctor", "--json", *argv, *options)
+    assert out, errors
+    return Report(code, json.loads(out))
 
 
 async def test_a_healthy_mesh_has_nothing_wrong() -> None:
@@ -464,16 +457,10 @@ async def test_settings_that_zenoh_does_not_forgive() -> None:
 async def test_people_get_text() -> None:
     """Without --json there are lines to read, without colours on a pipe, and nothing on stderr."""
     async with Router() as router:
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "bridge", "doctor", "--quick", "-e", router.endpoint),
-            cwd=ROOT,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-        )
-        out, errors = await asyncio.wait_for(process.communicate(), 60)
-    lines = out.decode().splitlines()
-    assert process.returncode == 0
+        code, out, errors = await ended("doctor", "--quick", "-e", router.endpoint)
+    lines = out.splitlines()
+    assert code == 0
     assert not errors
     assert lines[0] == "Routers"
     assert any(line.startswith(f"  ok       {router.endpoint}: Zenoh ") for line in lines)
-    assert "\033" not in out.decode()
+    assert "\033" not in out

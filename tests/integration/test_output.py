@@ -17,23 +17,17 @@ import pytest
 import macs_zenoh
 from bridge.headset.client import Headset
 from macs_zenoh import awareness
-from tests.support.programs import ROOT, Program, free_port
+from tests.support.processes import finished
+from tests.support.programs import Program, free_port
 
 
 async def shell(command: str, **env: str) -> tuple[int | None, str, str]:
     """A line of bash with pipefail; ``macs`` in it is ours."""
     macs = f"{shlex.quote(sys.executable)} -m bridge"
-    process = await asyncio.create_subprocess_exec(
-        *("bash", "-o", "pipefail", "-c", command.replace("macs ", f"{macs} ")),
-        cwd=ROOT,
-        env={**os.environ, **env},
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-    )
-    out, errors = await asyncio.wait_for(process.communicate(), 60)
-    assert b"Traceback" not in errors, errors.decode()
-    assert b"Exception ignored" not in errors, errors.decode()
-    return process.returncode, out.decode(errors="surrogateescape"), errors.decode()
+    code, out, errors = await finished("bash", "-o", "pipefail", "-c", command.replace("macs ", f"{macs} "), env=env)
+    assert "Traceback" not in errors, errors
+    assert "Exception ignored" not in errors, errors
+    return code, out, errors
 
 
 @pytest.mark.parametrize("verb", ["keys", "keys --json", "--help", "ls --help", "headset 127.0.0.1 pub --help"])

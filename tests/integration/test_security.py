@@ -918,15 +918,6 @@ async def test_a_gateway_keeps_to_its_blocks(site: Site) -> None:
 # -- the command -----------------------------------------------------------------------------------------------------
 
 
-async def run(*argv: str) -> tuple[int, str, str]:
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "bridge", *argv, cwd=ROOT, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
-    )
-    out, errors = await asyncio.wait_for(process.communicate(), 60)
-    assert process.returncode is not None
-    return process.returncode, out.decode(), errors.decode()
-
-
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 async def test_a_check_that_was_stopped_is_none_that_went_well(how: signal.Signals, tmp_path: Path) -> None:
     """Ctrl-C or SIGTERM in the middle of a check ends it with 130."""
@@ -957,7 +948,7 @@ async def test_a_check_without_a_router_gives_up(tmp_path: Path) -> None:
     plan_file = tmp_path / "policy.yaml"
     plan_file.write_text(f"routers: [{{name: site, addresses: [127.0.0.1], listen: ['{nowhere}']}}]" + CLIENTS)
     began = time.monotonic()
-    code, out, errors = await run(
+    code, out, errors = await ended(
         "security", "check", str(plan_file), "--dir", str(found.directory), "-e", nowhere, "--timeout", "1"
     )
     assert time.monotonic() - began < 10, "1 s, and the start of a program on a busy machine"
@@ -971,7 +962,7 @@ async def test_the_command_generates_and_checks(tmp_path: Path) -> None:
     routers = f"routers: [{{name: site, addresses: [127.0.0.1], listen: ['{found.router('site')[0]}']}}]"
     (tmp_path / "policy.yaml").write_text(routers + CLIENTS)
     pki = str(tmp_path / "pki")
-    code, out, _ = await run("security", "generate", str(tmp_path / "policy.yaml"), "--into", pki)
+    code, out, _ = await ended("security", "generate", str(tmp_path / "policy.yaml"), "--into", pki)
     assert code == 0
     assert "7 certificates made, 0 kept, 7 files written" in out
     told = await macs(
@@ -980,16 +971,16 @@ async def test_the_command_generates_and_checks(tmp_path: Path) -> None:
     assert [one["name"] for one in told["certificates"] if one["made"]] == ["anna"]
     assert (told["written"], told["restart"]) == ([], [])
 
-    code, out, errors = await run("security", "check", str(tmp_path / "policy.yaml"), "--dir", pki)
+    code, out, errors = await ended("security", "check", str(tmp_path / "policy.yaml"), "--dir", pki)
     assert (code, out) == (1, "")
     assert "nobody listens there" in errors
     async with Router(tmp_path / "pki" / "site" / "router.json5"):
-        code, out, _ = await run("security", "check", str(tmp_path / "policy.yaml"), "--dir", pki)
+        code, out, _ = await ended("security", "check", str(tmp_path / "policy.yaml"), "--dir", pki)
         assert code == 0, out
         assert out.endswith(" 0 not\n")
         results = await macs("security", "check", str(tmp_path / "policy.yaml"), "--dir", pki, "--json")
         assert all(result["as_expected"] for result in results)
     (tmp_path / "policy.yaml").write_text(routers + CLIENTS.replace("robot-7, id", "robot-7, idd"))
-    code, _, errors = await run("security", "generate", str(tmp_path / "policy.yaml"), "--into", pki)
+    code, _, errors = await ended("security", "generate", str(tmp_path / "policy.yaml"), "--into", pki)
     assert code == 2
     assert "did you mean `id`?" in errors

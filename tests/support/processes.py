@@ -136,3 +136,21 @@ class Process:
                 self.log.append(line)
             if self._heard(line, is_log=is_log):
                 self._ready.set()
+
+
+async def finished(*command: str, env: Mapping[str, str] | None = None) -> tuple[int, str, str]:
+    """Run a command to its end: exit code, standard output, standard error. It is killed when it takes too long."""
+    process = await asyncio.create_subprocess_exec(
+        *command,
+        cwd=ROOT,
+        env={**os.environ, **(env or {})},
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        out, errors = await asyncio.wait_for(process.communicate(), START_S)
+    finally:
+        if process.returncode is None:
+            process.kill()
+    assert process.returncode is not None
+    return process.returncode, out.decode(errors="surrogateescape"), errors.decode(errors="surrogateescape")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import socket
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tests.support.processes import ROOT, START_S, Process
+from tests.support.processes import ROOT as ROOT
+from tests.support.processes import Process, finished
 
 READY = "ready: "
 
@@ -46,13 +46,9 @@ class Program(Process):
         return is_ready
 
 
-async def ended(*argv: str) -> tuple[int | None, str, str]:
+async def ended(*argv: str) -> tuple[int, str, str]:
     """Run ``macs ...`` to its end: exit code, stdout, stderr."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "bridge", *argv, cwd=ROOT, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
-    )
-    out, errors = await asyncio.wait_for(process.communicate(), START_S)
-    return process.returncode, out.decode(), errors.decode()
+    return await finished(sys.executable, "-m", "bridge", *argv)
 
 
 async def macs(*argv: str) -> Any:
