@@ -332,7 +332,7 @@ BEFORE = {
 """The files that recorded the situation in which a file begins, in order."""
 
 SETTINGS: dict[str, dict[str, Any]] = {
-    "router/rosagent_killed_prune": {"handshake_timeout_s": 1.5, "idle_timeout_s": 1.5},
+    "router/rosagent_killed_prune": {"handshake_timeout_s": 4.0, "idle_timeout_s": 4.0},
     "router/bad_data_exchange_types": {"tell_refusals": False},
     "router/type4_second_registrant_must_fail": {"tell_refusals": False},
 }

@@ -24,6 +24,7 @@ from bridge.security.check import check
 from bridge.security.files import client_overrides
 from bridge.security.generate import generate
 from bridge.security.policy import Policy
+from bridge.settings import load
 from macs_zenoh import awareness, config
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import NotServed, Refused, Unreachable
@@ -32,6 +33,7 @@ from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.protocol.named import Outcome
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.sections import changed
 from macs_zenoh.streams import Streams
 from tests.integration.test_reliable import Numbers, Stream
 from tests.support.programs import ROOT, Program, ended, free_port, macs
@@ -69,7 +71,7 @@ class Site:
 
     def settings(self, name: str) -> MeshSettings:
         """What a node's own settings file says."""
-        return config.load(self.directory / name / "macs.toml").mesh
+        return load(self.directory / name / "macs.toml").mesh
 
     def file(self, name: str = "site") -> Path:
         return self.directory / name / "router.json5"
@@ -79,7 +81,7 @@ class Site:
         """A session with a node's certificate, on the first router or the one named."""
         settings = self.settings(name)
         if router is not None:
-            settings = config.changed(settings, connect=self.router(router))
+            settings = changed(settings, connect=self.router(router))
         async with await Mesh.open_once(settings, timeout_s=10) as mesh:
             yield mesh
 
@@ -417,7 +419,7 @@ async def test_a_client_is_no_router(site: Site) -> None:
         ],
     )
     async with await Mesh.open(fake):
-        victim = config.changed(site.settings("robot-7"), connect=[f"tls/127.0.0.1:{port}"])
+        victim = changed(site.settings("robot-7"), connect=[f"tls/127.0.0.1:{port}"])
         with pytest.raises(Unreachable):
             await Mesh.open_once(victim, timeout_s=3)
 
@@ -425,7 +427,7 @@ async def test_a_client_is_no_router(site: Site) -> None:
 async def test_a_client_that_says_it_is_a_router_may_no_more(site: Site) -> None:
     """A client's certificate opens a session as a router as well, which Zenoh cannot refuse; what it may put, hear and
     declare there is the same."""
-    stolen = config.changed(site.settings("robot-8"), mode="router", listen=[f"tcp/127.0.0.1:{free_port()}"])
+    stolen = changed(site.settings("robot-8"), mode="router", listen=[f"tcp/127.0.0.1:{free_port()}"])
     async with (
         site.session("robot-7") as robot,
         site.session("hall-2") as hall,
@@ -905,9 +907,9 @@ async def test_a_gateway_keeps_to_its_blocks(site: Site) -> None:
     """A second gateway with the same certificate finds no block that it may have."""
     settings = str(site.directory / "hall-1" / "macs.toml")
     async with Program("gateway", "--settings", settings, "--port", "0"):
-        loaded = config.load(settings)
+        loaded = load(settings)
         async with await Mesh.open_once(loaded.mesh, timeout_s=10) as mesh:
-            second = Gateway(mesh, config.changed(loaded.gateway, port=0))
+            second = Gateway(mesh, changed(loaded.gateway, port=0))
             try:
                 with pytest.raises(Unreachable, match="all that this gateway may have"):
                     await second.start()

@@ -12,6 +12,7 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.serialization import deserialize_message, serialize_message
 
+from bridge.headset import actions
 from bridge.headset.actions import ABORTED, CANCELED, SUCCEEDED, ActionClient, Goal
 from bridge.headset.frames import NodeSpec
 from bridge.headset.nodes import Incoming
@@ -86,6 +87,13 @@ class Headset:
         self.heard += 1
         if self.online:
             self.client.receive(Incoming(metadata, data))
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a headset waits for may take as long as a busy machine needs."""
+    within = actions._within
+    monkeypatch.setattr(actions, "_within", lambda future, what, timeout_s: within(future, what, PATIENCE_S))
 
 
 @pytest.fixture

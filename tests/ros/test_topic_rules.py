@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import AsyncIterator
 
 import pytest
@@ -68,6 +69,7 @@ async def test_a_limited_topic_sends_the_latest(
     """Of 200 Hz for a second, about 10 messages are sent, and the last one is among them."""
     await nodes.add(adding("/fast"))
     publisher = await peer.publisher(String, "/fast", matched=1)
+    began = time.monotonic()
     for number in range(200):
         publisher.publish(String(data=str(number)))
         await asyncio.sleep(0.005)
@@ -76,7 +78,7 @@ async def test_a_limited_topic_sends_the_latest(
         frame = parse_frame(await get(frames))
         sent.append(int(deserialize_message(bytes(frame.body), String).data))
     assert sent == sorted(sent)
-    assert 8 <= len(sent) <= 25  # 10 per second; a busy machine needs longer than a second for 200
+    assert 8 <= len(sent) <= 2 + 10 * (time.monotonic() - began)  # a busy machine needs longer than a second for 200
 
 
 async def test_what_waits_for_its_time_goes_straight_into_the_mesh(session: RosSession, peer: Peer) -> None:
