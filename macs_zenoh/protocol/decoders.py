@@ -158,7 +158,9 @@ class FrameDecoder:
                 frames.append(error.with_traceback(None))
                 start = stop
                 continue
-            if self.runs and stop != end and not management_bytes:
+            # most frames that begin differently differ in their headers, which are short
+            following = data[stop : stop + header_bytes]
+            if self.runs and not management_bytes and following == data[start : start + header_bytes]:
                 stop = run_end(data, start, body_at, size, min(end, start + RUN_BYTES))
             piece = bytes(view[start:stop])
             if stop - start == size:
