@@ -204,7 +204,7 @@ async def test_online(start: Start, robot: EchoRobot) -> None:
 
 async def test_a_topic_is_published_and_received(start: Start, robot: EchoRobot) -> None:
     """What one headset publishes, typed from JSON, another one receives typed, in order, each message once."""
-    subscriber = await start("sub", "/talk", "std_msgs/String", "--count", "3", "--timeout", "20")
+    subscriber = await start("sub", "/talk", "std_msgs/String", "--count", "3", "--timeout", "90")
     await robot.registered(NodeType.SUBSCRIBER, "nd__talk")
     publisher = await start("pub", "/talk", "std_msgs/String", '{"data": "$i"}', "--count", "3", "--settle", "0.2")
     code, lines, log = await publisher.end()
@@ -469,7 +469,7 @@ KNOWN = Functionality(
 async def test_a_type_that_robots_offer_need_not_be_named(start: Start, robot: EchoRobot) -> None:
     """`sub`, `pub` and `call` take the type of a topic or service from the robots; options may stand anywhere."""
     robot.offers = KNOWN
-    subscriber = await start("sub", "/talk", "--count", "2", "--timeout", "20")
+    subscriber = await start("sub", "/talk", "--count", "2", "--timeout", "90")
     await robot.registered(NodeType.SUBSCRIBER, "nd__talk")
     for words in (["/talk", '{"data": "a"}', "--settle", "0.2"], ["/talk", "--settle", "0.2", '{"data": "a"}']):
         code, lines, log = await (await start("pub", *words)).end()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import importlib.util
 import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -218,3 +220,49 @@ def test_help_needs_no_zenoh() -> None:
     """A command line that only explains itself loads neither Zenoh nor asyncio's programs."""
     code = "import sys, bridge.cli; bridge.cli.build_parser(); sys.exit('zenoh' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+OURS = ("macs_zenoh", "bridge")
+OTHERS = sorted(path for folder in ("tests", "benchmarks", "examples") for path in (ROOT / folder).rglob("*.py"))
+
+
+def test_tests_and_benchmarks_name_what_exists() -> None:
+    """Whatever tests, benchmarks and examples import of us is there, and so is each attribute of a module of ours
+    that they use: else only a whole run would tell of a name that has moved."""
+    gone = [f"{path.relative_to(ROOT)}:{line} {name}" for path in OTHERS for line, name in nowhere(path)]
+    assert gone == []
+
+
+def nowhere(path: Path) -> Iterator[tuple[int, str]]:
+    """Names of ours in a file that do not exist, with their lines. What needs ROS is looked at where ROS is."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    nodes = list(ast.walk(tree))
+    modules: dict[str, ModuleType] = {}
+    for node in nodes:
+        if not isinstance(node, ast.ImportFrom) or node.level or not (node.module or "").startswith(OURS):
+            continue
+        try:
+            module = importlib.import_module(node.module or "")
+        except ModuleNotFoundError as error:
+            if (error.name or "").startswith(OURS):
+                yield node.lineno, str(node.module)
+            continue
+        for alias in node.names:
+            if not hasattr(module, alias.name) and _submodule(module, alias.name) is None:
+                yield node.lineno, f"{node.module}.{alias.name}"
+            elif isinstance(found := getattr(module, alias.name), ModuleType):
+                modules[alias.asname or alias.name] = found
+    hidden = {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+    hidden |= {node.arg for node in nodes if isinstance(node, ast.arg)}
+    for node in nodes:
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id not in hidden:
+            used = modules.get(node.value.id)
+            if used is not None and not hasattr(used, node.attr):
+                yield node.lineno, f"{used.__name__}.{node.attr}"
+
+
+def _submodule(module: ModuleType, name: str) -> ModuleType | None:
+    try:
+        return importlib.import_module(f"{module.__name__}.{name}")
+    except ModuleNotFoundError:
+        return None
