@@ -91,7 +91,7 @@ class Presses:
         if presses(data):
             for robot in robots:
                 self._press(sender, robot)
-            return REPLACES if self._held.pop(sender, None) else GOES
+            return REPLACES if self._drop_releases(sender, robots) else GOES
         held, where = self._held.get(sender, {}), header[:3]
         if not self._is_asking(sender, robots) or (where not in held and len(held) >= HELD):
             return GOES
@@ -111,6 +111,16 @@ class Presses:
         for task in self._tasks:
             task.cancel()
 
+    def _drop_releases(self, sender: Sender, robots: set[int]) -> bool:
+        """Those that would follow a press on one of these robots."""
+        held = self._held.get(sender, {})
+        dropped = [where for where, release in held.items() if not release.robots.isdisjoint(robots)]
+        for where in dropped:
+            del held[where]
+        if not held:
+            self._held.pop(sender, None)
+        return bool(dropped)
+
     def _is_asking(self, sender: Sender, robots: Iterable[int]) -> bool:
         return any((sender, robot) in self._unsettled for robot in robots)
 
@@ -121,7 +131,8 @@ class Presses:
             return ()
         groups = set(header.groups)
         members = (agent.id for agent in self._directory if agent.type == ROS and agent.group in groups)
-        return {*header.ids, *(members if groups else ())}
+        online = (robot for robot in header.ids if (ROS, robot) in self._directory)
+        return {*online, *(members if groups else ())}
 
     def _press(self, sender: Sender, robot: int) -> None:
         about, now = (sender, robot), self._loop.time()

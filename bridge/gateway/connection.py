@@ -53,6 +53,9 @@ IN_FLIGHT = 4
 """While senders are held, so many times the outbox's limit may wait beyond it: what is on its way from those behind
 other gateways."""
 
+DRIVES_S = 1.0
+"""So long after a command its sender counts as driving."""
+
 READ_S = 0.02
 """How long what waits in a socket has before the agent's time is looked at again."""
 
@@ -123,6 +126,8 @@ class Connection(asyncio.BufferedProtocol):
         self._timer: asyncio.TimerHandle | None = None
         self._told: dict[Hashable, float] = {}
         """What the agent was told of its rights, and when."""
+        self.drove_at = -math.inf
+        """When it sent a robot a command last."""
         self._refused = False
         self._pauses = 0
         self._spent_s = 0.0
@@ -434,7 +439,7 @@ class Connection(asyncio.BufferedProtocol):
         level = logging.INFO if reason == "went offline" else logging.WARNING
         level = logging.DEBUG if self._not_let_in else level
         log.log(level, "%s leaves: %s", self, reason)
-        self._writer.close()
+        self._writer.close(self._write_timeout_s)
 
     def finish(self, reason: str) -> None:
         """Send all that waits, then FIN; `abort` whoever does not take it in time."""
@@ -479,6 +484,12 @@ class Connection(asyncio.BufferedProtocol):
             self.close("its host does not answer")
         if self.peer.state is not State.GONE:
             self._schedule()
+
+    @property
+    def drives(self) -> bool:
+        """Whether it has sent a robot a command a moment ago. Nobody who drives is held back for what else he sends,
+        since his stop would wait behind that; what there is no room for is dropped."""
+        return time.monotonic() < self.drove_at + DRIVES_S
 
     def is_away(self, now: float) -> bool:
         """Whether nothing was heard of the agent for a while, though it is connected."""

@@ -425,7 +425,8 @@ class Delivery:
             if not receiver.congested:
                 continue
             if (connection := self._agents.find(*sender)) is not None:
-                receiver.backpressure.hold(connection, receiver.moved)
+                if not connection.drives:
+                    receiver.backpressure.hold(connection, receiver.moved)
             else:
                 self._afar.hold(sender, receiver)
 

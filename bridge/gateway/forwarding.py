@@ -24,6 +24,7 @@ from .agents import Agents
 from .backpressure import Backpressure
 from .connection import Connection
 from .judged import JudgedFrames, Read
+from .latest import Latest
 from .routes import Route, Routes
 
 PUBLISHER = int(NodeType.PUBLISHER)
@@ -62,8 +63,7 @@ class Forwarding:
         """By where they go, in the order in which they began."""
         self._apart = True
         """Whether no two of them can have a receiver in common, so that their order does not matter."""
-        self._waited: dict[tuple[bytes, str], tuple[Route, Sent]] = {}
-        """Commands that have waited in their connection, the newest of each kind, until all that came is seen."""
+        self._latest = Latest(lambda route, newest: self._put(route.keys, newest.frame.data, COMMAND))
         self._presses = Presses(mesh, directory)
         self._flooding: dict[Connection, float] = {}
         """Who is not read from for having flooded, and until when."""
@@ -76,17 +76,20 @@ class Forwarding:
 
     def leave(self, connection: Connection) -> None:
         """It has ended."""
+        self._latest.go(connection)
         self._presses.leave(connection.key)
         self._routes.pop(connection, None)
         self.afar.leave(connection)
 
     def close(self) -> None:
         """Nothing is forwarded any more."""
+        self._latest.close()
         self._presses.close()
 
     def forget(self, connection: Connection) -> None:
         """It is about to have another id: what it sent goes under the one that it had."""
         self.flush()
+        self._latest.go(connection)
         self._presses.leave(connection.key)
         self._routes[connection].forget()
 
@@ -130,10 +133,8 @@ class Forwarding:
         """All that one read of a socket brought is forwarded."""
         if self._runs:
             self.flush()
-        if self._waited:
-            waited, self._waited = self._waited, {}
-            for route, newest in waited.values():
-                self._put(route.keys, newest.frame.data, COMMAND)
+        if connection.drives:
+            return
         if self._slowed and connection in self._slowed:
             self.afar.has_read(connection)
         if self._mesh.backlogged:
@@ -188,28 +189,31 @@ class Forwarding:
     def _may_go(self, connection: Connection, sent: Sent, route: Route, traffic: Traffic) -> bool:
         """Whether a frame to robots goes on now; a command that has waited may, after all that came with it."""
         now, count, metadata = time.monotonic(), sent.frame.count, sent.metadata
-        if traffic is COMMAND:
-            may_stop = metadata.data_exchange_type in STOP_TYPES
-            if may_stop and metadata.node_name == STOP_NAME and self._waits_for_stop(connection, sent, route):
-                return False
-            passing = connection.pace.command(count, now, may_stop=may_stop)
-        else:
+        if traffic is not COMMAND:
             passing = connection.pace.request(count, now)
-        if passing is Passing.NOW:
-            if self._waited and self._waited.pop((sent.frame.destination, metadata.node_name), None) is not None:
-                connection.complain("too_old", "commands that waited with newer ones")
-            return True
+        elif metadata.data_exchange_type in STOP_TYPES:
+            return metadata.node_name != STOP_NAME or not self._waits_for_stop(connection, sent, route)
+        else:
+            passing = connection.pace.command((sent.frame.destination, metadata.node_name), count, now)
         if passing is Passing.FLOODED:
             connection.complain("flooded", "it sends robots more than one agent may", count)
             self._slow_down(connection, now)
-            return False
-        newest = sent.frame.each()[-1]
-        held = (sent.frame.destination, metadata.node_name)
-        older = count - 1 + (self._waited.pop(held, None) is not None)
-        self._waited[held] = (route, Sent(newest, metadata))
+        elif traffic is COMMAND:
+            connection.drove_at = now
+            self._keep_latest(connection, sent, route, passing)
+        return passing is Passing.NOW
+
+    def _keep_latest(self, connection: Connection, sent: Sent, route: Route, passing: Passing) -> None:
+        """Of commands that have waited the newest is kept; one that goes on now takes its place."""
+        kind = sent.frame.destination, sent.metadata.node_name
+        if passing is Passing.NOW:
+            older = int(self._latest.supersede(connection, kind))
+        else:
+            *_, newest = sent.frame.each()
+            older = sent.frame.count - 1
+            older += self._latest.hold(connection, kind, route, Sent(newest, sent.metadata, sent.readable))
         if older:
             connection.complain("too_old", "commands that waited with newer ones", older)
-        return False
 
     def _slow_down(self, connection: Connection, now: float) -> None:
         """What is dropped has to be read first, which costs others the time of the loop: all who flood have a small

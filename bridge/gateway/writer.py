@@ -124,12 +124,14 @@ class Writer:
             while self._outbox and self.paused_at is None:  # writing may pause us again
                 self.write(self._outbox.take(BUFFER_BYTES))
 
-    def close(self) -> None:
-        """Write what is gathered, then FIN; who does not read is cut, since that would wait for ever."""
+    def close(self, most_s: float) -> None:
+        """Write what is gathered, then FIN. Who does not read is cut, at once or after ``most_s``, since a transport
+        that still has something to write waits for ever."""
         with self._lock:
             self.flush()
             if self.paused_at is None:
                 self._transport.close()
+                asyncio.get_running_loop().call_later(most_s, self._transport.abort)
             else:
                 self._transport.abort()
 

@@ -22,6 +22,9 @@ from .threads import keep_attached
 
 log = logging.getLogger("macs.mesh")
 
+WAITING = 1024
+"""So many calls that no gate admits may wait to be looked at; what is more has no answer."""
+
 HOLDER = re.compile(r"([0-9]{1,3})/([0-9]{1,5})")
 """Who has what was refused: agent type and id."""
 
@@ -161,6 +164,10 @@ class Calls:
                 if not gate.admits(str(query.key_expr), size, False, now_s()):
                     query.drop()  # type: ignore[no-untyped-call]
                     return
+            elif len(self._arrivals.asked) >= WAITING:
+                self._outgoing.drops.note("flooded", key, "more is asked than can be answered")
+                query.drop()  # type: ignore[no-untyped-call]
+                return
             self._arrivals.asked.append(query)
             self._from_thread(spawn, query, problem)
 

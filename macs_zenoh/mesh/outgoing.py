@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections import Counter, OrderedDict, deque
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ import zenoh.ext
 
 from macs_zenoh.config import Priority
 from macs_zenoh.handles import Callbacks, Handle
+from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.keyexpr import NAMED_ALL, STREAM
 from macs_zenoh.protocol.policing import Policer, Policy
 
@@ -77,7 +78,7 @@ class Outgoing:
         session: zenoh.Session,
         loopback: Loopback,
         policer: Policer,
-        drops: Counter[str],
+        drops: Losses,
         *,
         linked: bool,
         backlog_bytes: int,

@@ -3,12 +3,14 @@
 A robot drops what is too much for it, but on the way there it would fill the links that others' stops go over. And
 only the gateway can see that commands waited in the agent's own connection: a headset whose Wi-Fi stood still for a
 minute sends all that it said meanwhile at once, and no stamp tells how old it is. So after a gap in a flow of
-commands, of those that come together only the newest of each kind goes on.
+commands, while they come faster than they were ever said, only the newest of each kind goes on, when no newer one has
+come for `TOGETHER_S`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from enum import Enum
 
 from .credit import Credit
@@ -21,52 +23,109 @@ class Passing(Enum):
     FLOODED = "flooded"
     """More than the agent may send."""
     WAITED = "waited"
-    """It has waited: only the newest of its kind goes on, when the rest of what came with it has been seen."""
+    """It has waited, or may have: only the newest of its kind goes on, when none has come for `TOGETHER_S`."""
 
 
 NOW, FLOODED, WAITED = Passing.NOW, Passing.FLOODED, Passing.WAITED
 
 
+TOGETHER_S = 0.05
+"""What has waited comes with smaller gaps than this, as far as they are not the network's."""
+
+
+class Flow:
+    """Commands of one kind: those to one interface node of the same robots."""
+
+    LENGTH = 5
+    """So many commands, each soon after the one before, are a flow: somebody drives."""
+    LEAST_S, MOST_S = 0.002, 0.5
+    """What comes faster comes together, as programs send it that have several things to say; what comes slower is no
+    flow."""
+    GAP_S = 1.0
+    """A flow that has a gap of so long has stood still, or somebody has stopped driving for a moment."""
+    LATE_S = 1.0
+    """For so long at most commands count as having waited."""
+    PACED = 3
+    """So many in a row that come like the flow before the gap have not waited."""
+    MEAN_OF = 16
+
+    def __init__(self) -> None:
+        self._last = -math.inf
+        self._length = 0
+        self._usual_s = 0.0
+        """The mean gap between two commands."""
+        self._late_since: float | None = None
+        self._late = 0
+        """How many came since."""
+        self._paced = 0
+
+    @property
+    def drives(self) -> bool:
+        """Whether it is one: not a command now and then."""
+        return self._length >= self.LENGTH or self._late_since is not None
+
+    def has_waited(self, count: int, now: float) -> bool:
+        """Whether commands that come at this time may be older than that."""
+        gap, self._last = now - self._last, now
+        if self._late_since is not None and now - self._late_since < self.LATE_S:
+            return self._still_late(count, gap, now - self._late_since)
+        self._late_since = None
+        if gap > self.GAP_S and self._length >= self.LENGTH:
+            self._length, self._late_since, self._late, self._paced = 0, now, count, 0
+            return True
+        if gap > self.MOST_S:
+            self._length, self._usual_s = 0, 0.0
+            return False
+        each_s = gap / count
+        self._usual_s += (each_s - self._usual_s) / self.MEAN_OF if self._usual_s else each_s
+        if gap >= self.LEAST_S and count == 1:
+            self._length += 1
+        return False
+
+    def _still_late(self, count: int, gap: float, late_s: float) -> bool:
+        """A flow that has merely paused goes on as it was; what has waited comes as fast as the network takes it."""
+        self._late += count
+        if self._late <= 1 + 2 * late_s / max(self._usual_s, 1e-9):
+            return False
+        self._paced = self._paced + 1 if count == 1 and gap >= self._usual_s / 2 else 0
+        if self._paced < self.PACED:
+            return True
+        self._late_since = None
+        return False
+
+
 class Pace:
     """Of one connection."""
 
-    FLOW = 5
-    """So many commands, each soon after the one before, are a flow: somebody drives."""
-    LEAST_S, MOST_S = 0.002, 0.5
-    """What comes faster is a burst, as programs send it that have several things to say; what comes slower no flow."""
-    GAP_S = 1.0
-    """A flow that has a gap of so long has stood still, or somebody has stopped driving for a moment."""
-    TOGETHER_S = 0.05
-    LATE_S = 1.0
-    """For so long at most commands count as having waited."""
+    KINDS = 256
+    """So many flows are known; of more than these the one that began first is forgotten."""
 
     def __init__(self, commands_per_s: float, requests_per_s: float, now: float) -> None:
         self._commands = Credit(commands_per_s, now)
         self._requests = Credit(requests_per_s, now)
+        self._flows: dict[Hashable, Flow] = {}
         self._last = -math.inf
-        self._flow = 0
-        self._late_since: float | None = None
+        self._late_until = -math.inf
+        """So long what is no flow counts as having waited, too: it came with what has."""
 
     def request(self, count: int, now: float) -> Passing:
         """Of so many messages that are no commands."""
         return NOW if self._requests.take(count, now) else FLOODED
 
-    def command(self, count: int, now: float, *, may_stop: bool = False) -> Passing:
-        """Of so many commands that came together. One that may be an emergency stop is never held back."""
-        gap, self._last = now - self._last, now
-        if may_stop:
-            return NOW
+    def command(self, kind: Hashable, count: int, now: float) -> Passing:
+        """Of so many commands of one kind that came together; of those that may be an emergency stop nobody asks."""
         if not self._commands.take(count, now):
             return FLOODED
-        if self._late_since is not None:
-            if gap < self.TOGETHER_S and now - self._late_since < self.LATE_S:
-                return WAITED
-            self._late_since = None
-        if gap > self.GAP_S and self._flow >= self.FLOW:
-            self._flow, self._late_since = 0, now
-            return WAITED
-        if count > 1 or gap < self.LEAST_S or gap > self.MOST_S:
-            self._flow = 0
-        else:
-            self._flow += 1
-        return NOW
+        flow = self._flows.get(kind)
+        if flow is None:
+            if len(self._flows) >= self.KINDS:
+                del self._flows[next(iter(self._flows))]
+            flow = self._flows[kind] = Flow()
+        gap, self._last = now - self._last, now
+        if gap > Flow.GAP_S and any(each.drives for each in self._flows.values()):
+            self._late_until = now + TOGETHER_S
+        drives = flow.drives
+        waited = flow.has_waited(count, now)
+        if waited:
+            self._late_until = now + TOGETHER_S
+        return WAITED if waited or (not drives and now < self._late_until) else NOW

@@ -174,18 +174,38 @@ async def test_a_question_that_is_lost_keeps_no_other_from_being_asked(
 
 async def test_an_agent_asks_for_its_own_stop(router: str) -> None:
     """What a program on the mesh sends on the topic of the stop is asked for as well, and its release waits."""
-    async with (
-        macs_zenoh.join("ros", id=7, connect=[router]) as agent,
-        macs_zenoh.join("unity", id=300, connect=[router]) as presser,
-    ):
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
         robot = Slow(agent)
-        await until(lambda: (1, 7) in presser.directory)
-        for data in (PRESS, RELEASE):
-            presser.send(data, to="ros", ids=[7], metadata=STOP)
-        await until(lambda: {PRESS, b"asked true"} <= set(robot.came))
-        assert RELEASE not in robot.came
-        robot.answer.set()
-        await until(lambda: RELEASE in robot.came)
+        async with macs_zenoh.join("unity", id=300, connect=[router]) as presser:
+            await until(lambda: (1, 7) in presser.directory)
+            for data in (PRESS, RELEASE):
+                presser.send(data, to="ros", ids=[7], metadata=STOP)
+            await until(lambda: {PRESS, b"asked true"} <= set(robot.came))
+            assert RELEASE not in robot.came
+            robot.answer.set()
+            await until(lambda: RELEASE in robot.came)
+
+
+async def test_a_press_drops_releases_of_the_same_robots_only(
+    router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """A release for one robot waits for the question to it, and is not lost when the other one is stopped."""
+    gateway = await start_gateway()
+    async with (
+        macs_zenoh.join("ros", id=7, connect=[router]) as seven,
+        macs_zenoh.join("ros", id=8, connect=[router]) as eight,
+    ):
+        robots = Slow(seven), Slow(eight)
+        headset = await connect(gateway)
+        await until(lambda: {(1, 7), (1, 8)} <= {agent.key for agent in gateway.directory})
+        await headset.send_frame(said(PRESS, ids=(7,)))
+        await until(lambda: b"asked true" in robots[0].came)
+        await headset.send_frame(said(RELEASE, ids=(7,)) + said(PRESS, ids=(8,)))
+        await until(lambda: b"asked true" in robots[1].came)
+        for robot in robots:
+            robot.answer.set()
+        await until(lambda: RELEASE in robots[0].came)
+        assert RELEASE not in robots[1].came
 
 
 async def test_what_an_agent_released_is_sent_before_it_leaves(router: str) -> None:
