@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 import pytest
 
@@ -12,9 +14,11 @@ from bridge.gateway.server import Gateway
 from bridge.headset.client import Headset
 from bridge.settings import GatewaySettings
 from macs_zenoh.config import MeshSettings
+from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.mesh.outgoing import Outgoing
 from macs_zenoh.protocol.keyexpr import PING
+from tests.support.local import patient
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
 
@@ -164,3 +168,30 @@ async def test_a_zenoh_id_is_its_owners_secret(router: str) -> None:
             assert await watcher.query(PING.of(zid=agent.mesh.zid), b"", timeout_s=PATIENCE_S)
         await gateway.close()
         assert chosen.zid == "abc"
+
+
+async def test_of_calls_that_no_gate_admits_so_many_wait_at_most(router: str) -> None:
+    """While the loop is busy 1 024 calls wait; what is more has no answer, and is counted."""
+    count = 3000
+
+    async def answer(key: str, payload: bytes) -> bytes:
+        return payload
+
+    here = patient(router)
+    async with await Mesh.open(here) as server, await Mesh.open(here) as client:
+        serving = server.serve("macs/ping/here", answer)
+
+        async def asks() -> bool:
+            with suppress(MacsError):
+                return await client.query("macs/ping/here", b"x", timeout_s=5) == b"x"
+            return False
+
+        await until(asks)
+        asking = [asyncio.ensure_future(asks()) for _ in range(count)]
+        await asyncio.sleep(0)  # now all of them have asked
+        deadline = time.monotonic() + 30
+        while not server.drops["flooded"] and time.monotonic() < deadline:
+            time.sleep(0.05)
+        answered = sum(await asyncio.gather(*asking))
+        assert 0 < count - answered == server.drops["flooded"]
+        serving.close()

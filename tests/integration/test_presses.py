@@ -51,8 +51,13 @@ async def test_a_press_is_asked_for_as_well(
         asked = Asked(robot)
         headset = await connect(gateway)
         await until(lambda: (1, 7) in gateway.directory)
-        await headset.send_frame(frame)
-        await until(lambda: asked.calls)
+
+        async def is_asked() -> bool:
+            await headset.send_frame(frame)
+            return bool(asked.calls)
+
+        # the gateway may hear of the robot before it hears that it can be asked
+        await until(is_asked, every_s=presses.AGAIN_S)
         call = asked.calls[0]
         assert (call.sender_type, call.sender_id, call.data) == ("unity", headset.id, b"true")
         assert call.metadata.node_name == STOP.node_name
