@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import struct
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -288,6 +289,49 @@ async def test_a_stalled_headset_is_let_go(router: str, start_gateway: StartGate
                 received += 1
         assert received > 10
         assert gateway.drops["node_full_oldest"] or gateway.drops["outbox_full"]
+
+
+async def test_who_leaves_without_taking_what_waits_is_gone_in_time(
+    start_gateway: StartGateway, connect: Connect
+) -> None:
+    """A headset that has stopped reading goes silent before its outbox is full: what is still to be written keeps
+    neither its id nor its slot."""
+    gateway = await start_gateway(write_timeout_s=0.5, idle_timeout_s=3.0)
+    neighbour, frozen = await connect(gateway), await connect(gateway)
+    await until(lambda: gateway.agents.find(2, frozen.id))
+    connection = gateway.agents.find(2, frozen.id)
+    frozen.pause()
+    message = encode_frame(2, (frozen.id,), message=encode_message(METADATA, bytes(50_000)))
+    while not connection._transport.get_write_buffer_size():
+        await neighbour.send_frame(message)
+        await asyncio.sleep(0.005)
+    assert connection._writer.paused_at is None
+    connection.close("tried")
+    await until(lambda: gateway.agents.find(2, frozen.id) is None)
+
+
+async def test_who_drives_is_not_held_for_what_else_he_sends(
+    router: str, start_gateway: StartGateway, connect: Connect
+) -> None:
+    """A headset that talks to one that does not read is read from more slowly, but not while it drives a robot: its
+    stop would wait behind that."""
+    gateway = await start_gateway(outbox_bytes=4 << 20, write_timeout_s=120.0)
+    sender, slow = await connect(gateway), await connect(gateway)
+    slow.pause()
+    await until(lambda: gateway.agents.find(2, sender.id) and gateway.agents.find(2, slow.id))
+    connection = gateway.agents.find(2, sender.id)
+    mail = encode_frame(2, (slow.id,), message=encode_message(METADATA, bytes(1_000_000)))
+    driving = Metadata(node_type=2, node_name="nd__cmd_vel", data_exchange_type="geometry_msgs/Twist").encode()
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as robot:
+        await until(lambda: (1, 7) in gateway.directory)
+        command = encode_frame(1, (robot.id,), message=encode_message(driving, b"on"))
+        receiver = gateway.agents.find(2, slow.id)
+        while receiver.all_drops()["outbox_full"] < 3:
+            await sender.send_frame(command + mail)
+            assert not receiver.backpressure.holds
+        connection.drove_at = -math.inf
+        while not receiver.backpressure.holds:
+            await sender.send_frame(mail)
 
 
 async def test_encoding_of_the_first_message(start_gateway: StartGateway) -> None:
