@@ -99,7 +99,7 @@ class Door:
         self._watch = Watch(path, self._look)
         self._holders: dict[Connection, _Holder] = {}
         self._grants: dict[str, Grant] = {}
-        """Of tokens that somebody has come in by: all who have one share what it may send."""
+        """Of tokens that somebody has come in by: all who have one share what it may send, also who comes again."""
         self._attempts = Attempts()
         self._exchanging = asyncio.Lock()
 
@@ -148,9 +148,7 @@ class Door:
 
     def leave(self, connection: Connection) -> None:
         """A connection has ended."""
-        held = self._holders.pop(connection, None)
-        if held is not None and all(other.name != held.name for other in self._holders.values()):
-            self._grants.pop(held.name, None)
+        self._holders.pop(connection, None)
 
     async def exchange(self, code: str) -> str | None:
         """A new secret for who shows the code of a pairing; None: there is no such pairing."""
@@ -190,6 +188,8 @@ class Door:
         self._on_look()
         now = time.time()
         tokens = {token.name: token for token in self._watch.tokens.tokens}
+        for name in self._grants.keys() - tokens.keys():
+            del self._grants[name]
         for connection, held in list(self._holders.items()):
             token = tokens.get(held.name)
             if token is None or not token.holds(now) or held.digest not in token.hashes:

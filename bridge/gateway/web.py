@@ -47,6 +47,10 @@ HTTP_PER_ADDRESS = 128
 PINGS_PER_S = 10.0
 """Pings and empty messages; who sends more is closed."""
 CLOSE_S = 2.0
+TURN_S = 0.003
+"""Work for one socket that takes longer lets others have their turn, as with agents' own sockets."""
+LEAST_READ_BYTES = 4 << 10
+MOST_READ_BYTES = 256 << 10
 COOKIE_S = 30 * 24 * 3600
 
 WRONG = {"error": "a valid token is wanted here"}
@@ -78,6 +82,8 @@ class WebPort:
         self._names = frozenset({*(name.lower() for name in settings.web_names), own, f"{own}.local"})
         self._at_http: Counter[str] = Counter()
         self._listeners: list[Listener] = []
+        self.scratch = memoryview(bytearray(MOST_READ_BYTES))
+        """Sockets of one loop receive one after the other."""
         app = web.Application(client_max_size=BODY_BYTES, middlewares=[self._middle()])
         app.router.add_get("/", self._hello)
         app.router.add_get(WEBSOCKET_PATH, self._websocket)
@@ -250,8 +256,9 @@ async def _said(request: web.Request, name: str) -> str | None:
     return None
 
 
-class _Outer(asyncio.Protocol):
-    """What a socket of the web port talks to: aiohttp's protocol, within limits of time that it does not have."""
+class _Outer(asyncio.BufferedProtocol):
+    """What a socket of the web port talks to: aiohttp's protocol, within limits of time that it does not have, for a
+    request and for what one read brings: thousands of tiny WebSocket frames are parsed at once otherwise."""
 
     def __init__(self, inner: asyncio.Protocol, port: WebPort) -> None:
         self._inner = inner
@@ -261,6 +268,9 @@ class _Outer(asyncio.Protocol):
         self._stream: WebSocketTransport | None = None
         self._counted = False
         self._timer: asyncio.TimerHandle | None = None
+        self._read_bytes = LEAST_READ_BYTES
+        self._spent_s = 0.0
+        self._shared: _SharedTransport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast(asyncio.Transport, transport)
@@ -270,12 +280,28 @@ class _Outer(asyncio.Protocol):
             self.transport.abort()
             return
         self._counted = True
+        self._shared = _SharedTransport(self.transport)
         self.wait()
-        self._inner.connection_made(transport)
+        self._inner.connection_made(cast(asyncio.BaseTransport, self._shared))
 
-    def data_received(self, data: bytes) -> None:
-        if self._counted or self._stream is not None:
-            self._inner.data_received(data)
+    def get_buffer(self, sizehint: int) -> memoryview:
+        return self._port.scratch[: self._read_bytes]
+
+    def buffer_updated(self, nbytes: int) -> None:
+        if not self._counted and self._stream is None:
+            return  # it was not let in
+        began = time.monotonic()
+        self._inner.data_received(bytes(self._port.scratch[:nbytes]))
+        took_s = time.monotonic() - began
+        if took_s > TURN_S:
+            self._read_bytes = max(LEAST_READ_BYTES, self._read_bytes // 2)
+        elif took_s < TURN_S / 2 and nbytes == self._read_bytes:
+            self._read_bytes = min(len(self._port.scratch), 2 * self._read_bytes)
+        self._spent_s += took_s
+        if self._spent_s > TURN_S and not self.transport.is_closing():  # others have their turn
+            self._spent_s = 0.0
+            self._shared.hold()
+            asyncio.get_running_loop().call_soon(self._shared.let_go)
 
     def eof_received(self) -> bool | None:
         return self._inner.eof_received() if self._counted or self._stream is not None else None
@@ -326,6 +352,43 @@ class _Outer(asyncio.Protocol):
         self.transport.abort()
 
 
+class _SharedTransport:
+    """A transport whose reading two may pause: aiohttp, when much waits in its queues, and we."""
+
+    def __init__(self, transport: asyncio.Transport) -> None:
+        self._transport = transport
+        self._paused = self._held = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+    def pause_reading(self) -> None:
+        """aiohttp's."""
+        self._set(paused=True, held=self._held)
+
+    def resume_reading(self) -> None:
+        """Likewise."""
+        self._set(paused=False, held=self._held)
+
+    def hold(self) -> None:
+        """Ours."""
+        self._set(paused=self._paused, held=True)
+
+    def let_go(self) -> None:
+        """Likewise."""
+        self._set(paused=self._paused, held=False)
+
+    def _set(self, *, paused: bool, held: bool) -> None:
+        before, self._paused, self._held = self._paused or self._held, paused, held
+        now = paused or held
+        if now == before or self._transport.is_closing():
+            return
+        if now:
+            self._transport.pause_reading()
+        else:
+            self._transport.resume_reading()
+
+
 class WebSocketTransport(asyncio.Transport):
     """A WebSocket as a `Connection` sees it: a transport of bytes."""
 
@@ -357,6 +420,8 @@ class WebSocketTransport(asyncio.Transport):
             await self._may_read.wait()
             message = await self._socket.receive()
             if message.type is WSMsgType.BINARY:
+                if not message.data and not self._spares():
+                    return
                 await self._feed(message.data)
             elif message.type in (WSMsgType.PING, WSMsgType.PONG):
                 if not self._spares():
@@ -375,8 +440,6 @@ class WebSocketTransport(asyncio.Transport):
 
     async def _feed(self, data: bytes) -> None:
         connection, view = self.connection, memoryview(data)
-        if not len(view):
-            self._spares()
         while len(view) and not self.is_closing() and not self._lost:
             if not self._may_read.is_set():
                 await self._may_read.wait()

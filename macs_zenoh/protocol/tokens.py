@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
+from collections import Counter
 from collections.abc import Iterator
 from typing import Annotated
 
@@ -81,9 +82,8 @@ class Tokens(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     pairings: Annotated[list[Pairing], Meta(max_length=TOKENS)] = []
 
     def __post_init__(self) -> None:
-        names = [token.name for token in self.tokens]
-        for name in names:
-            if names.count(name) > 1:
+        for name, count in Counter(token.name for token in self.tokens).items():
+            if count > 1:
                 raise ValueError(f"two tokens are called {name}")
 
     def find(self, shown: str | None, now: float) -> Token | None:

@@ -9,7 +9,9 @@ import gc
 import json
 import os
 import re
+import socket
 import ssl
+import threading
 import time
 import tracemalloc
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -683,3 +685,47 @@ async def test_what_is_no_request_is_answered_and_counted(
         writer.close()
     assert door.gateway.drops["bad_http"] >= 2
     assert not [record for record in caplog.records if record.levelname == "ERROR"]
+
+
+FLOODS = {
+    "pings": masked(0x89, b"") * 40_000,
+    "fragments": masked(0x02, b"x") + masked(0x00, b"") * 40_000,
+    "empty messages": masked(0x82, b"") * 40_000,
+    "bytes": masked(0x82, b"\0") * 35_000,
+}
+
+
+@pytest.mark.parametrize("what", FLOODS)
+async def test_a_flood_leaves_others_their_turn(start_door: StartDoor, what: str) -> None:
+    """However small the pieces are that somebody sends, and how often he comes again: no turn of the loop takes long,
+    counted in the processor's time, which other programs do not change."""
+    door = await start_door()
+    port = door.gateway.listeners.web_port
+    stop = threading.Event()
+
+    def flood() -> None:
+        request = (
+            f"GET /macs HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        ).encode()
+        while not stop.is_set():
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=2) as attacker:
+                attacker.sendall(request)
+                attacker.recv(500)
+                attacker.sendall(FLOODS[what])
+                while attacker.recv(65536):
+                    pass
+
+    flooding = asyncio.create_task(asyncio.to_thread(flood))
+    turns_s = []
+    deadline = time.monotonic() + 2
+    began = time.thread_time()
+    while time.monotonic() < deadline:
+        await asyncio.sleep(0)
+        now = time.thread_time()
+        turns_s.append(now - began)
+        began = now
+    stop.set()
+    await flooding
+    turns_s.sort()
+    assert turns_s[-3] < 0.1, turns_s[-5:]  # what is done once is not what a flood costs
