@@ -49,6 +49,8 @@ class Goal:
     request_id: int
     node_name: str
     """Under which its owner registered the action."""
+    stops: int = 0
+    """How often the robot had been stopped when it was given."""
     status: int = UNKNOWN
     """As in action_msgs/GoalStatus."""
     result: bytes = b""
@@ -116,6 +118,7 @@ class ActionNode(InterfaceNode):
         await self._found(self.MATCH_S)
 
     def retire(self) -> None:
+        self.cut_off()  # nobody could cancel them any more
         for task in self._tasks:
             task.cancel()
         if self._watching is not None:
@@ -141,12 +144,17 @@ class ActionNode(InterfaceNode):
                 goal.owner, goal.former = agent, None
 
     def emergency_stop(self, by: str) -> None:
-        self._loop.call_soon_threadsafe(self._cancel_all)
+        if not self.rule.allow_while_stopped:  # whatever holds by the time the loop comes to it
+            self._loop.call_soon_threadsafe(self._cancel_all)
+
+    def cut_off(self) -> None:
+        """Nobody is seen to leave, so all have left."""
+        if self.rule.cancel_on_leave:
+            self._cancel_all()
 
     def _cancel_all(self) -> None:
-        if self.held:
-            for goal in self._goals.values():
-                self._cancel(goal)
+        for goal in self._goals.values():
+            self._cancel(goal)
 
     def status(self) -> NodeStatus:
         return structs.replace(super().status(), goals=[_shown(goal) for goal in self._goals.values()])
@@ -193,11 +201,12 @@ class ActionNode(InterfaceNode):
         if problem is not None:
             self._reject(goal, f"the goal is no {self.interface}: {problem}")
         elif self.held:
-            self._reject(goal, self._stopped())
+            self._reject(goal, self.stop_reason())
         elif not self._room():
             self._reject(goal, f"{len(self._goals)} goals of {self.topic} are open")
         else:
             self._goals[goal_id] = goal
+            goal.stops = self.robot.stop.times
             self._spawn(goal, body)
 
     def _ask_result(self, goal: Goal, message: Message) -> None:
@@ -293,9 +302,6 @@ class ActionNode(InterfaceNode):
         else:
             self.robot.session.submit(lambda: self._send_cancel(goal))
 
-    def _stopped(self) -> str:
-        return f"the emergency stop by {self.robot.stop.by} holds"
-
     def _reject(self, goal: Goal, reason: str) -> None:
         self._tell(goal, ActionVerb.ACCEPTED, 0, reason.encode())
 
@@ -342,8 +348,8 @@ class ActionNode(InterfaceNode):
     def _send_goal(self, goal: Goal, body: bytes) -> None:
         if self._client is None:
             return
-        if self.held:  # pressed while the goal waited for the action
-            self._loop.call_soon_threadsafe(self._drop, goal, self._stopped())
+        if self.held_since(goal.stops):  # pressed while the goal waited for the action
+            self._loop.call_soon_threadsafe(self._drop, goal, self.stop_reason())
             return
         message = deserialize_message(body, self._types.Goal)
         tell = self._loop.call_soon_threadsafe

@@ -164,6 +164,16 @@ class InterfaceNode(ABC):
         """Whether the emergency stop keeps agents from acting through this node now."""
         return self.robot.stop.stopped and not self.rule.allow_while_stopped
 
+    def held_since(self, stops: int) -> bool:
+        """The same, or whether it did meanwhile: ``stops`` is how often there had been one."""
+        stop = self.robot.stop
+        return (stop.stopped or stop.times != stops) and not self.rule.allow_while_stopped
+
+    def stop_reason(self) -> str:
+        """Why nothing is done that waited."""
+        stop = self.robot.stop
+        return f"the emergency stop by {stop.by} holds" if stop.stopped else "the robot was stopped meanwhile"
+
     @property
     def in_use(self) -> bool:
         """Whether the node must stay: somebody is registered, or waits for something."""

@@ -32,6 +32,7 @@ from macs_zenoh.protocol.budget import may_have_one_more
 from macs_zenoh.protocol.messages import (
     OTHER_TYPE,
     ROS,
+    ActionVerb,
     AddNode,
     DataRefused,
     Metadata,
@@ -336,10 +337,17 @@ class InterfaceNodes:
                         self._early.remove(key, message)
 
     def _aged(self, key: NodeKey, message: Message) -> Message | None:
-        """A message as old as it has become while it waited here; None for a command that is too old by now."""
+        """A message as old as it has become while it waited here; None for a command that is too old by now, and for
+        what would act on a robot that was stopped meanwhile."""
+        waited_s = self._early.waited_s(key, message, time.monotonic())
+        if self._was_stopped(waited_s) and self._acts(key, message):
+            reason = "the robot was stopped while this waited for its registration"
+            self.drops.note("stopped", f"{key.node_name[:80]} from {Registrant.of(message)}", reason)
+            self._tell_unanswered(message, reason)
+            return None
         if key.node_type != NodeType.PUBLISHER:
             return message
-        age_s = message.age_s + self._early.waited_s(key, message, time.monotonic())
+        age_s = message.age_s + waited_s
         most_s = self.robot.rules.settings.max_command_age_s
         stops = self.stop is not None and key == self.stop.key
         if not stops and 0 < most_s < age_s:
@@ -347,6 +355,19 @@ class InterfaceNodes:
             self.drops.note("too_old", f"{key.node_name[:80]} from {Registrant.of(message)}", reason)
             return None
         return message._replace(age_s=age_s)
+
+    def _was_stopped(self, within_s: float) -> bool:
+        """Whether a stop has ended since then; one that holds is for the nodes to judge."""
+        stop = self.robot.stop
+        return stop.times > 0 and not stop.stopped and time.time() - stop.since < within_s
+
+    def _acts(self, key: NodeKey, message: Message) -> bool:
+        node = self._meant(key, message)
+        if node is None or node is self.stop or node.rule.allow_while_stopped:
+            return False
+        if key.node_type == NodeType.ACTION:
+            return message.metadata.message_manager == ActionVerb.GOAL
+        return key.node_type in (NodeType.PUBLISHER, NodeType.CLIENT)
 
     def last_words(self) -> None:
         """This program is about to end without closing anything: no last command may stay. From any thread."""

@@ -94,7 +94,7 @@ class ClientNode(InterfaceNode):
         if len(self._calls) >= self.robot.rules.settings.max_calls:
             self._fail(message, CallFailed("refused", f"{len(self._calls)} calls of {self.topic} are open"))
             return
-        call = asyncio.get_running_loop().create_task(self._call(message))
+        call = asyncio.get_running_loop().create_task(self._call(message, self.robot.stop.times))
         self._calls[call] = message
         call.add_done_callback(self._calls.pop)
 
@@ -111,9 +111,9 @@ class ClientNode(InterfaceNode):
     def status(self) -> NodeStatus:
         return structs.replace(super().status(), open_calls=len(self._calls))
 
-    async def _call(self, message: Message) -> None:
+    async def _call(self, message: Message, stops: int) -> None:
         try:
-            response = await within(self._ask(message.data), self._deadline_s)
+            response = await within(self._ask(message.data, stops), self._deadline_s)
         except CallFailed as error:
             self._fail(message, error)
         except asyncio.TimeoutError:
@@ -127,7 +127,7 @@ class ClientNode(InterfaceNode):
                 return
             self.robot.send(asker, answer_metadata(self.robot.agent_id, message.metadata), response)
 
-    async def _ask(self, data: bytes) -> bytes:
+    async def _ask(self, data: bytes, stops: int) -> bytes:
         try:
             request = readable(self._request_cdr, self._parts, data, self.robot.rules.settings.max_message_parts)
         except TooManyParts as error:
@@ -152,7 +152,7 @@ class ClientNode(InterfaceNode):
         release = _Once(self._room.release)
         pace = loop.call_later(PACE_S, release)
         try:
-            sent = await self.robot.session.run(lambda: self._send(request, loop, settle))
+            sent = await self.robot.session.run(lambda: self._send(request, stops, loop, settle))
             try:
                 return await answer
             finally:
@@ -163,7 +163,7 @@ class ClientNode(InterfaceNode):
             release()
 
     def _stopped(self) -> CallFailed:
-        return CallFailed("refused", f"the emergency stop by {self.robot.stop.by} holds")
+        return CallFailed("refused", self.stop_reason())
 
     def _fail(self, message: Message, error: CallFailed) -> None:
         about = f"{self.topic} from {message.sender_type}/{message.sender_id}"
@@ -175,12 +175,13 @@ class ClientNode(InterfaceNode):
     def _send(
         self,
         request: bytes,
+        stops: int,
         loop: asyncio.AbstractEventLoop,
         settle: Callable[[bytes | None, CallFailed | None], None],
     ) -> Any:
         if self._client is None:
             raise CallFailed("refused", f"{self.topic} is no longer registered")
-        if self.held:  # pressed while the call waited for the service, or for its turn
+        if self.held_since(stops):  # pressed while the call waited for the service, or for its turn
             raise self._stopped()
         try:
             sent = self._client.call_async(deserialize_message(request, self._service.Request))

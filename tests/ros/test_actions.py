@@ -293,6 +293,39 @@ async def test_an_emergency_stop_cancels_goals(site: SimpleNamespace) -> None:
     await site.five.client.send_goal(7, site.goal(1))
 
 
+async def test_a_short_stop_cancels_goals(site: SimpleNamespace) -> None:
+    """Also when it is released before the loop comes to it; a goal that waits for its action is never given."""
+    await site.nodes.open_stop("/emergency_stop")
+    await site.nodes.add(adding("/late", COUNT, node_type=NodeType.ACTION))
+    goal = await site.five.client.send_goal(7, site.goal(1000))
+    site.six.client = ActionClient(site.six, NodeSpec(NodeType.ACTION, "/late", COUNT))
+    late = asyncio.create_task(site.six.client.send_goal(7, site.goal(1000)))
+    node = site.nodes.get(NodeType.ACTION, "nd__late")
+    await until(lambda: node.status().goals)
+    site.nodes.stop.press("unity/5")
+    site.nodes.stop.release("unity/5")
+    counter = await site.peer.session.run(lambda: Counter(site.peer, site.action, "/late"))
+    assert (await goal.result(PATIENCE_S)).status == CANCELED
+    with pytest.raises(Refused, match=r"stopped meanwhile|there is no action"):
+        await late
+    await site.peer.session.run(counter.server.destroy)
+
+
+async def test_goals_end_with_the_mesh_where_a_rule_says_so(site: SimpleNamespace) -> None:
+    """With cancel_on_leave the robot cancels them when it loses the mesh."""
+    counter = await site.peer.session.run(lambda: Counter(site.peer, site.action, "/other"))
+    await site.nodes.add(adding("/other", COUNT, node_type=NodeType.ACTION))
+    elsewhere = await site.five.client.send_goal(7, site.goal(1000))
+    site.five.client = ActionClient(site.five, NodeSpec(NodeType.ACTION, "/other", COUNT))
+    goal = await site.five.client.send_goal(7, site.goal(1000))
+    for node in site.nodes:
+        node.cut_off()
+    assert (await goal.result(PATIENCE_S)).status == CANCELED
+    (state,) = site.nodes.get(NodeType.ACTION, "nd__count").status().goals
+    assert (state.goal, state.finished) == (elsewhere.id.hex(), False)
+    await site.peer.session.run(counter.server.destroy)
+
+
 async def test_a_server_that_dies_aborts_its_goals(
     site: SimpleNamespace, count_action: Any, domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

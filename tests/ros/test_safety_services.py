@@ -128,3 +128,31 @@ async def test_a_topic_may_be_allowed_as_well(site: SimpleNamespace) -> None:
     await asyncio.sleep(0.2)
     assert [value for _, value in lamp.values] == [0.5]
     assert [value for _, value in wheels.values] == [-1.0]
+
+
+async def test_what_waited_while_the_robot_was_stopped_is_not_done(site: SimpleNamespace) -> None:
+    """A stop that is released at once: neither a command nor a call that came before its registration, nor a call
+    that waits for its turn, is carried out after it."""
+    wheels, lamp = await hear(site.peer, "/cmd_vel"), await hear(site.peer, "/lamp")
+    await register(site, "/motors")
+    count = 3 * services.BURST
+    for number in range(1, count + 1):
+        site.nodes.deliver(call("/motors", number))
+    for topic in ("/cmd_vel", "/lamp"):
+        site.nodes.deliver(drive(0.5, topic=topic))
+    site.nodes.stop.press("unity/6")
+    site.nodes.stop.release("unity/6")
+    node = site.nodes.robot.session.node
+    await until(lambda: node.count_subscribers("/lamp") and node.count_subscribers("/cmd_vel"))
+    for topic in ("/cmd_vel", "/lamp"):
+        await site.nodes.add(adding(topic, "geometry_msgs/Twist", node_type=NodeType.PUBLISHER))
+    answers: list[str] = []
+    while len(answers) < count:
+        metadata, _ = await get(site.answers)
+        answers += [metadata.message_manager] if metadata.request_id else []  # commands have none
+    assert answers.count(CallFailure.manager) >= count - services.BURST
+    await until(lambda: lamp.values)
+    site.nodes.deliver(drive(0.25))
+    await until(lambda: wheels.values)
+    assert [value for _, value in wheels.values] == [0.25]
+    assert site.nodes.drops["stopped"] == 1
