@@ -169,13 +169,11 @@ async def test_topic_data_only_for_whom_registered_it(
         macs_zenoh.join("ros", id=7, connect=[router]) as seven,
         macs_zenoh.join("ros", id=8, connect=[router]) as eight,
     ):
-        for robot in (seven, eight):
-            robot.serve("add_node", _accept)
+        asked = [_accepting(robot) for robot in (seven, eight)]
         chatter = await of_seven.subscribe("/chatter", "std_msgs/String", agents=[7])
         other = await of_eight.subscribe("/other", "std_msgs/String", agents=[7])
         true = await of_eight.subscribe("/chatter", "std_msgs/String", agents=[8])
-        for headset in (of_seven, of_eight):
-            await headset.online()  # the gateway knows of the registrations
+        await until(lambda: [len(calls) for calls in asked] == [2, 1])  # the gateway has subscribed before it calls
         Streams(seven).publish("nd__chatter", data(8, "nd__chatter", b"forged"))
         Streams(seven).publish("nd__other", data(7, "nd__chatter", b"under another node's key"))
         Streams(seven).publish("nd__other", data(7, "nd__other", b"seven's"))
@@ -200,12 +198,12 @@ async def test_topic_data_stops_when_the_registration_does(
         socket(gateway) as stays,
         macs_zenoh.join("ros", id=7, connect=[router]) as robot,
     ):
-        robot.serve("add_node", _accept)
+        asked = _accepting(robot)
         for headset in (left, stays):
             headset.configure()
             adding = AddNode(UNITY, headset.id, 1, "nd__chatter", "/chatter", "std_msgs/String")
             headset.writer.write(registration(headset, [7], adding))
-            await headset.online()
+        await until(lambda: len(asked) == 2)  # the gateway has subscribed before it calls
         left.writer.write(registration(left, [7], RemoveNode(UNITY, left.id, 1, "nd__chatter")))
         await left.online()
         metadata = Metadata(ROS, 7, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__chatter", "std_msgs/String")
@@ -251,8 +249,16 @@ async def test_what_comes_with_the_configuration_is_by_who_the_agent_becomes(
         await until(lambda: not len(gateway._robots._registrations))
 
 
-async def _accept(_call: macs_zenoh.Call) -> bytes:
-    return b""
+def _accepting(robot: macs_zenoh.Agent) -> list[macs_zenoh.Call]:
+    """Let everybody register on a robot; the calls with which they do."""
+    calls: list[macs_zenoh.Call] = []
+
+    async def add(call: macs_zenoh.Call) -> bytes:
+        calls.append(call)
+        return b""
+
+    robot.serve("add_node", add)
+    return calls
 
 
 async def test_a_registration_for_somebody_else_is_refused(router: str, start_gateway: StartGateway) -> None:

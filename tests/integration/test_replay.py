@@ -250,10 +250,12 @@ class Stage:
         await until(lambda: all(agent in gateway.directory for gateway in self.gateways for agent in agents))
 
     async def _settle(self) -> None:
-        """Everybody has heard as much as the recording shows up to here."""
+        """Everybody has heard as much as the recording shows up to here, and gateways have what they asked for. (Who
+        leaves while a robot has not answered yet is taken off it expressly.)"""
 
         def settled() -> bool:
-            return all(len(self.players[name].heard) >= len(texts) for name, texts in self.expected.items())
+            heard = all(len(self.players[name].heard) >= len(texts) for name, texts in self.expected.items())
+            return heard and not any(gateway._robots._calls for gateway in self.gateways)
 
         try:
             await until(settled)
@@ -284,7 +286,8 @@ class Stage:
     def _compare(self) -> None:
         for name, player in self.players.items():
             heard = [meaning(message) for message in player.heard]
-            assert _by_sender(heard) == _by_sender(self.expected[name]), f"what {name} heard"
+            both = ["", *heard, "and not", *self.expected[name]]
+            assert _by_sender(heard) == _by_sender(self.expected[name]), f"what {name} heard: " + "\n".join(both)
 
 
 def _by_sender(texts: list[str]) -> dict[tuple[object, object], list[str]]:
