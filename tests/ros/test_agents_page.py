@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import macs_zenoh
+from tests.support.processes import finished
 from tests.support.programs import ROOT, Program, free_port
 
 PAGE = (ROOT / "docs" / "agents.md").read_text(encoding="utf-8")
@@ -36,12 +37,9 @@ async def printed(program: str, folder: Path) -> str:
     """What a program says until it ends."""
     path = folder / "program.py"
     path.write_text(program)
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, str(path), stdout=asyncio.subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)}
-    )
-    out, _ = await asyncio.wait_for(process.communicate(), 90)
-    assert process.returncode == 0
-    return out.decode()
+    code, out, errors = await finished(sys.executable, str(path), env={"PYTHONPATH": str(ROOT)})
+    assert code == 0, errors
+    return out
 
 
 async def ready(endpoint: str, namespace: str | None = None) -> None:

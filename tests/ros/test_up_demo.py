@@ -17,10 +17,13 @@ import macs_zenoh
 from tests.support.programs import ROOT, free_port
 from tests.support.ros_peer import Peer
 
+PATIENT = "import sys; from bridge.cli import main, up; up.READY_S = 80.0; sys.exit(main())"
+"""`macs` on a machine that is busy."""
+
 
 def demo(*argv: str, env: dict[str, str]) -> Coroutine[Any, Any, asyncio.subprocess.Process]:
     return asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "bridge", "up", "--demo", "--once", *argv),
+        *(sys.executable, "-c", PATIENT, "up", "--demo", "--once", *argv),
         cwd=ROOT,
         env={**os.environ, **env},
         stdout=asyncio.subprocess.PIPE,
