@@ -319,7 +319,7 @@ async def test_those_that_do_not_read_have_a_limit_together() -> None:
                 sender.send(bytes(31 << 20), to="unity", ids=[number + 2], metadata=Metadata(message_manager="Big"))
                 await asyncio.sleep(0.1)
         await answers(neighbour)
-        assert memory_bytes(gateway.pid) - before < (256 + 96) << 20
+        await until(lambda: memory_bytes(gateway.pid) - before < (256 + 96) << 20)  # what was cut is given back soon
         for sock in stalled:
             sock.close()
         while len((await neighbour.online()).unity_agent_ids) > 1:
@@ -349,7 +349,7 @@ async def test_frames_that_do_not_end_have_a_limit_together() -> None:
         while len((await asyncio.wait_for(neighbour.__anext__(), PATIENCE_S)).data) < 4 << 20:
             pass
         await answers(neighbour)
-        assert memory_bytes(gateway.pid) - before < (256 + 96) << 20
+        await until(lambda: memory_bytes(gateway.pid) - before < (256 + 96) << 20)  # what was cut is given back soon
         ended = asyncio.wait_for(halves[0].read(), PATIENCE_S)
         with suppress(ConnectionError):
             await ended
