@@ -19,7 +19,7 @@ from bridge.headset.client import Headset
 from tests.conformance import client_faults, router_faults
 from tests.conformance.client_faults import Fault
 from tests.conformance.proxy import Proxy
-from tests.programs import ROOT, Program, ended, free_port
+from tests.support.programs import ROOT, Program, ended, free_port
 
 PATIENCE_S = 8.0
 """As long as a loaded machine may take; right programs never use it."""

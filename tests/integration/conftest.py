@@ -15,7 +15,6 @@ from macs_zenoh.mesh import Mesh
 from macs_zenoh.sections import changed
 from tests.support.given import Connect, StartGateway
 from tests.support.local import patient
-from tests.support.waiting import until  # noqa: F401 - until all that is under way takes it from there
 
 
 @pytest.fixture

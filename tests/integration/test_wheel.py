@@ -18,7 +18,7 @@ import pytest
 
 from bridge.cli import VERBS
 from tests.support.once import made_once
-from tests.support.programs import ROOT
+from tests.support.processes import ROOT
 
 SETTINGS = ["macs.toml", "one-host/robot.toml", "systemd/macs-robot.service", "security/site.yaml"]
 INTERFACES = ["as2_ca_msgs/package.xml", "as2_ca_msgs/msg/InterAgentMessage.msg"]

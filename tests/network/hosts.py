@@ -25,7 +25,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
-from tests.support.programs import ROOT
+from tests.support.processes import ROOT
 
 PREFIX = "macs-test"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from tests.support.programs import ROOT
+from tests.support.processes import ROOT
 
 
 def panicking(where: str, when: Path | None = None) -> dict[str, str]:

@@ -10,8 +10,7 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 from tests.ros.driven import STOPPED, hear, may_command, send, site
-from tests.support.processes import START_S
-from tests.support.programs import ROOT
+from tests.support.processes import ROOT, START_S
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
 

@@ -15,7 +15,7 @@ from as2_ca_msgs.msg import InterAgentMessage
 
 from bridge.interfaces import Package, build
 from macs_zenoh.errors import ConfigError, Unreachable
-from tests.support.programs import ROOT
+from tests.support.processes import ROOT
 from tests.support.ros_peer import Peer
 from tests.support.waiting import get, until
 

@@ -9,7 +9,6 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
-import unity_serializer
 from geometry_msgs.msg import Twist
 from rcl_interfaces.srv import GetParameters
 from rclpy.serialization import deserialize_message, serialize_message
@@ -26,6 +25,7 @@ from bridge.ros.unity_cdr import PARTS, Parts, TooManyParts, UnityCdr, readable,
 from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, node_name
 from macs_zenoh.protocol.reading import Message
+from tests.ros import unity_serializer
 from tests.support.ros_peer import Peer, adding, command, drive
 from tests.support.waiting import get, until
 

@@ -222,7 +222,7 @@ def test_help_needs_no_zenoh() -> None:
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
-OURS = ("macs_zenoh", "bridge")
+OURS = ("macs_zenoh", "bridge", "tests.support")
 OTHERS = sorted(path for folder in ("tests", "benchmarks", "examples") for path in (ROOT / folder).rglob("*.py"))
 
 
@@ -231,6 +231,14 @@ def test_tests_and_benchmarks_name_what_exists() -> None:
     that they use: else only a whole run would tell of a name that has moved."""
     gone = [f"{path.relative_to(ROOT)}:{line} {name}" for path in OTHERS for line, name in nowhere(path)]
     assert gone == []
+
+
+def test_tests_import_each_other_by_full_names() -> None:
+    """As ``tests.ros.driven``: a name without its folder is found in none of the ways in which tests are run, and a
+    module that is imported by two names exists twice."""
+    short = {path.stem for path in (ROOT / "tests").rglob("*.py")} - sys.stdlib_module_names
+    used = {(path, name) for path in (ROOT / "tests").rglob("*.py") for name in roots(path) & short}
+    assert sorted(f"{path.relative_to(ROOT)} imports {name}" for path, name in used) == []
 
 
 def nowhere(path: Path) -> Iterator[tuple[int, str]]:

@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 from bridge.logs import PlainFormatter, Written
-from tests.support.programs import ROOT
+from tests.support.processes import ROOT
 
 LINES = 3000
 LOGS = f"""
