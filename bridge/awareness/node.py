@@ -23,6 +23,7 @@ from std_msgs.msg import String
 
 from bridge.awareness import cdr
 from bridge.ros.intake import Intake
+from bridge.ros.rclpy_private import change_state, lifecycle_state, on_transition
 from bridge.settings import AwarenessSettings
 from macs_zenoh.errors import ConfigError, UsageError
 from macs_zenoh.protocol.named import check_word
@@ -102,7 +103,7 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
             self.declare_parameter("transport", settings.transport)
         except ParameterException as error:
             raise ConfigError(f"parameters of {self.get_fully_qualified_name()}", str(error)) from error
-        self._service_change_state.callback = self._change_state
+        on_transition(self, self._change_state)
 
     def destroy_node(self) -> None:
         """End everything."""
@@ -112,7 +113,7 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
     @property
     def state(self) -> str:
         """``unconfigured``, ``inactive``, ``active`` or ``finalized``."""
-        return str(self._state_machine.current_state[1])
+        return lifecycle_state(self)
 
     # -- transitions ---------------------------------------------------------------------------------------------
 
@@ -160,7 +161,7 @@ class GatewayNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
     def _change_state(self, request: Any, response: Any) -> Any:
         """Answer a transition that is not possible now with a refusal; rclpy raises and answers nothing."""
         try:
-            return self._LifecycleNodeMixin__on_change_state(request, response)
+            return change_state(self, request, response)
         except RuntimeError as error:
             log.warning("transition %s is not possible: %s", request.transition.id, str(error).splitlines()[0])
             response.success = False

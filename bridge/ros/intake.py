@@ -18,9 +18,10 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.subscription import Subscription
+
+from bridge.ros.rclpy_private import WaitSet, raw_taker
 
 log = logging.getLogger("macs.ros")
 
@@ -110,51 +111,23 @@ class Intake:
                     time.sleep(ERROR_PAUSE_S)
 
     def _take_until_changed(self) -> None:
-        version, context, changed = self._version, self._node.context, self._changed.handle
-        with ExitStack() as in_use:  # nothing that is waited for may be destroyed meanwhile
-            in_use.enter_context(context.handle)
-            in_use.enter_context(changed)
-            wanted = self._enter(in_use)
-            handles = [subscription.handle for subscription, _ in wanted.values()]
-            takers = {
-                pointer: (subscription.handle.take_message, subscription.msg_type, on_raw)
-                for pointer, (subscription, on_raw) in wanted.items()
-            }
-            events = [event for subscription, _ in wanted.values() for event in subscription.event_handlers]
-            for event in events:
-                in_use.enter_context(event)
-            wait_set = rclpy_implementation.WaitSet(len(handles), 1, 0, 0, 0, len(events), context.handle)
-            while version == self._version:
-                wait_set.clear_entities()
-                wait_set.add_guard_condition(changed)
-                for handle in handles:
-                    wait_set.add_subscription(handle)
-                for event in events:
-                    event.add_to_wait_set(wait_set)
-                wait_set.wait(-1)
-                for event in events:  # of a new publisher before its messages
-                    if event.is_ready(wait_set):
-                        _call(event.callback, event.take_data())
-                for pointer in wait_set.get_ready_entities("subscription"):
-                    _take(*takers[pointer])
-
-    def _enter(self, in_use: ExitStack) -> dict[int, tuple[Subscription, OnRaw]]:
-        """The subscriptions that exist, by the pointers under which the wait set knows them."""
+        version = self._version
         with self._lock:
-            wanted = list(self._wanted.items())
-        existing = {}
-        for subscription, on_raw in wanted:
-            try:
-                in_use.enter_context(subscription.handle)
-            except InvalidHandle:  # destroyed a moment ago
-                continue
-            existing[subscription.handle.pointer] = (subscription, on_raw)
-        return existing
+            wanted = dict(self._wanted)
+        with ExitStack() as in_use:  # nothing that is waited for may be destroyed meanwhile
+            waiting = WaitSet(self._node.context, self._changed, wanted, in_use)
+            takers = {subscription: raw_taker(subscription) for subscription in waiting.subscriptions}
+            while version == self._version:
+                events, ready = waiting.wait()
+                for event in events:  # of a new publisher before its messages
+                    _call(event.callback, event.take_data())
+                for subscription in ready:
+                    _take(takers[subscription], wanted[subscription])
 
 
-def _take(take: Callable[[type[Any], bool], tuple[bytes, Any] | None], message: type[Any], on_raw: OnRaw) -> None:
+def _take(take: Callable[[], tuple[bytes, Any] | None], on_raw: OnRaw) -> None:
     for _ in range(BURST):
-        taken = take(message, True)
+        taken = take()
         if taken is None:
             return
         _call(on_raw, *taken)

@@ -18,6 +18,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from bridge.ros import fields
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, first_line, ros_errors
+from bridge.ros.rclpy_private import answer_later, waiting_requests
 from bridge.ros.servers import check_service_type, servers_elsewhere
 from bridge.ros.services import BURST, DEPTH
 from bridge.ros.stream import cdr_problem
@@ -43,10 +44,7 @@ class OpenCall(NamedTuple):
 class ServiceNode(InterfaceNode):
     """Type 4: a service that a headset runs, for ROS nodes on the robot. One registrant.
 
-    rclpy sends as the response what the callback returned, through ``send_response`` of the service object, with the
-    header of the request. So the callback returns the request, and a ``send_response`` of our own takes both and
-    leaves; the response is sent when there is one. rclpy's own way of answering later, a coroutine, makes the executor
-    spin as long as any call is open.
+    A request is passed on and answered later (`rclpy_private.answer_later`).
 
     ROS has no word for a call that failed. The caller gets a response with every field zero (see `fields.failure`)
     at the deadline, when the headset says that it failed, and when the headset leaves.
@@ -101,8 +99,7 @@ class ServiceNode(InterfaceNode):
             self._service = node.create_service(
                 self._types, self.request.tos_name, lambda request, response: request, qos_profile=DEPTH
             )
-        self._respond = self._service.send_response
-        self._service.send_response = self._take
+        self._respond = answer_later(self._service, self._take)
 
     async def settle(self) -> None:
         self._watch()
@@ -235,13 +232,8 @@ class ServiceNode(InterfaceNode):
 
     def _take(self, request: Any, header: Any) -> None:
         self._pass_on(request, header)
-        handle = self._service.handle
-        with handle:
-            for _ in range(self.TURN):
-                request, header = handle.service_take_request(self._types.Request)
-                if header is None:
-                    return
-                self._pass_on(request, header)
+        for request, header in waiting_requests(self._service, self._types.Request, self.TURN):
+            self._pass_on(request, header)
 
     def _pass_on(self, request: Any, header: Any) -> None:
         self._loop.call_soon_threadsafe(self._ask, bytes(serialize_message(request)), header)
