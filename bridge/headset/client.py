@@ -58,7 +58,6 @@ from .connection import Connection
 from .frames import DEFAULT_BUFFER_SIZE, NodeSpec
 from .mailbox import Mailbox
 from .nodes import (
-    REQUEST_IDS,
     Incoming,
     Node,
     Publisher,
@@ -66,8 +65,8 @@ from .nodes import (
     ServiceClient,
     ServiceHandler,
     Subscription,
-    fail_all,
 )
+from .questions import ROUTER, Questions
 from .stream import TCP, Way
 
 log = logging.getLogger("macs.headset")
@@ -94,48 +93,40 @@ class Link:
     why: str = ""
 
 
+@dataclass(frozen=True)
+class Options:
+    """What `Headset.connect` takes, and explains."""
+
+    group: int
+    reconnect: bool
+    handshake_timeout_s: float
+    heartbeat_s: float
+    max_message_bytes: int
+    extensions: int
+    token: str | None
+    way: Way
+    on_link: Callable[[Link], object] | None
+
+
 class Headset:
     """One headset on one TCP connection to a router or gateway. Made by `connect`."""
 
-    def __init__(
-        self,
-        host: str,
-        port: int,
-        *,
-        group: int = 0,
-        reconnect: bool = False,
-        handshake_timeout_s: float = HANDSHAKE_S,
-        heartbeat_s: float = HEARTBEAT_S,
-        max_message_bytes: int = MAX_FRAME_BYTES,
-        extensions: int = EXTENSIONS,
-        token: str | None = None,
-        way: Way = TCP,
-        on_link: Callable[[Link], object] | None = None,
-    ) -> None:
+    def __init__(self, host: str, port: int, options: Options) -> None:
         self.host = host
         self.port = port
-        self.group = group
+        self.group = options.group
         self.id = 0
         self.bad_messages = 0
-        self._reconnect = reconnect
-        self._handshake_s = handshake_timeout_s
-        self._heartbeat_s = heartbeat_s
-        self._max_message_bytes = max_message_bytes
-        self._extensions = extensions
-        self._token = token
-        self._way = way
+        self._options = options
         self._not_let_in = ""
         """Why the gateway does not let this headset in; it makes no sense to come again."""
         self.forbidden: deque[AccessRefused] = deque(maxlen=INBOX_MESSAGES)
         """What its token does not permit, as the gateway has told it."""
-        self._on_link = on_link
         self._nodes: dict[tuple[int, str], Node] = {}
         self._inbox: Mailbox[Incoming] = Mailbox(INBOX_MESSAGES)
         self._connection: Connection | None = None
         self._welcome_request = 0
-        self._next_request = 0
-        self._open: dict[int, asyncio.Future[bytes]] = {}
-        self._asked: dict[tuple[int, int], asyncio.Future[bytes]] = {}
+        self._questions = Questions()
         self._reading = asyncio.Event()
         self._reading.set()
         self._ended = asyncio.Event()
@@ -169,19 +160,18 @@ class Headset:
         Raises Unreachable when there is no connection, or no id as its first message within ``handshake_timeout_s``;
         Refused when the gateway does not take the token.
         """
-        headset = cls(
-            host,
-            port,
-            group=group,
-            reconnect=reconnect,
-            handshake_timeout_s=handshake_timeout_s,
-            heartbeat_s=heartbeat_s,
-            max_message_bytes=max_message_bytes,
-            extensions=extensions,
-            token=token,
-            way=way,
-            on_link=on_link,
+        options = Options(
+            group,
+            reconnect,
+            handshake_timeout_s,
+            heartbeat_s,
+            max_message_bytes,
+            extensions,
+            token,
+            way,
+            on_link,
         )
+        headset = cls(host, port, options)
         await headset._join()
         loop = asyncio.get_running_loop()
         headset._tasks = [loop.create_task(headset._live()), loop.create_task(headset._beat())]
@@ -210,7 +200,7 @@ class Headset:
     @property
     def reconnecting(self) -> bool:
         """Whether the connection is lost and a new one is being made."""
-        return self._connection is None and self._reconnect and not self._ended.is_set()
+        return self._connection is None and self._options.reconnect and not self._ended.is_set()
 
     @property
     def why_ended(self) -> str:
@@ -231,34 +221,26 @@ class Headset:
 
     async def online(self, timeout_s: float = 5.0) -> OnlineReply:
         """Ask who is online: ids of robots and of headsets. Raises CallTimeout or Unreachable."""
-        request_id = self._next_request
-        self._next_request = (request_id + 1) % REQUEST_IDS
-        answer = asyncio.get_running_loop().create_future()
-        self._open[request_id] = answer
-        try:
-            await self.send_frame(frames.online_request(self.id, request_id))
-            return decode_data(OnlineReply, await within(answer, timeout_s), ANSWER_BYTES)
-        except asyncio.TimeoutError as error:
-            raise CallTimeout(f"router {self.target}", timeout_s) from error
-        finally:
-            del self._open[request_id]
+        answer = await self._questions.ask(
+            ROUTER,
+            lambda number: self.send_frame(frames.online_request(self.id, number)),
+            timeout_s=timeout_s,
+            target=f"router {self.target}",
+        )
+        return decode_data(OnlineReply, answer, ANSWER_BYTES)
 
     async def ask_gateway(self, manager: str, data: Mapping[str, object], *, timeout_s: float = 5.0) -> bytes:
         """Ask a manager that somebody added to the gateway; returns its answer's data.
 
         Raises Refused with its reason, or CallTimeout, also when there is no such manager (see the gateway's log).
         """
-        request_id = self._next_request
-        self._next_request = (request_id + 1) % REQUEST_IDS
-        answer = asyncio.get_running_loop().create_future()
-        self._open[request_id] = answer
-        try:
-            await self.send_frame(frames.management(self.id, request_id, manager, data))
-            return _not_refused(await within(answer, timeout_s))
-        except asyncio.TimeoutError as error:
-            raise CallTimeout(f"{manager} of gateway {self.target}", timeout_s) from error
-        finally:
-            del self._open[request_id]
+        answer = await self._questions.ask(
+            ROUTER,
+            lambda number: self.send_frame(frames.management(self.id, number, manager, data)),
+            timeout_s=timeout_s,
+            target=f"{manager} of gateway {self.target}",
+        )
+        return _not_refused(answer)
 
     async def subscribe(
         self,
@@ -399,18 +381,13 @@ class Headset:
         ``manager`` says what: ``FunctionalityGetter``, ``RobotStatus``, ``RobotControl``. Raises CallTimeout,
         Unreachable, or Refused, as when an existing robot program does not know what it is asked.
         """
-        request_id = self._next_request
-        self._next_request = (request_id + 1) % REQUEST_IDS
-        answer = asyncio.get_running_loop().create_future()
-        self._asked[robot, request_id] = answer
-        try:
-            await self.send(data, to=ROS, ids=(robot,), manager=manager, request_id=request_id)
-            answered: bytes = await within(answer, timeout_s)
-            return _not_refused(answered)
-        except asyncio.TimeoutError as error:
-            raise CallTimeout(f"{manager} of robot {robot}", timeout_s) from error
-        finally:
-            del self._asked[robot, request_id]
+        answer = await self._questions.ask(
+            robot,
+            lambda number: self.send(data, to=ROS, ids=(robot,), manager=manager, request_id=number),
+            timeout_s=timeout_s,
+            target=f"{manager} of robot {robot}",
+        )
+        return _not_refused(answer)
 
     async def send_frame(self, frame: bytes) -> None:
         """Send bytes as they are, also what no headset would say. Raises Unreachable without a connection."""
@@ -506,12 +483,12 @@ class Headset:
         connection = await Connection.open(
             self.host,
             self.port,
-            timeout_s=self._handshake_s,
-            max_message_bytes=self._max_message_bytes,
-            way=self._way,
+            timeout_s=self._options.handshake_timeout_s,
+            max_message_bytes=self._options.max_message_bytes,
+            way=self._options.way,
         )
         try:
-            first = await connection.receive_first(self._handshake_s)
+            first = await connection.receive_first(self._options.handshake_timeout_s)
             metadata, data = split_message(first)
             self._take_id(Metadata.decode(metadata), bytes(data))
             await connection.send(self._configuration(self.id))
@@ -528,7 +505,7 @@ class Headset:
     async def _be_let_in(self) -> None:
         """Wait until the gateway has taken the token. Raises Refused, Unreachable."""
         try:
-            await self.online(self._handshake_s)
+            await self.online(self._options.handshake_timeout_s)
         except Unreachable:
             await self.abort()
             if self._not_let_in:
@@ -542,7 +519,9 @@ class Headset:
         self._welcome_request = metadata.request_id
 
     def _configuration(self, own_id: int) -> bytes:
-        return frames.configuration(own_id, self.group, self._welcome_request, self._extensions, self._token)
+        return frames.configuration(
+            own_id, self.group, self._welcome_request, self._options.extensions, self._options.token
+        )
 
     async def _live(self) -> None:
         """Read until the end; with ``reconnect`` join again and register everything."""
@@ -554,7 +533,7 @@ class Headset:
             self._fail_open(Unreachable(self.target, why))
             if self._not_let_in:
                 why = self._not_let_in
-            if not self._reconnect or self._not_let_in:
+            if not self._options.reconnect or self._not_let_in:
                 self._finish(why)
                 return
             log.warning("connection to %s lost: %s", self.target, why)
@@ -610,7 +589,7 @@ class Headset:
             self._take_id(metadata, message.data)
             await self.send_frame(self._configuration(self.id))
             return
-        elif not metadata.message_manager and self._take_answer(message):
+        elif not metadata.message_manager and self._questions.take(message):
             return
         else:
             self._take_refusal(message)
@@ -648,18 +627,6 @@ class Headset:
             raise WireError(f"data for {node.spec.tos_name} from agent type {message.sender_type}, not a robot")
         return node.receive(message)
 
-    def _take_answer(self, message: Incoming) -> bool:
-        """Whether this answers an open request to the router, or to a robot."""
-        request_id = message.metadata.request_id
-        if message.sender_type is None:
-            answer = self._open.get(request_id)
-        else:
-            answer = self._asked.get((message.sender_id or 0, request_id)) if message.sender_type == ROS else None
-        if answer is None or answer.done():
-            return False
-        answer.set_result(message.data)
-        return True
-
     def _take_access(self, refused: AccessRefused) -> None:
         """What the gateway does not permit."""
         if refused.kind in ("no_token", "ended"):
@@ -667,25 +634,20 @@ class Headset:
         log.warning("%s: %s", self.target, refused.reason)
         if refused.kind == "not_permitted":
             self.forbidden.append(refused)
-            asked = [answer for (_, number), answer in self._asked.items() if number == refused.request_id]
-            if refused.request_id in self._open:
-                asked.append(self._open[refused.request_id])
-            fail_all(asked, Refused(refused.reason))
+            self._questions.refuse(refused.request_id, refused.reason)
 
     async def _beat(self) -> None:
-        loop = asyncio.get_running_loop()
+        loop, heartbeat_s = asyncio.get_running_loop(), self._options.heartbeat_s
         while True:
             connection = self._connection
-            due_s = (
-                self._heartbeat_s if connection is None else connection.last_output + self._heartbeat_s - loop.time()
-            )
+            due_s = heartbeat_s if connection is None else connection.last_output + heartbeat_s - loop.time()
             if due_s > 0:
                 await asyncio.sleep(due_s)
             elif connection is not None:
                 try:
                     await connection.send(frames.heartbeat())
                 except Unreachable:
-                    await asyncio.sleep(self._heartbeat_s)  # the reading task sees the end as well
+                    await asyncio.sleep(heartbeat_s)  # the reading task sees the end as well
 
     async def tell(self, frame: Callable[[int], bytes]) -> None:
         """Send what a reconnection would repeat anyway: without a connection it waits for that."""
@@ -705,7 +667,7 @@ class Headset:
         node.end()
 
     def _fail_open(self, error: Unreachable) -> None:
-        fail_all([*self._open.values(), *self._asked.values()], error)
+        self._questions.fail(error)
         for node in self.nodes:
             if isinstance(node, ServiceClient):
                 node.fail(error)
@@ -721,10 +683,10 @@ class Headset:
         self._tell_link(Link(False, self.id, why))
 
     def _tell_link(self, link: Link) -> None:
-        if self._on_link is None:
+        if self._options.on_link is None:
             return
         try:
-            self._on_link(link)
+            self._options.on_link(link)
         except Exception:  # our caller's code must not end our tasks
             log.exception("on_link failed")
 

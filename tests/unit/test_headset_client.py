@@ -509,9 +509,10 @@ async def test_what_is_asked_for_while_away_is_done_later() -> None:
     """A subscription made without a connection is registered with the next one; a message is refused."""
     async with ScriptedRouter() as router:
         port = router.port
-        headset = await Headset.connect("127.0.0.1", port, reconnect=True)
         lost = asyncio.Event()
-        headset._on_link = lambda link: None if link.up else lost.set()
+        headset = await Headset.connect(
+            "127.0.0.1", port, reconnect=True, on_link=lambda link: None if link.up else lost.set()
+        )
         router._server.close()
         router.cut()
         await asyncio.wait_for(lost.wait(), PATIENCE_S)
