@@ -19,7 +19,7 @@ from functools import partial
 from msgspec import structs
 
 from .errors import HeldByAnother, OutOfRange, Refused, Unreachable
-from .mesh import Mesh
+from .mesh import Mesh, Traffic
 from .protocol.agent_id import AgentId
 from .protocol.directory import Change, Directory
 from .protocol.limits import NODE_AGENTS
@@ -340,7 +340,7 @@ class RobotCalls:
         verb = "add_node" if isinstance(node, AddNode) else "remove_node"
         metadata = Metadata(*sender, message_manager=node.manager)
         key, frame = call((ROS, task.robot_id), verb, sender, encode_data(node), metadata, self._layout)
-        await self._mesh.query(key, frame, timeout_s=CALL_TIMEOUT_S)
+        await self._mesh.query(key, frame, timeout_s=CALL_TIMEOUT_S, traffic=Traffic.REGISTRATION)
 
 
 def _keys(task: Task) -> tuple[AgentKey, CallKey]:

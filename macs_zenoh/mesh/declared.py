@@ -30,6 +30,8 @@ class Traffic(Enum):
     """Commands to robots: first in line, never waits, the next one replaces a lost one."""
     CALL = (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK, True)
     """Services, management, messages between agents: kept, in order."""
+    REGISTRATION = (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK, False)
+    """As calls, but nobody waits for one so much that it must have a packet of its own: they come in hundreds."""
     STREAM = (zenoh.Priority.DATA, zenoh.CongestionControl.DROP, False)
     """Topic data: dropped when a link is full."""
     PROBE = (zenoh.Priority.BACKGROUND, zenoh.CongestionControl.BLOCK, False)
