@@ -31,7 +31,7 @@ from macs_zenoh.protocol.tcp_agent import Event, Joined, Left, Rejected, Sent, S
 from .backpressure import Backpressure
 from .door import OPEN_TO_ALL, Entrance
 from .memory import Memory
-from .writer import BUFFER_BYTES, Writer
+from .writer import BUFFER_BYTES, ENDED, Writer
 
 log = logging.getLogger("macs.gateway")
 
@@ -241,6 +241,8 @@ class Connection(asyncio.BufferedProtocol):
             if timer is not None:
                 timer.cancel()
         self._writer.close_direct()
+        self._writer.detach()
+        self._transport = ENDED
         if self._refused:
             return
         if self.greeted:

@@ -309,12 +309,12 @@ class _Outer(asyncio.BufferedProtocol):
     def pause_writing(self) -> None:
         self._inner.pause_writing()
         if self._stream is not None:
-            self._stream.connection.pause_writing()
+            self._stream.below_is_full()
 
     def resume_writing(self) -> None:
         self._inner.resume_writing()
         if self._stream is not None:
-            self._stream.connection.resume_writing()
+            self._stream.below_has_room()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._stop_waiting()
@@ -394,29 +394,40 @@ class WebSocketTransport(asyncio.Transport):
 
     def __init__(self, socket: web.WebSocketResponse, below: asyncio.Transport, connection: Connection) -> None:
         super().__init__()
-        self.connection = connection
+        self._connection: Connection | None = connection
+        """None when it has ended: two that know each other are kept until Python looks for circles."""
         self._socket = socket
         self._below = below
         self._closing: asyncio.Task[bool] | None = None
-        self._lost = False
         self._may_read = asyncio.Event()
         self._may_read.set()
         self._spare = Credit(PINGS_PER_S, time.monotonic())
 
     def begin(self) -> None:
         """The connection is there."""
-        self.connection.connection_made(self)
+        if self._connection is not None:
+            self._connection.connection_made(self)
+
+    def below_is_full(self) -> None:
+        """Nothing more should be written for now."""
+        if self._connection is not None:
+            self._connection.pause_writing()
+
+    def below_has_room(self) -> None:
+        """It should again."""
+        if self._connection is not None:
+            self._connection.resume_writing()
 
     def lost(self, exc: Exception | None) -> None:
         """It has ended."""
-        if not self._lost:
-            self._lost = True
+        if self._connection is not None:
+            connection, self._connection = self._connection, None
             self._may_read.set()
-            self.connection.connection_lost(exc)
+            connection.connection_lost(exc)
 
     async def read(self) -> None:
         """Give the connection what comes, until the end."""
-        while not self._lost:
+        while self._connection is not None:
             await self._may_read.wait()
             message = await self._socket.receive()
             if message.type is WSMsgType.BINARY:
@@ -433,34 +444,38 @@ class WebSocketTransport(asyncio.Transport):
                 await self._end(WSCloseCode.UNSUPPORTED_DATA, "it sends text, which nothing here understands")
                 return
             elif message.type is WSMsgType.ERROR:
-                self.connection.complain("bad_websocket", f"what it sends is no WebSocket: {message.data}")
+                self._complain("bad_websocket", f"what it sends is no WebSocket: {message.data}")
                 return
             else:  # closed, by us or by the other end
                 return
 
     async def _feed(self, data: bytes) -> None:
-        connection, view = self.connection, memoryview(data)
-        while len(view) and not self.is_closing() and not self._lost:
+        view = memoryview(data)
+        while len(view) and self._connection is not None and not self.is_closing():
             if not self._may_read.is_set():
                 await self._may_read.wait()
                 continue
-            space = connection.get_buffer(-1)
+            space = self._connection.get_buffer(-1)
             size = min(len(space), len(view))
             space[:size] = view[:size]
             del space  # a view that is kept would keep a frame from growing
-            connection.buffer_updated(size)
+            self._connection.buffer_updated(size)
             view = view[size:]
 
     def _spares(self) -> bool:
         """Whether it has not sent too much that says nothing; who has is gone."""
         if self._spare.take(1, time.monotonic()):
             return True
-        self.connection.complain("too_many_pings", f"more than {PINGS_PER_S:g} pings or empty messages a second")
+        self._complain("too_many_pings", f"more than {PINGS_PER_S:g} pings or empty messages a second")
         self.abort()
         return False
 
+    def _complain(self, name: str, problem: str) -> None:
+        if self._connection is not None:
+            self._connection.complain(name, problem)
+
     async def _end(self, code: WSCloseCode, why: str) -> None:
-        self.connection.complain("not_binary", why)
+        self._complain("not_binary", why)
         with suppress(ConnectionError):
             await self._socket.close(code=code)
 
@@ -471,7 +486,7 @@ class WebSocketTransport(asyncio.Transport):
         return True if name == "websocket" else self._below.get_extra_info(name, default)
 
     def is_closing(self) -> bool:
-        return self._closing is not None or self._lost or self._below.is_closing()
+        return self._closing is not None or self._connection is None or self._below.is_closing()
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         self.writelines([data])

@@ -45,6 +45,11 @@ class Writer:
         self._transport = transport
         transport.set_write_buffer_limits(high=BUFFER_BYTES)
 
+    def detach(self) -> None:
+        """It has ended."""
+        with self._lock:
+            self._transport = ENDED
+
     # -- past the loop -------------------------------------------------------------------------------------------
 
     def open_direct(self) -> None:
@@ -141,6 +146,26 @@ class Writer:
             self.flush()
             self.write(self._outbox.take(self._outbox.bytes))
             self._transport.close()
+
+
+class _Ended(asyncio.Transport):
+    """In the place of a transport that has ended. TLS's and its protocol know each other for ever, which would keep
+    what a connection has until Python looks for circles."""
+
+    def is_closing(self) -> bool:
+        return True
+
+    def get_write_buffer_size(self) -> int:
+        return 0
+
+    def abort(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+ENDED = _Ended()
 
 
 class DirectWriter:

@@ -54,12 +54,17 @@ def registration(node: AddNode | RemoveNode) -> bytes:
     return encode_message(metadata.encode(), encode_data(node))
 
 
+def _nowhere(metadata: Metadata) -> bool:
+    """Of an agent that is registered on no robot."""
+    return False
+
+
 class Recipient:
     """One agent. ``registered_there(metadata)`` says whether it registered a message's node on the robot that sends
     it; ``packages`` are those that an existing robot program has besides the common ones."""
 
     def __init__(
-        self, registered_there: Callable[[Metadata], bool] = lambda metadata: False, packages: Collection[str] = ()
+        self, registered_there: Callable[[Metadata], bool] = _nowhere, packages: Collection[str] = ()
     ) -> None:
         self._registered_there = registered_there
         self._is_robot = False
@@ -77,6 +82,11 @@ class Recipient:
         self._last: dict[str, OwnNode] = {}
         """An existing headset keeps its nodes by name: of two under one name it has the last."""
         self._verdicts: dict[Subject, Verdict] = {}
+
+    def lost(self) -> None:
+        """The agent has left. Who asked for its registrations knows its connection: a circle, which would keep what
+        that has until Python looks for circles."""
+        self._registered_there = _nowhere
 
     def configured(self, agent_type: int, *, existing: bool) -> None:
         """The agent has said what it is."""

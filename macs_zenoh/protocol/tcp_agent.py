@@ -389,6 +389,8 @@ class TcpAgent:
     def lost(self) -> None:
         """The connection has ended."""
         self.state = GONE
+        self._admit = None  # it knows the connection: a circle, which would keep a frame's megabytes for a while
+        self.recipient.lost()
 
     # -- frames --------------------------------------------------------------------------------------------------
 
@@ -530,6 +532,7 @@ class TcpAgent:
         if self._admit is None:
             return True
         grant = self._admit(configuration.token)
+        self._admit = None
         rights = grant.rights if grant is not None else None
         is_robot = configuration.agent_type != UNITY
         if grant is None or (is_robot and rights is not None and not rights.has("robot")):

@@ -11,9 +11,11 @@ import os
 import re
 import socket
 import ssl
+import struct
 import threading
 import time
 import tracemalloc
+import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -26,7 +28,7 @@ from bridge.gateway import Gateway
 from bridge.headset import frames
 from bridge.headset.client import Headset
 from bridge.headset.frames import NodeSpec
-from bridge.headset.stream import Way
+from bridge.headset.stream import Way, open_stream
 from bridge.tokens import store
 from macs_zenoh.agent import Agent, join
 from macs_zenoh.errors import Refused, Unreachable
@@ -729,3 +731,25 @@ async def test_a_flood_leaves_others_their_turn(start_door: StartDoor, what: str
     await flooding
     turns_s.sort()
     assert turns_s[-3] < 0.1, turns_s[-5:]  # what is done once is not what a flood costs
+
+
+@pytest.mark.parametrize("port", ["plain", "tls", "web"])
+async def test_a_connection_that_ends_leaves_no_circle(start_door: StartDoor, port: str) -> None:
+    """What a frame that had begun has taken is given back when its connection ends, and not some time later."""
+    door = await start_door()
+    number, way = door.way(port)
+    gc.collect()
+    gc.disable()
+    try:
+        stream = await open_stream("127.0.0.1", number, way)
+        stream.write(frames.configuration(0, 0, 0))
+        await until(lambda: list(door.gateway.agents.online()))
+        (connection,) = door.gateway.agents.online()
+        peer = weakref.ref(connection.peer)
+        del connection
+        stream.write(struct.pack("<B30xII", 2, 0, 31 << 20) + bytes(1 << 20))
+        await asyncio.sleep(0.2)
+        stream.abort()
+        await until(lambda: peer() is None)
+    finally:
+        gc.enable()
