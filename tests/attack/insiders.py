@@ -146,6 +146,10 @@ WAYS: dict[str, tuple[int, Callable[[Target, str], None]]] = {
 }
 
 
+SEEN = {(puts, "gateway"), (puts, "robot"), (questions, "watching_gateway")}
+"""With these somebody waited for seconds."""
+
+
 def _made(way: Callable[[Target, str], None], kind: str, name: str) -> Callable[[Target], None]:
     def run(target: Target) -> None:
         way(target, name)
@@ -159,4 +163,4 @@ for _kind, _name in INSIDERS.items():
     for _section, _way in WAYS.values():
         _to_headsets = _way is puts and _kind in ("gateway", "watching_gateway", "robot")
         _row = _made(_way, _kind, _name)
-        enter(_row, _section, "certificate", seen=_section == 3, addressed=_to_headsets)
+        enter(_row, _section, "certificate", seen=(_way, _kind) in SEEN, addressed=_to_headsets)
