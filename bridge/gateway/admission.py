@@ -3,12 +3,45 @@
 from __future__ import annotations
 
 import ipaddress
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Mapping, Sequence
 
 STRANGERS_IN_ALL = 1024
 STRANGERS_PER_ADDRESS = 256
 """Connections that have yet to show a token, where one is wanted: each has an id, which agents need."""
+
+
+class Churn:
+    """Connections that end soon, by address: each cost others the time in which it got an id, a presence and what it
+    registered. Who makes many waits before the next is greeted, and others do not."""
+
+    SOON_S = 2.0
+    FREE = 500
+    PER_S = 50.0
+    MOST_S = 3.0
+    """An existing headset waits for its greeting no longer than 5."""
+    ADDRESSES = 4096
+
+    def __init__(self) -> None:
+        self._owed: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        """How many, and when that was so; who owed last is at the end."""
+
+    def ended(self, address: str, lived_s: float, now: float) -> None:
+        """A connection that was greeted has ended."""
+        if lived_s >= self.SOON_S:
+            return
+        self._owed[address] = (self._owes(address, now) + 1, now)
+        self._owed.move_to_end(address)
+        if len(self._owed) > self.ADDRESSES:
+            self._owed.popitem(last=False)
+
+    def wait_s(self, address: str, now: float) -> float:
+        """How long the next connection from there is not greeted."""
+        return min(self.MOST_S, max(0.0, self._owes(address, now) - self.FREE) / self.PER_S)
+
+    def _owes(self, address: str, now: float) -> float:
+        owed, at = self._owed.get(address, (0.0, now))
+        return max(0.0, owed - (now - at) * self.PER_S)
 
 
 class Admission:

@@ -115,6 +115,7 @@ class Connection(asyncio.BufferedProtocol):
         """What may be said to the agent."""
         self.pace: Pace
         self.greeted = False
+        self.greeted_at = -math.inf
         self.host = self.address = "?"
         self.drops = Losses(log)
         self._outbox = Outbox(outbox_bytes)
@@ -190,7 +191,7 @@ class Connection(asyncio.BufferedProtocol):
         """The agent has an id: tell it, and begin to listen."""
         self.peer = peer
         self.recipient = peer.recipient
-        self.greeted = True
+        self.greeted, self.greeted_at = True, time.monotonic()
         self.pace = self.owner.pace()
         self._writer.write([peer.welcome()])
         self.resume()

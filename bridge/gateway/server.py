@@ -75,7 +75,7 @@ from macs_zenoh.protocol.wire import Layout
 from macs_zenoh.registration_calls import RobotCalls, StreamChanges
 from macs_zenoh.timeouts import within
 
-from .admission import Admission
+from .admission import Admission, Churn
 from .agents import Agents, Group
 from .connection import Connection
 from .declarations import AgentDeclarations
@@ -136,6 +136,9 @@ class Gateway:
         """Who is online, as the answer to whoever asks; empty when that has changed."""
         self._memory = Memory(settings.outbox_bytes, settings.max_frame_bytes)
         self._numbers = 0
+        self._churn = Churn()
+        self._coming: dict[Connection, asyncio.TimerHandle] = {}
+        """Who is not greeted yet, since many from there have come and gone."""
         self._waiting = WaitingRoom(settings.handshake_timeout_s, self._no_id)
         self._subscriptions: dict[str, Subscription] = {}
         self._door = Door(
@@ -227,7 +230,7 @@ class Gateway:
         self._door.close()
         self._renumbering.close()
         self._robots.close()
-        connections = [*self.agents.connections(), *self._waiting]
+        connections = [*self.agents.connections(), *self._waiting, *self._coming]
         self._waiting.close()
         if connections:
             for connection in connections:
@@ -269,9 +272,19 @@ class Gateway:
             self._drops.once(name, "%s is refused: %s", connection.address, why)
             return False
         self._admission.enter(connection.host, stranger=connection.stranger)
+        wait_s = self._churn.wait_s(connection.host, time.monotonic())
+        if wait_s:
+            self._drops.once("coming_and_going", "%s waits: many from there have just left", connection.address)
+            timer = asyncio.get_running_loop().call_later(wait_s, self._let_in, connection)
+            self._coming[connection] = timer
+        else:
+            self._let_in(connection)
+        return True
+
+    def _let_in(self, connection: Connection) -> None:
+        self._coming.pop(connection, None)
         self._waiting.enter(connection)
         self._greet_waiting()
-        return True
 
     def _greet_waiting(self) -> None:
         """Give waiting connections ids of our blocks that no agent of any type has."""
@@ -331,8 +344,12 @@ class Gateway:
         self._known(connection)
         self._door.leave(connection)
         if not connection.greeted:
+            if (timer := self._coming.pop(connection, None)) is not None:
+                timer.cancel()
             self._waiting.leave(connection)
             return
+        now = time.monotonic()
+        self._churn.ended(connection.host, now - connection.greeted_at, now)
         if connection.peer.dials_a_router:
             what = "%s is a Zenoh program: it wants a router, and this is a gateway"
             self._drops.once("zenoh_program", what, connection.address)

@@ -148,6 +148,10 @@ class RobotAgent:
                 self.nodes.deliver(message)
             elif message.metadata.message_manager in self._managers:
                 self._manage(message)
+            elif message.metadata.message_manager in REQUESTS and self.agent.mesh.backlogged:
+                self.nodes.drops.note(
+                    "flooded", str(Registrant.of(message)), "answers that nobody takes fill the link"
+                )
             elif message.metadata.message_manager in REQUESTS:
                 # an answer may take a while; an emergency stop behind it must not wait
                 self._answering[answer := asyncio.create_task(self._answer(message))] = Registrant.of(message)

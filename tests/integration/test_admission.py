@@ -13,6 +13,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from bridge.gateway import Gateway
+from bridge.gateway.admission import Churn
 from bridge.gateway.leases import Leases
 from bridge.headset import frames
 from macs_zenoh.mesh import Mesh
@@ -210,3 +211,28 @@ async def test_without_descriptors_it_is_said() -> None:
             except ConnectionError:  # it has not yet seen that the others are gone
                 assert time.monotonic() < deadline
     assert "there are no descriptors left" in "\n".join(gateway.log)
+
+
+async def test_many_that_come_and_go_wait_and_others_do_not(
+    start_gateway: StartGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After so many short connections from one address the next from there is greeted, later; and it is said. From
+    elsewhere nobody waits for that: a headset is greeted while the other one is not."""
+    monkeypatch.setattr(Churn, "FREE", 20)
+    monkeypatch.setattr(Churn, "PER_S", 2.0)
+    gateway = await start_gateway()
+
+    async def greeted(address: str) -> asyncio.StreamWriter:
+        reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port, local_addr=(address, 0))
+        assert await asyncio.wait_for(reader.read(8), PATIENCE_S)
+        return writer
+
+    for _ in range(25):
+        (await greeted("127.0.0.2")).close()
+    await until(lambda: not gateway.agents)
+    waiting = asyncio.create_task(greeted("127.0.0.2"))
+    await until(lambda: gateway.drops["coming_and_going"])
+    other = await greeted("127.0.0.1")
+    assert not waiting.done()
+    (await waiting).close()
+    other.close()
