@@ -27,7 +27,7 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, split_message
 from tests.integration.test_limits import answers, memory_bytes, site
 from tests.support.given import Connect, StartGateway
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 
 @cache
@@ -101,7 +101,7 @@ async def test_a_costly_frame_costs_only_itself(what: str) -> None:
         await attacker.send(
             encode_frame(2, [neighbour.id], message=encode_message(Metadata(2, 0, 1, "Hello").encode()))
         )
-        message = await asyncio.wait_for(neighbour.receive(), 20)
+        message = await asyncio.wait_for(neighbour.receive(), PATIENCE_S)
         assert message.metadata.message_manager == "Hello"
         await answers(neighbour)
         await until(lambda: memory_bytes(gateway.pid) - before < 48 << 20)
@@ -142,7 +142,7 @@ async def test_topic_data_of_a_robot_under_any_name(start_gateway: StartGateway,
         await robot.send(encode_frame(management=management, message=encode_message(metadata, b"data")))
     hello = Metadata(1, 1, 0, "Hello").encode()
     await robot.send(encode_frame(2, [neighbour.id], message=encode_message(hello)))
-    message = await asyncio.wait_for(neighbour.receive(), 20)
+    message = await asyncio.wait_for(neighbour.receive(), PATIENCE_S)
     assert message.metadata.message_manager == "Hello"
     await answers(await connect(gateway))
 
@@ -194,7 +194,7 @@ async def test_half_frames_are_not_kept_for_ever(start_gateway: StartGateway, co
     for at in range(0, len(big), 100_000):
         await slow.send(big[at : at + 100_000])
         await asyncio.sleep(0.5)
-    while (message := await asyncio.wait_for(neighbour.receive(), 20)).metadata.message_manager != "Big":
+    while (message := await asyncio.wait_for(neighbour.receive(), PATIENCE_S)).metadata.message_manager != "Big":
         pass
     assert len(message.data) == 600_000
     await until(lambda: gateway.drops["unfinished_frame"] == 1)
@@ -245,7 +245,7 @@ async def test_destinations_that_are_made_up_cost_nothing(start_gateway: StartGa
         await answers(neighbour)
     await sending
     await attacker.send(encode_frame(2, [neighbour.id, 70], message=hello))
-    message = await asyncio.wait_for(neighbour.receive(), 20)
+    message = await asyncio.wait_for(neighbour.receive(), PATIENCE_S)
     assert message.metadata.message_manager == "Hello"
     outlets = sum(map(len, gateway.mesh._outgoing._outlets.values()))
     assert outlets < 200
@@ -261,7 +261,7 @@ async def test_keys_that_are_used_again_get_a_publisher(start_gateway: StartGate
         await sender.send(str(number).encode(), to=2, ids=[receiver.id], manager="Greeting")
         if number < 4:
             await answers(sender)
-    found = [int((await asyncio.wait_for(receiver.receive(), 20)).data) for _ in range(20)]
+    found = [int((await asyncio.wait_for(receiver.receive(), PATIENCE_S)).data) for _ in range(20)]
     assert found == list(range(20))
     assert any(
         f"/{receiver.id}/unity/" in key for outlets in gateway.mesh._outgoing._outlets.values() for key in outlets

@@ -6,25 +6,30 @@ import asyncio
 import struct
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterable, Iterator
 
 import pytest
 
 from benchmarks import sequence
 from benchmarks.headset import TOPIC, Headset
 from bridge.headset import frames
+from bridge.headset.client import Headset as Looking
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.mesh.arrivals import Arrivals
+from tests.support.local import PATIENT_MS
 from tests.support.programs import Program, free_port
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 KEY, ECHO = "macs/to/ros/7/from/unity/256", "macs/to/ros/8/from/unity/256"
-SETTINGS = """[gateway]
+SETTINGS = f"""[gateway]
 robots = "any"
 max_commands_per_s = 0
 max_requests_per_s = 0
+[mesh]
+block_limit_ms = {PATIENT_MS}
 """
+"""A program that gets no time for half a second is a busy machine here, not one that is gone."""
 
 
 @pytest.fixture
@@ -35,7 +40,7 @@ async def two_ports(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[t
     settings.write_text(SETTINGS)
     options = ("-e", endpoint, "--settings", str(settings))
     async with (
-        Program("router", "-l", endpoint),
+        Program("router", "-l", endpoint, "--settings", str(settings)),
         Program("gateway", "--port", str(near), *options),
         Program("gateway", "--port", str(far), *options),
     ):
@@ -49,7 +54,8 @@ async def port(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[int]:
     settings = tmp_path_factory.mktemp("gateway") / "settings.toml"
     settings.write_text(SETTINGS)
     options = ("--port", str(port), "-e", endpoint, "--settings", str(settings))
-    async with Program("router", "-l", endpoint), Program("gateway", *options):
+    router = Program("router", "-l", endpoint, "--settings", str(settings))
+    async with router, Program("gateway", *options):
         yield port
 
 
@@ -59,7 +65,7 @@ def pieces(frames_: Iterator[bytes]) -> bytes:
 
 
 class Receiver(threading.Thread):
-    """Reads at most so many bytes per second until it has all, or nothing comes for 5 s."""
+    """Reads at most so many bytes per second until it has all, or nothing comes for long."""
 
     def __init__(self, headset: Headset, wanted: int, bytes_per_s: float = 1e9) -> None:
         super().__init__(daemon=True)
@@ -69,7 +75,7 @@ class Receiver(threading.Thread):
 
     def run(self) -> None:
         sock = self._headset.socket
-        sock.settimeout(5)
+        sock.settimeout(PATIENCE_S)
         buffer, began, taken = bytearray(), time.monotonic(), 0
         try:
             while len(self.numbers) < self._wanted and (piece := sock.recv(64 << 10)):
@@ -103,10 +109,19 @@ def send(headset: Headset, data: bytes) -> threading.Thread:
     return thread
 
 
+async def known(ports: Iterable[int], headsets: Iterable[Headset]) -> None:
+    """Wait until each gateway knows of all of them."""
+    wanted = {headset.id for headset in headsets}
+    for port in ports:
+        async with await Looking.connect("127.0.0.1", port) as looking:
+            while not wanted <= set((await looking.online(PATIENCE_S)).unity_agent_ids):
+                await asyncio.sleep(0.02)
+
+
 async def ended(*threads: threading.Thread) -> None:
     """Wait for threads."""
     for thread in threads:
-        await asyncio.to_thread(thread.join, 60)
+        await asyncio.to_thread(thread.join, 2 * PATIENCE_S)
         assert not thread.is_alive()
 
 
@@ -115,7 +130,7 @@ async def test_many_senders_with_destinations_in_turn(port: int) -> None:
     receivers = [Headset.join(port, 0) for _ in range(2)]
     senders = [Headset.join(port, 0) for _ in range(8)]
     ways = [{"ids": [receiver.id], "groups": []} for receiver in receivers]
-    await asyncio.sleep(0.5)
+    await known([port], [*receivers, *senders])
     count = 6000
     loads = [pieces(sequence.messages(sender.id, 64, count, ways)) for sender in senders]
     reading = [Receiver(receiver, count // 2 * len(senders)) for receiver in receivers]
@@ -133,7 +148,7 @@ async def test_many_destinations_in_each_message(port: int) -> None:
     senders = [Headset.join(port, 0) for _ in range(4)]
     ids = [receiver.id for receiver in receivers]
     ways = [{"ids": ids, "groups": []}, {"ids": ids[::-1], "groups": []}]
-    await asyncio.sleep(0.5)
+    await known([port], [*receivers, *senders])
     count = 3000
     loads = [pieces(sequence.messages(sender.id, 16, count, ways)) for sender in senders]
     reading = [Receiver(receiver, count * len(senders)) for receiver in receivers]
@@ -148,7 +163,7 @@ async def test_many_destinations_in_each_message(port: int) -> None:
 async def test_a_receiver_that_is_slower_than_its_sender(port: int) -> None:
     """A headset that reads 15 MB a second gets all 40 MB of one that sends as fast as it can."""
     receiver, sender = Headset.join(port, 0), Headset.join(port, 0)
-    await asyncio.sleep(0.5)
+    await known([port], [receiver, sender])
     count = 40_000_000 // (64 << 10)
     load = pieces(sequence.messages(sender.id, 64 << 10, count, [{"ids": [receiver.id], "groups": []}]))
     reading = Receiver(receiver, count, 15e6)
@@ -161,7 +176,7 @@ async def test_a_receiver_that_is_slower_than_its_sender(port: int) -> None:
 async def test_a_slower_receiver_behind_another_gateway(two_ports: tuple[int, int], size: int) -> None:
     """The same between two gateways: the receiver's says that it is full, and the sender's reads less."""
     sender, receiver = Headset.join(two_ports[0], 0), Headset.join(two_ports[1], 0)
-    await asyncio.sleep(1)
+    await known(two_ports, [sender, receiver])
     count = 60_000_000 // size
     load = pieces(sequence.messages(sender.id, size, count, [{"ids": [receiver.id], "groups": []}]))
     reading = Receiver(receiver, count, 15e6)
@@ -174,7 +189,7 @@ async def test_slower_receivers_in_a_group_behind_another_gateway(two_ports: tup
     """Of five in a group each gets everything, though they read at different rates, from two senders."""
     receivers = [Headset.join(two_ports[1], 7) for _ in range(5)]
     senders = [Headset.join(two_ports[0], 0) for _ in range(2)]
-    await asyncio.sleep(1)
+    await known(two_ports, [*receivers, *senders])
     count = 20_000_000 // (64 << 10)
     way = [{"ids": [], "groups": [7]}]
     loads = [pieces(sequence.messages(sender.id, 64 << 10, count, way)) for sender in senders]
@@ -191,7 +206,7 @@ async def test_large_frames_to_many_slow_receivers_elsewhere(two_ports: tuple[in
     """However many receivers are full at once, a sender's frame comes to its end: four a second go on."""
     sender = Headset.join(two_ports[0], 0)
     receivers = [Headset.join(two_ports[1], 0) for _ in range(10)]
-    await asyncio.sleep(1)
+    await known(two_ports, [sender, *receivers])
     ids = [receiver.id for receiver in receivers]
     load = pieces(sequence.messages(sender.id, 3 << 20, 6, [{"ids": ids, "groups": []}]))
     reading = [Receiver(receiver, 6, 6e6) for receiver in receivers]
@@ -205,7 +220,7 @@ async def test_large_frames_to_many_slow_receivers_elsewhere(two_ports: tuple[in
 async def test_a_receiver_elsewhere_that_has_stopped_stops_nobody(two_ports: tuple[int, int]) -> None:
     """Whose receiver behind another gateway reads nothing at all is soon read from as before."""
     sender, stalled = Headset.join(two_ports[0], 0), Headset.join(two_ports[1], 0)
-    await asyncio.sleep(1)
+    await known(two_ports, [sender, stalled])
     load = pieces(sequence.messages(sender.id, 64 << 10, 1500, [{"ids": [stalled.id], "groups": []}]))
     await ended(send(sender, load))  # of more than all that may wait anywhere
 
@@ -239,7 +254,7 @@ async def registered(robot: Headset, headsets: list[Headset]) -> None:
     for headset in headsets:
         headset.socket.sendall(frames.registration(headset.id, TOPIC, [robot.id], []))
     told = bytearray()
-    robot.socket.settimeout(10)
+    robot.socket.settimeout(PATIENCE_S)
     while told.count(b"nd__bench") < len(headsets):
         told += await asyncio.to_thread(robot.socket.recv, 65536)
 

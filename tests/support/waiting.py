@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 """How long something may take that takes a moment on a machine with nothing else to do."""
 SHOWN = 400
 """How many characters of a value are shown."""
