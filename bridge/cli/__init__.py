@@ -15,6 +15,7 @@ from typing import Any
 
 from bridge.cli import (
     agent,
+    audit,
     awareness,
     completion,
     conformance,
@@ -50,6 +51,7 @@ VERBS = {
     "doctor": doctor,
     "security": security,
     "conformance": conformance,
+    "audit": audit,
     "token": token,
     "init": init,
     "keys": keys,

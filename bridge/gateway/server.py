@@ -16,6 +16,7 @@ from functools import partial
 
 from msgspec import structs
 
+from bridge.audit import NO_AUDIT, Audit, open_audit, who
 from bridge.listening import for_others
 from bridge.settings import GatewaySettings
 from bridge.tokens.store import path_of
@@ -29,7 +30,7 @@ from macs_zenoh.protocol.budget import Budget
 from macs_zenoh.protocol.credit import Credits
 from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.directory import Change
-from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM, UNICAST
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
 from macs_zenoh.protocol.limits import (
     NAMED_EACH,
     NAMED_IN_ALL,
@@ -51,6 +52,7 @@ from macs_zenoh.protocol.messages import (
     NodeType,
     OnlineReply,
     Refusal,
+    RemoveNode,
     encode_data,
 )
 from macs_zenoh.protocol.rate_limit import Pace
@@ -151,6 +153,7 @@ class Gateway:
         self.directory = self._presence.directory
         """Who is online."""
         self._robot_ids = RobotIds(settings.robots)
+        self._audit: Audit = NO_AUDIT
         stead = Stead(mesh, self._layout)
         judged = JudgedFrames()
         self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged)
@@ -197,6 +200,11 @@ class Gateway:
 
         Raises ConfigError when the block is somebody else's, Unreachable when the port cannot be had.
         """
+        settings = self.settings
+        name = f"gateway {joined(for_others(settings.host), settings.port)}"
+        self._audit = open_audit(
+            settings.audit_file, name, settings.audit_max_bytes, settings.audit_files, self._audit_lost
+        )
         self.mesh.tells, self.mesh.away = self._now, self._away
         await self._presence.start()
         self.mesh.on_link(lambda up: self._robots.repeat_all() if up else None)
@@ -222,7 +230,11 @@ class Gateway:
 
     def _now(self) -> dict[str, int]:
         """What `macs doctor` is told besides losses."""
-        return {"waiting_for_id": len(self._waiting)} if self._waiting.longest_s > NAMED_S else {}
+        waiting = {"waiting_for_id": len(self._waiting)} if self._waiting.longest_s > NAMED_S else {}
+        return {**waiting, **self._audit.troubles()}
+
+    def _audit_lost(self, count: int) -> None:
+        self._drops.once("audit_lost", "the record of who did what is not whole", count=count, level=logging.ERROR)
 
     async def close(self) -> None:
         """Stop accepting, tell the mesh, send what waits for ``FLUSH_S`` at most, leave."""
@@ -248,6 +260,7 @@ class Gateway:
         self._presence.close()
         for subscription in self._subscriptions.values():
             subscription.close()
+        await asyncio.to_thread(self._audit.close)
         if self.drops:
             log.info("lost in all: %s", ", ".join(f"{name} {count}" for name, count in sorted(self.drops.items())))
 
@@ -270,6 +283,7 @@ class Gateway:
         if refusal is not None:
             name, why = refusal
             self._drops.once(name, "%s is refused: %s", connection.address, why)
+            self._audit.note("refused", who(address=connection.address), name, why)
             return False
         self._admission.enter(connection.host, stranger=connection.stranger)
         wait_s = self._churn.wait_s(connection.host, time.monotonic())
@@ -366,6 +380,7 @@ class Gateway:
         if was_online:
             self._declarations.undeclare(connection.key)
             self._robots.leave(connection.key)
+            self._audit.note("left", _who(connection))
             log.debug("%s is offline", connection)
         if not self.agents:
             self._all_closed.set()
@@ -410,6 +425,7 @@ class Gateway:
         elif isinstance(event, Forbidden):
             self._tell_forbidden(connection, event)
         elif isinstance(event, NotLetIn):
+            self._audit.note("refused", who(address=connection.address), "join", "no valid token")
             self._tell_access(connection, AccessRefused("no_token", "a valid token is wanted here"))
         elif isinstance(event, Withdrawn):
             self._withdraw(connection, event)
@@ -443,6 +459,7 @@ class Gateway:
             if not connection.peer.extensions:  # an existing program, which cannot say it itself
                 node = structs.replace(node, unity_cdr=True)
         self._robots.register(node, event.robot_ids, event.groups)
+        self._audit.note(*_registering(connection, node, event))
         if not isinstance(node, AddNode) and self._robots.find(connection.key, node.node_type, node.node_name) is None:
             connection.recipient.unregistered(node.node_name, node.node_type)
         self._nodes.set(connection, connection.host, connection.recipient.node_count)
@@ -470,6 +487,8 @@ class Gateway:
         connection = self.agents.find(*agent)
         if connection is None:
             return
+        what = f"type {refused.node_type} {refused.tos_name or refused.node_name} at robot {refused.robot_id}"
+        self._audit.note("register", _who(connection), what, refused.reason)
         connection.peer.registration_refused(refused)
         if self.settings.tell_refusals:
             connection.send_call(to_agent(refused))
@@ -486,6 +505,8 @@ class Gateway:
             (about.node_type, about.node_name, about.message_manager, event.robots, event.reason)
         ):
             return
+        what = f"type {about.node_type} {about.node_name}" if about.node_name else about.message_manager or "message"
+        self._audit.note("message", _who(connection), what, event.reason)
         if not (about.node_name and connection.peer.extensions):
             self._tell_access(connection, AccessRefused(kind, event.reason, about.request_id))
             return
@@ -506,6 +527,7 @@ class Gateway:
     def _rights_changed(self, connection: Connection, grant: Grant) -> None:
         """A token has other rights: they hold at once."""
         log.info("%s has other rights: its token %s has changed", connection, grant.name)
+        self._audit.note("token_changed", _who(connection))
         events = connection.peer.rights_change(grant)
         self._tell_access(connection, AccessRefused("changed", "the rights of this token have changed"))
         for event in events:
@@ -513,6 +535,7 @@ class Gateway:
 
     def _token_ended(self, connection: Connection) -> None:
         """A token holds no longer, and so do the connections of who came in by it."""
+        self._audit.note("token_ended", _who(connection))
         self._tell_access(connection, AccessRefused("ended", "this token holds no longer"))
         connection.close("its token holds no longer")
 
@@ -527,6 +550,7 @@ class Gateway:
         self._enter_group(connection)
         self._renumbering.joined(connection)
         by = f" with token {connection.peer.grant.name}" if connection.peer.grant.name else ""
+        self._audit.note("joined", _who(connection), f"group {event.group}" if event.group else "")
         log.info("%s is online%s%s", connection, f" in group {event.group}" if event.group else "", by)
 
     def _admit(self, connection: Connection) -> bool:
@@ -536,6 +560,7 @@ class Gateway:
         agent_id = self._robot_ids.choose(before, lambda each: each in self.agents.ids or self._is_elsewhere(each))
         if agent_id is None:
             self._drops["robot_not_allowed"] += 1
+            self._audit.note("refused", who(address=connection.address), "join as robot", self._robot_ids.problem)
             connection.close(self._robot_ids.problem)
             return False
         if agent_id != before:
@@ -629,3 +654,17 @@ class Gateway:
                 self._robots.presence(change)
             except Exception:  # one robot's registrations must not cost another its own
                 log.exception("telling %s what is registered for it failed", change.agent)
+
+
+def _who(connection: Connection) -> dict[str, str]:
+    kind, agent_id = connection.key
+    return who(f"{type_name(kind)}/{agent_id}", connection.address, connection.peer.grant.name)
+
+
+def _registering(
+    connection: Connection, node: AddNode | RemoveNode, event: Registering
+) -> tuple[str, dict[str, str], str]:
+    at = [f"robot {each}" for each in event.robot_ids] + [f"group {each}" for each in event.groups]
+    name = node.tos_name if isinstance(node, AddNode) else node.node_name
+    verb = "register" if isinstance(node, AddNode) else "deregister"
+    return verb, _who(connection), f"type {node.node_type} {name} at {', '.join(at) or 'nobody'}"

@@ -16,6 +16,7 @@ from contextlib import asynccontextmanager
 from typing import TypeVar
 
 import macs_zenoh
+from bridge.audit import open_audit, who
 from bridge.ros import parameters
 from bridge.ros.checked import CheckedSettings
 from bridge.ros.graph import NamesAndTypes, Offers
@@ -96,6 +97,13 @@ class RobotAgent:
             prioritise_stream=self.streams.prioritise,
             keep_stream=self.streams.keep,
         )
+        self._audit = robot.audit = open_audit(
+            settings.audit_file,
+            f"robot {agent.id}",
+            settings.audit_max_bytes,
+            settings.audit_files,
+            lambda count: robot.drops.note("audit_lost", "", "the record of who did what is not whole", count),
+        )
         self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
         self.checked = CheckedSettings(robot.rules, robot.drops)
         self.offers = Offers(robot, self.streams.publish, self._graph_changed)
@@ -171,6 +179,7 @@ class RobotAgent:
         self.nodes.close()
         if self.stop_line is not None:
             await self.stop_line.close()
+        await asyncio.to_thread(self._audit.close)
 
     # -- plain requests ------------------------------------------------------------------------------------------
 
@@ -204,7 +213,7 @@ class RobotAgent:
         troubles = {"wrong_settings": len(self.checked.wrong)}
         if self.nodes.stop is not None:
             troubles["shared_graph"] = len(self.nodes.stop.shared_with)
-        return {name: count for name, count in troubles.items() if count}
+        return {name: count for name, count in (troubles | self._audit.troubles()).items() if count}
 
     def _state(self) -> bytes:
         return status(self.nodes, self.session.full_name, self.agent.drops + self.agent.mesh.drops)
@@ -222,7 +231,13 @@ class RobotAgent:
         request = _own(decode_data(AddNode, call.data), call)
         registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
         await self._until_judged(registrant)
-        await self.nodes.add(request)
+        what = f"type {request.node_type} {request.tos_name}"
+        try:
+            await self.nodes.add(request)
+        except Refused as refusal:
+            self._audit.note("register", who(str(registrant)), what, refusal.reason)
+            raise
+        self._audit.note("register", who(str(registrant)), what)
         if registrant not in self.agent.directory:
             asyncio.get_running_loop().call_later(ABSENT_S, self._forget_absent, registrant)
         return b""
@@ -242,7 +257,10 @@ class RobotAgent:
             self.nodes.forget(registrant)
 
     async def _remove_node(self, call: Call) -> bytes:
-        self.nodes.remove(_own(decode_data(RemoveNode, call.data), call))
+        request = _own(decode_data(RemoveNode, call.data), call)
+        self.nodes.remove(request)
+        registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
+        self._audit.note("deregister", who(str(registrant)), f"type {request.node_type} {request.node_name}")
         return b""
 
     async def _offers(self, _call: Call) -> bytes:

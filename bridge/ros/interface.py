@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 from rclpy.exceptions import NameValidationException
 from rclpy.type_support import NoTypeSupportImportedException
 
+from bridge.audit import NO_AUDIT, Audit
 from bridge.ros.alarms import Alarms
 from bridge.ros.early import NodeKey
 from bridge.ros.refusals import Refusals
@@ -85,6 +86,7 @@ class Robot:
         stop: the emergency stop.
         alarms: calls back at a time, whatever the loop is busy with.
         refusals: who was told lately why what he sent was not taken.
+        audit: the record of who did what.
     """
 
     session: RosSession
@@ -101,6 +103,7 @@ class Robot:
     keep_stream: Callable[[str, int | None], bool] = lambda node, frames: False
     alarms: Alarms = field(default_factory=Alarms)
     refusals: Refusals = field(default_factory=Refusals)
+    audit: Audit = NO_AUDIT
 
     def tell_refused(self, message: Message, topic: str, kind: str, reason: str) -> None:
         """Tell a message's sender why it was not taken; ``kind`` is the name under which that is counted."""

@@ -11,12 +11,15 @@ from collections.abc import Mapping
 
 import msgspec
 
+from bridge.audit import who
 from bridge.ros.interface import Registrant, full_name
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.topics import PublisherNode
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import NodeType
 from macs_zenoh.protocol.robot_state import ControlReply, ControlRequest, RobotStatus, StopStatus
+
+_NOTES = {"take": "control_taken", "release": "control_released", "give": "control_given"}
 
 
 def control(nodes: InterfaceNodes, sender: Registrant, request: ControlRequest, now: float) -> ControlReply:
@@ -39,6 +42,9 @@ def control(nodes: InterfaceNodes, sender: Registrant, request: ControlRequest, 
             done = node.control.give(sender, Registrant(request.to_type, request.to), now)
         holder = node.control.holder(now)
     reason = "" if done else f"{holder or 'nobody'} has control"
+    if not done or request.action != "take":  # `Control` tells of what is taken
+        what = f"{node.topic} to {Registrant(request.to_type, request.to)}" if request.action == "give" else node.topic
+        nodes.robot.audit.note(_NOTES[request.action], who(str(sender)), what, reason or "done")
     return ControlReply(done, str(holder) if holder else "", reason)
 
 

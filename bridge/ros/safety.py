@@ -6,7 +6,7 @@ Pure: the time is passed in, in seconds. Agents are whatever identifies them.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 
 
@@ -22,6 +22,8 @@ class Control:
         self._holder: Hashable | None = None
         self._since = -math.inf
         self._until = -math.inf
+        self.on_taken: Callable[[Hashable], None] = lambda agent: None
+        """Is told who has taken control that was free."""
 
     def holder(self, now: float) -> Hashable | None:
         """Who has control; None while it is free."""
@@ -40,9 +42,10 @@ class Control:
         holder = self.holder(now)
         if holder not in (None, agent):
             return False
+        self._holder, self._until = agent, now + self.hold_s
         if holder is None:
             self._since = now
-        self._holder, self._until = agent, now + self.hold_s
+            self.on_taken(agent)
         return True
 
     def give(self, agent: Hashable, to: Hashable, now: float) -> bool:

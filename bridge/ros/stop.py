@@ -17,6 +17,7 @@ from typing import Any
 from msgspec import UNSET, structs
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from bridge.audit import who
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.rules import names_agent
 from bridge.ros.shared_stop import A_NODE, SharedStop, StopState
@@ -109,6 +110,13 @@ class StopNode(InterfaceNode):
 
     def set(self, sender: Registrant, stop: bool) -> None:
         """Stop or release. Raises Refused when the settings do not allow it to this agent."""
+        try:
+            self._set(sender, stop)
+        except Refused as refusal:
+            self.robot.audit.note("stop" if stop else "release", who(str(sender)), self.topic, refusal.reason)
+            raise
+
+    def _set(self, sender: Registrant, stop: bool) -> None:
         if stop:
             if not self._names(self.robot.rules.settings.stop_allow, sender):
                 raise Refused(f"{sender} may not stop this robot")
@@ -130,6 +138,7 @@ class StopNode(InterfaceNode):
             if self.robot.stop.press(by, time.time()):
                 self._has_stopped()
             elif self.robot.stop.changes != before:
+                self.robot.audit.note("stop", who(by), self.topic, "it was stopped before")
                 self._tell()
 
     def release(self, by: str) -> None:
@@ -184,10 +193,12 @@ class StopNode(InterfaceNode):
             self._on_stop(by)
         finally:
             self._tell()
+        self.robot.audit.note("stop", who(by), self.topic)
         log.warning("emergency stop by %s; commands are refused until it is released", by)
 
     def _has_been_released(self) -> None:
         self._tell()
+        self.robot.audit.note("release", who(self.robot.stop.by), self.topic)
         log.warning("emergency stop released by %s", self.robot.stop.by)
 
     def _tell(self) -> None:

@@ -20,6 +20,7 @@ from msgspec import UNSET, UnsetType, structs
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.serialization import serialize_message
 
+from bridge.audit import who
 from bridge.ros import fields, qos
 from bridge.ros.alarms import Alarm
 from bridge.ros.gaps import Gaps
@@ -318,6 +319,8 @@ class PublisherNode(TopicNode):
         if self.rule.read_only:
             raise Refused(f"headsets may only read {self.topic} on this robot")
         self.control = Control(self.rule.hold_s or DEFAULT_HOLD_S) if self.rule.exclusive else None
+        if self.control is not None:
+            self.control.on_taken = lambda agent: robot.audit.note("control_taken", who(str(agent)), self.topic)
         self.deadman = DeadMan(self.rule.deadman_s) if self.rule.deadman_message is not None else None
         self._stop_cdr = b""
         self._stopped_at = -math.inf
@@ -440,8 +443,8 @@ class PublisherNode(TopicNode):
 
     def left(self, agent: Registrant) -> None:
         with self.lock:
-            if self.control is not None:
-                self.control.release(agent)
+            if self.control is not None and self.control.release(agent):
+                self.robot.audit.note("control_released", who(str(agent)), self.topic, "it left")
             if self.deadman is not None and self.deadman.left(agent):
                 self._publish_stop(self.deadman.why, logging.INFO)  # as it does every day
 

@@ -93,6 +93,13 @@ class GatewaySettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=
     robot_packages: list[str] = []
     """Packages of ROS types that existing robot programs here have, besides the common ones and those of the topics
     and services that they name. A type of another package ends such a program's thread, so it is refused."""
+    audit_file: str | None = None
+    """File for a record of who did what, in lines that hang on each other: `macs audit verify` finds what was changed
+    (docs/audit.md). Programs may share one. Unset: none is kept."""
+    audit_max_bytes: Annotated[int, Meta(ge=4096, le=4 * 1024**3)] = 16 * 1024 * 1024
+    """A new file is begun when it has so much; the older one is called ``….000001`` and so on."""
+    audit_files: Annotated[int, Meta(ge=1, le=100_000)] = 20
+    """So many older files are kept."""
     reuse_port: bool = False
     """Share the port with other gateway processes (SO_REUSEPORT); set by ``--workers``."""
 

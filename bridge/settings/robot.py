@@ -145,6 +145,13 @@ class RobotSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     max_message_parts: Annotated[int, Meta(ge=1024, le=10_000_000)] = 1 << 15
     """Strings and structures in a command, a request, an answer or a goal of a headset, where this robot has to
     translate or read it. More is refused: it would hold up everything else. An array of numbers is one part."""
+    audit_file: str | None = None
+    """File for a record of who did what, in lines that hang on each other: `macs audit verify` finds what was changed
+    (docs/audit.md). Programs may share one. Unset: none is kept."""
+    audit_max_bytes: Annotated[int, Meta(ge=4096, le=4 * 1024**3)] = 16 * 1024 * 1024
+    """A new file is begun when it has so much; the older one is called ``….000001`` and so on."""
+    audit_files: Annotated[int, Meta(ge=1, le=100_000)] = 20
+    """So many older files are kept."""
     rules: list[TopicRule] = []
     """What holds for topics, services and actions by name, each a ``[[robot.rules]]`` table."""
     groups: dict[str, list[AgentPattern]] = {}
