@@ -12,7 +12,7 @@ TEXT = 400
 class Audit(Protocol):
     """Takes notes, from any thread, at once."""
 
-    def note(self, event: str, by: Mapping[str, str], what: str = "", result: str = "done") -> None:
+    def record(self, event: str, by: Mapping[str, str], what: str = "", result: str = "done") -> None:
         """``event`` is a word, as joined; ``by`` says `who`; ``result`` is ``done``, or why it was not."""
 
     def troubles(self) -> dict[str, int]:
@@ -25,7 +25,7 @@ class Audit(Protocol):
 class _NoAudit:
     """There is no ``audit_file``."""
 
-    def note(self, event: str, by: Mapping[str, str], what: str = "", result: str = "done") -> None:
+    def record(self, event: str, by: Mapping[str, str], what: str = "", result: str = "done") -> None:
         pass
 
     def troubles(self) -> dict[str, int]:

@@ -78,13 +78,13 @@ class AuditFile:
             self._resume_or_refuse()
         except OSError as error:
             raise ConfigError(str(path), error.strerror or str(error)) from error
-        self.note("started", {}, f"pid {os.getpid()}")
+        self.record("started", {}, f"pid {os.getpid()}")
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
         self._thread.start()
 
     # -- from any thread ---------------------------------------------------------------------------------------------
 
-    def note(self, event: str, by: Mapping[str, str], what: str = "", result: str = "done") -> None:
+    def record(self, event: str, by: Mapping[str, str], what: str = "", result: str = "done") -> None:
         """As `Audit` says."""
         note: Note = {
             "time": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="milliseconds"),
@@ -109,7 +109,7 @@ class AuditFile:
 
     def close(self) -> None:
         """Write what waits, and that the program has stopped; `CLOSE_S` at most."""
-        self.note("stopped", {})
+        self.record("stopped", {})
         with self._wake:
             self._closing = True
             self._wake.notify()

@@ -11,6 +11,8 @@ from collections.abc import Iterable
 from enum import Enum
 from typing import NamedTuple
 
+from macs_zenoh.errors import MacsError
+
 
 class Level(str, Enum):
     """How much is asked of a program."""
@@ -46,11 +48,11 @@ class Verdict(NamedTuple):
     why: str = ""
 
 
-class NotHeld(Exception):
+class NotHeld(MacsError):
     """What a check asks does not hold; the text says what was seen instead."""
 
 
-class NotTried(Exception):
+class NotTried(MacsError):
     """A check cannot be tried on this program; the text says why."""
 
 

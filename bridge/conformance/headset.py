@@ -10,6 +10,7 @@ import asyncio
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
+from macs_zenoh.errors import MacsError
 from macs_zenoh.timeouts import within
 
 from . import client_frames, vectors
@@ -102,7 +103,7 @@ _LOOKS = 3
 _LARGE_BYTES = 1 << 20
 
 
-class Gone(Exception):
+class Gone(MacsError):
     """The headset has no connection any more and makes none."""
 
 

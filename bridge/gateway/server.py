@@ -283,7 +283,7 @@ class Gateway:
         if refusal is not None:
             name, why = refusal
             self._drops.once(name, "%s is refused: %s", connection.address, why)
-            self._audit.note("refused", who(address=connection.address), name, why)
+            self._audit.record("refused", who(address=connection.address), name, why)
             return False
         self._admission.enter(connection.host, stranger=connection.stranger)
         wait_s = self._churn.wait_s(connection.host, time.monotonic())
@@ -380,7 +380,7 @@ class Gateway:
         if was_online:
             self._declarations.undeclare(connection.key)
             self._robots.leave(connection.key)
-            self._audit.note("left", _who(connection))
+            self._audit.record("left", _who(connection))
             log.debug("%s is offline", connection)
         if not self.agents:
             self._all_closed.set()
@@ -425,7 +425,7 @@ class Gateway:
         elif isinstance(event, Forbidden):
             self._tell_forbidden(connection, event)
         elif isinstance(event, NotLetIn):
-            self._audit.note("refused", who(address=connection.address), "join", "no valid token")
+            self._audit.record("refused", who(address=connection.address), "join", "no valid token")
             self._tell_access(connection, AccessRefused("no_token", "a valid token is wanted here"))
         elif isinstance(event, Withdrawn):
             self._withdraw(connection, event)
@@ -459,7 +459,7 @@ class Gateway:
             if not connection.peer.extensions:  # an existing program, which cannot say it itself
                 node = structs.replace(node, unity_cdr=True)
         self._robots.register(node, event.robot_ids, event.groups)
-        self._audit.note(*_registering(connection, node, event))
+        self._audit.record(*_registering(connection, node, event))
         if not isinstance(node, AddNode) and self._robots.find(connection.key, node.node_type, node.node_name) is None:
             connection.recipient.unregistered(node.node_name, node.node_type)
         self._nodes.set(connection, connection.host, connection.recipient.node_count)
@@ -488,7 +488,7 @@ class Gateway:
         if connection is None:
             return
         what = f"type {refused.node_type} {refused.tos_name or refused.node_name} at robot {refused.robot_id}"
-        self._audit.note("register", _who(connection), what, refused.reason)
+        self._audit.record("register", _who(connection), what, refused.reason)
         connection.peer.registration_refused(refused)
         if self.settings.tell_refusals:
             connection.send_call(to_agent(refused))
@@ -506,7 +506,7 @@ class Gateway:
         ):
             return
         what = f"type {about.node_type} {about.node_name}" if about.node_name else about.message_manager or "message"
-        self._audit.note("message", _who(connection), what, event.reason)
+        self._audit.record("message", _who(connection), what, event.reason)
         if not (about.node_name and connection.peer.extensions):
             self._tell_access(connection, AccessRefused(kind, event.reason, about.request_id))
             return
@@ -527,7 +527,7 @@ class Gateway:
     def _rights_changed(self, connection: Connection, grant: Grant) -> None:
         """A token has other rights: they hold at once."""
         log.info("%s has other rights: its token %s has changed", connection, grant.name)
-        self._audit.note("token_changed", _who(connection))
+        self._audit.record("token_changed", _who(connection))
         events = connection.peer.rights_change(grant)
         self._tell_access(connection, AccessRefused("changed", "the rights of this token have changed"))
         for event in events:
@@ -535,7 +535,7 @@ class Gateway:
 
     def _token_ended(self, connection: Connection) -> None:
         """A token holds no longer, and so do the connections of who came in by it."""
-        self._audit.note("token_ended", _who(connection))
+        self._audit.record("token_ended", _who(connection))
         self._tell_access(connection, AccessRefused("ended", "this token holds no longer"))
         connection.close("its token holds no longer")
 
@@ -550,7 +550,7 @@ class Gateway:
         self._enter_group(connection)
         self._renumbering.joined(connection)
         by = f" with token {connection.peer.grant.name}" if connection.peer.grant.name else ""
-        self._audit.note("joined", _who(connection), f"group {event.group}" if event.group else "")
+        self._audit.record("joined", _who(connection), f"group {event.group}" if event.group else "")
         log.info("%s is online%s%s", connection, f" in group {event.group}" if event.group else "", by)
 
     def _admit(self, connection: Connection) -> bool:
@@ -560,7 +560,7 @@ class Gateway:
         agent_id = self._robot_ids.choose(before, lambda each: each in self.agents.ids or self._is_elsewhere(each))
         if agent_id is None:
             self._drops["robot_not_allowed"] += 1
-            self._audit.note("refused", who(address=connection.address), "join as robot", self._robot_ids.problem)
+            self._audit.record("refused", who(address=connection.address), "join as robot", self._robot_ids.problem)
             connection.close(self._robot_ids.problem)
             return False
         if agent_id != before:

@@ -235,9 +235,9 @@ class RobotAgent:
         try:
             await self.nodes.add(request)
         except Refused as refusal:
-            self._audit.note("register", who(str(registrant)), what, refusal.reason)
+            self._audit.record("register", who(str(registrant)), what, refusal.reason)
             raise
-        self._audit.note("register", who(str(registrant)), what)
+        self._audit.record("register", who(str(registrant)), what)
         if registrant not in self.agent.directory:
             asyncio.get_running_loop().call_later(ABSENT_S, self._forget_absent, registrant)
         return b""
@@ -260,7 +260,7 @@ class RobotAgent:
         request = _own(decode_data(RemoveNode, call.data), call)
         self.nodes.remove(request)
         registrant = Registrant(request.registrant_agent_type, request.registrant_agent_id)
-        self._audit.note("deregister", who(str(registrant)), f"type {request.node_type} {request.node_name}")
+        self._audit.record("deregister", who(str(registrant)), f"type {request.node_type} {request.node_name}")
         return b""
 
     async def _offers(self, _call: Call) -> bytes:

@@ -44,7 +44,7 @@ def control(nodes: InterfaceNodes, sender: Registrant, request: ControlRequest, 
     reason = "" if done else f"{holder or 'nobody'} has control"
     if not done or request.action != "take":  # `Control` tells of what is taken
         what = f"{node.topic} to {Registrant(request.to_type, request.to)}" if request.action == "give" else node.topic
-        nodes.robot.audit.note(_NOTES[request.action], who(str(sender)), what, reason or "done")
+        nodes.robot.audit.record(_NOTES[request.action], who(str(sender)), what, reason or "done")
     return ControlReply(done, str(holder) if holder else "", reason)
 
 

@@ -113,7 +113,7 @@ class StopNode(InterfaceNode):
         try:
             self._set(sender, stop)
         except Refused as refusal:
-            self.robot.audit.note("stop" if stop else "release", who(str(sender)), self.topic, refusal.reason)
+            self.robot.audit.record("stop" if stop else "release", who(str(sender)), self.topic, refusal.reason)
             raise
 
     def _set(self, sender: Registrant, stop: bool) -> None:
@@ -138,7 +138,7 @@ class StopNode(InterfaceNode):
             if self.robot.stop.press(by, time.time()):
                 self._has_stopped()
             elif self.robot.stop.changes != before:
-                self.robot.audit.note("stop", who(by), self.topic, "it was stopped before")
+                self.robot.audit.record("stop", who(by), self.topic, "it was stopped before")
                 self._tell()
 
     def release(self, by: str) -> None:
@@ -193,12 +193,12 @@ class StopNode(InterfaceNode):
             self._on_stop(by)
         finally:
             self._tell()
-        self.robot.audit.note("stop", who(by), self.topic)
+        self.robot.audit.record("stop", who(by), self.topic)
         log.warning("emergency stop by %s; commands are refused until it is released", by)
 
     def _has_been_released(self) -> None:
         self._tell()
-        self.robot.audit.note("release", who(self.robot.stop.by), self.topic)
+        self.robot.audit.record("release", who(self.robot.stop.by), self.topic)
         log.warning("emergency stop released by %s", self.robot.stop.by)
 
     def _tell(self) -> None:

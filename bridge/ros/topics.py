@@ -320,7 +320,7 @@ class PublisherNode(TopicNode):
             raise Refused(f"headsets may only read {self.topic} on this robot")
         self.control = Control(self.rule.hold_s or DEFAULT_HOLD_S) if self.rule.exclusive else None
         if self.control is not None:
-            self.control.on_taken = lambda agent: robot.audit.note("control_taken", who(str(agent)), self.topic)
+            self.control.on_taken = lambda agent: robot.audit.record("control_taken", who(str(agent)), self.topic)
         self.deadman = DeadMan(self.rule.deadman_s) if self.rule.deadman_message is not None else None
         self._stop_cdr = b""
         self._stopped_at = -math.inf
@@ -444,7 +444,7 @@ class PublisherNode(TopicNode):
     def left(self, agent: Registrant) -> None:
         with self.lock:
             if self.control is not None and self.control.release(agent):
-                self.robot.audit.note("control_released", who(str(agent)), self.topic, "it left")
+                self.robot.audit.record("control_released", who(str(agent)), self.topic, "it left")
             if self.deadman is not None and self.deadman.left(agent):
                 self._publish_stop(self.deadman.why, logging.INFO)  # as it does every day
 

@@ -102,7 +102,7 @@ from bridge.audit import AuditFile, who
 audit = AuditFile(Path(sys.argv[1]), sys.argv[2], max_bytes=int(sys.argv[3]), keep=1000)
 print("ready", flush=True)
 for number in range(int(sys.argv[4])):
-    audit.note("joined", who(f"unity/{number}"), "x" * 100)
+    audit.record("joined", who(f"unity/{number}"), "x" * 100)
     if number % 50 == 0:
         time.sleep(0.001)
 audit.close()
@@ -152,7 +152,7 @@ def test_only_so_many_files_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     audit = AuditFile(path, "p", max_bytes=4096, keep=2)
     for number in range(200):
-        audit.note("joined", who(f"unity/{number}"), "y" * 100)
+        audit.record("joined", who(f"unity/{number}"), "y" * 100)
         until(lambda: not audit._notes)
     audit.close()
     assert len(older_files(path)) == 2
@@ -182,7 +182,7 @@ async def test_a_full_disk(small_disk: Path, caplog: pytest.LogCaptureFixture) -
     audit = AuditFile(path, "p", on_lost=count)
     (small_disk / "filler").write_bytes(bytes(100 << 10))
     for number in range(WAITING + 2000):
-        audit.note("joined", who(f"unity/{number}"), "z" * 50)
+        audit.record("joined", who(f"unity/{number}"), "z" * 50)
         if number == 500:
             until(lambda: "audit_waiting" in audit.troubles())
     assert lost[0] > 0
@@ -190,7 +190,7 @@ async def test_a_full_disk(small_disk: Path, caplog: pytest.LogCaptureFixture) -
     assert [record.levelname for record in caplog.records if record.name == "macs.audit"] == ["ERROR"]
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
     until(lambda: not audit._notes)
-    audit.note("left", who("unity/1"))
+    audit.record("left", who("unity/1"))
     audit.close()
     code, said = await verified(path)
     assert (code, kinds(said)) == (0, ["lost"])
@@ -260,10 +260,10 @@ async def test_a_file_that_is_cut_under_a_running_program(tmp_path: Path) -> Non
     path = tmp_path / "audit.jsonl"
     audit = AuditFile(path, "p")
     for number in range(10):
-        audit.note("joined", who(f"unity/{number}"))
+        audit.record("joined", who(f"unity/{number}"))
     until(lambda: path.read_bytes().count(b"\n") == 11)
     os.truncate(path, path.read_bytes().index(b"\n") + 1)
-    audit.note("left", who("unity/1"))
+    audit.record("left", who("unity/1"))
     audit.close()
     code, said = await verified(path)
     assert (code, kinds(said)) == (1, ["removed"])
