@@ -81,9 +81,10 @@ class _RosTests:
 def pytest_configure(config: pytest.Config) -> None:
     if "PYTEST_XDIST_WORKER" in os.environ:
         isolate()
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        # a shell starts what it runs in the background so; programs that are tested with Ctrl-C would inherit it
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    # A shell ignores both for what it runs in the background; programs that are stopped by them would inherit that.
+    for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGQUIT, signal.SIG_DFL)):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, usual)
     if (
         os.environ.get(NEED_ROS_TESTS) and "PYTEST_XDIST_WORKER" not in os.environ
     ):  # workers report to the first process
