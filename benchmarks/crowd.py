@@ -11,7 +11,7 @@ from .figures import Figure
 from .plan import Case, Plan
 from .processes import ProgramFailed, Stage
 
-SIZES = ((10, 5), (100, 20), (1000, 50))
+SIZES = ((10, 5), (100, 20), (300, 30), (1000, 50))
 SMALLEST = "{} x {}".format(*SIZES[0])
 SECONDS = 20.0
 """How long each size is measured."""
