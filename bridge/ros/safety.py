@@ -6,7 +6,8 @@ Pure: the time is passed in, in seconds. Agents are whatever identifies them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
+import uuid
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 
 
@@ -118,7 +119,9 @@ class EmergencyStop:
     """Latched: once stopped, stopped until released. Whoever stopped can take that back; the robot goes on when nobody
     is left who stopped it.
 
-    Several programs may keep one stop among them (`adopt`): each change has a number, and the highest wins.
+    Several programs may keep one stop among them (`adopt`): each change has a number, and the highest wins, but for
+    presses that whoever has that number did not know. So each program says which presses were made where it is, with
+    their numbers, and up to which number of each other program it knows.
     """
 
     stopped: bool = False
@@ -132,16 +135,25 @@ class EmergencyStop:
     changes: int = 0
     """The number of the last change, here or elsewhere."""
     history: list[str] = field(default_factory=list)
+    session: str = field(default_factory=lambda: uuid.uuid4().hex)
+    """Which of the programs this is."""
+    own: dict[str, int] = field(default_factory=dict)
+    """Who stopped it here and has not taken that back, and the number of that change."""
+    heard: dict[str, int] = field(default_factory=dict)
+    """By session: up to which number its presses are known in what `pressed` says now."""
 
     HISTORY = 20
     PRESSED = 64
     """More are not remembered: the robot is stopped, and their releases do not count."""
+    HEARD = 64
+    """Sessions that are remembered."""
 
     def press(self, by: str, now: float) -> bool:
         """Stop. Whether this is new."""
         was = self.stopped
         if by not in self.pressed and len(self.pressed) < self.PRESSED:
             self.changes += 1
+            self.own[by] = self.changes
             self._become([*self.pressed, by], by, now)
         return not was
 
@@ -164,25 +176,54 @@ class EmergencyStop:
     def left(self, agent: str) -> None:
         """An agent is gone; who comes under its name is another, and cannot take back what this one did."""
         self.pressed = [f"{agent} (left)" if pressed == agent else pressed for pressed in self.pressed]
+        if agent in self.own:
+            self.own[f"{agent} (left)"] = self.own.pop(agent)
 
-    def adopt(self, changes: int, pressed: list[str], by: str, now: float) -> bool:
+    def adopt(
+        self,
+        changes: int,
+        pressed: list[str],
+        by: str,
+        now: float,
+        *,
+        session: str = "",
+        own: Mapping[str, int] | None = None,
+        heard: Mapping[str, int] | None = None,
+    ) -> bool:
         """What another program says of the same stop. Whether that changed anything here. Of two that changed it at
-        once, who stopped wins."""
-        if changes < self.changes:
+        once, who stopped wins. ``heard`` None: one that does not say what it knows, and is taken to know all."""
+        mine = self.own if heard is not None else {}
+        known = (heard or {}).get(self.session, 0)
+        unknown_there = [agent for agent, number in mine.items() if number > known]
+        unknown_here = [agent for agent, number in (own or {}).items() if number > self.heard.get(session, 0)]
+        if changes > self.changes:
+            first, more, knows = pressed, unknown_there, dict(heard or {})
+        elif changes == self.changes:
+            first, more, knows = self.pressed, pressed, _latest(self.heard, heard or {})
+        else:
+            first, more, knows = self.pressed, unknown_here, self.heard
+            if not unknown_here:
+                return False
+        became = [*first, *(agent for agent in more if agent not in first)][: self.PRESSED]
+        self.changes = max(changes, self.changes) + (changes != self.changes and became != first[: self.PRESSED])
+        self.heard = _latest(knows, {session: changes})
+        for gone in list(self.heard)[: -self.HEARD]:
+            del self.heard[gone]
+        if became == self.pressed:
             return False
-        if changes == self.changes:
-            pressed = [*self.pressed, *(agent for agent in pressed if agent not in self.pressed)]
-        self.changes = changes
-        if pressed == self.pressed:
-            return False
-        self._become(pressed[: self.PRESSED], by, now)
+        self._become(became, by, now)
         return True
 
     def _become(self, pressed: list[str], by: str, now: float) -> None:
         was, self.pressed, self.stopped = self.stopped, pressed, bool(pressed)
+        self.own = {agent: number for agent, number in self.own.items() if agent in pressed}
         if was == self.stopped:
             return
         self.by, self.since = by, now
         self.times += self.stopped
         self.history.append(f"{'stopped' if self.stopped else 'released'} by {by}")
         del self.history[: -self.HISTORY]
+
+
+def _latest(one: Mapping[str, int], other: Mapping[str, int]) -> dict[str, int]:
+    return {**one, **{session: max(number, one.get(session, 0)) for session, number in other.items()}}

@@ -21,7 +21,6 @@ from __future__ import annotations
 import logging
 import math
 import time
-import uuid
 from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -62,11 +61,14 @@ class StopState(Struct, frozen=True):
     """What one agent says of the stop."""
 
     session: str
-    """A new one with each start."""
+    """A new one with each start of the program."""
     robot: int
     changes: int
     pressed: list[str]
     by: str
+    own: dict[str, int] = {}
+    heard: dict[str, int] | None = None
+    """None: of an agent that does not say so."""
 
 
 class SharedStop:
@@ -89,14 +91,13 @@ class SharedStop:
         self._kind = kind
         self._on_state = on_state
         self._on_press = on_press
-        self._session = uuid.uuid4().hex
         self._agents: dict[str, int] = {}
         self._own: deque[list[float]] = deque(maxlen=UNREAD)
         """From when to when each of our own messages was published, in ns since the epoch."""
         self._heard: deque[int] = deque(maxlen=UNREAD)
         """When presses were published that have been heard: each comes by several subscriptions."""
         self._stopped_at = -math.inf
-        """When another agent said last that the robot is stopped."""
+        """When another agent said last that the robot is stopped, and was believed."""
         self._text: Any = None
         self._publisher: Any = None
         self._subscriptions: list[Any] = []
@@ -135,7 +136,9 @@ class SharedStop:
         """Tell the state as it is now. From any thread."""
         publisher, stop = self._publisher, self._robot.stop
         if publisher is not None:
-            state = StopState(self._session, self._robot.agent_id, stop.changes, stop.pressed, stop.by)
+            state = StopState(
+                stop.session, self._robot.agent_id, stop.changes, stop.pressed, stop.by, stop.own, stop.heard
+            )
             publisher.publish(self._text(data=msgspec.json.encode(state).decode()))
 
     @property
@@ -160,12 +163,12 @@ class SharedStop:
         except (msgspec.DecodeError, RuntimeError) as error:
             self._robot.drops.note("bad_stop_state", self._topic + AGENTS, f"this is no state of an agent: {error}")
             return
-        if state.session == self._session:
+        if state.session == self._robot.stop.session:
             return
         self._meet(state)
-        if state.pressed:
-            self._stopped_at = time.monotonic()
         self._on_state(state)
+        if state.pressed and self._robot.stop.stopped:  # what says less than is known here explains nothing
+            self._stopped_at = time.monotonic()
 
     def _meet(self, state: StopState) -> None:
         if state.session in self._agents:

@@ -37,6 +37,8 @@ STATES = {True: b"\x00\x01\x00\x00\x01", False: b"\x00\x01\x00\x00\x00"}
 """std_msgs/Bool in CDR."""
 HEAR_S = 0.5
 """How long the stop waits, at the start, to hear whether it holds for the graph already."""
+FIND_S = 0.15
+"""How long in any case: an agent that was not found yet is not known to be unheard."""
 LOOK_S = 0.01
 
 
@@ -76,9 +78,9 @@ class StopNode(InterfaceNode):
         """Hear from the other agents of this graph before anything is said, or passes."""
         assert self._shared is not None
         loop = asyncio.get_running_loop()
-        deadline = loop.time() + HEAR_S
-        while loop.time() < deadline:
-            if not self._shared.unheard:
+        begun = loop.time()
+        while loop.time() < begun + HEAR_S:
+            if not self._shared.unheard and loop.time() > begun + FIND_S:
                 break
             await asyncio.sleep(LOOK_S)
         with self._lock:
@@ -178,7 +180,18 @@ class StopNode(InterfaceNode):
         with self._lock:
             stop = self.robot.stop
             was = stop.stopped
-            if not stop.adopt(state.changes, state.pressed, state.by, time.time()):
+            before = stop.changes
+            if not stop.adopt(
+                state.changes,
+                state.pressed,
+                state.by,
+                time.time(),
+                session=state.session,
+                own=state.own,
+                heard=state.heard,
+            ):
+                if stop.changes > max(before, state.changes):  # what was pressed here, they do not know
+                    self._tell()
                 return
             if stop.stopped and not was:
                 self._has_stopped()

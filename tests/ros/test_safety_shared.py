@@ -88,6 +88,110 @@ def test_of_two_at_once_the_stop_wins() -> None:
     assert other.stopped
 
 
+def said(stop: EmergencyStop) -> dict[str, Any]:
+    """What it tells others, and `hear` takes."""
+    return {
+        "changes": stop.changes,
+        "pressed": list(stop.pressed),
+        "by": stop.by,
+        "session": stop.session,
+        "own": dict(stop.own),
+        "heard": dict(stop.heard),
+    }
+
+
+def hear_all(*stops: EmergencyStop) -> None:
+    """Tell each other until nobody has anything new."""
+    for _ in range(10):
+        told = [said(stop) for stop in stops]
+        news = [stop.adopt(**state, now=0) for stop in stops for state in told if state["session"] != stop.session]
+        if not any(news):
+            return
+    raise AssertionError("they tell each other without end")
+
+
+@pytest.mark.parametrize("released_before", [1, 5])
+@pytest.mark.parametrize("they_hear_first", [True, False])
+def test_a_stop_that_others_do_not_know_stays(released_before: int, they_hear_first: bool) -> None:
+    """One that has just started, or was cut off, is stopped: what others have changed meanwhile releases nothing."""
+    old, new = EmergencyStop(), EmergencyStop()
+    for _ in range(released_before):
+        old.press("a", 0)
+        old.release("operator/5", 0)
+    new.press("b", 1)
+    told_before = said(old)
+    if they_hear_first:
+        old.adopt(**said(new), now=2)
+        assert old.pressed == ["b"]
+    new.adopt(**told_before, now=2)
+    assert new.pressed == ["b"]
+    hear_all(old, new)
+    assert old.pressed == new.pressed == ["b"]
+    assert old.release("operator/5", 3)  # and who knows it may release it
+    new.adopt(**said(old), now=3)
+    assert not new.stopped
+
+
+def test_what_a_third_one_passed_on_is_known() -> None:
+    """A release by who heard of a stop from another than where it was pressed, releases."""
+    one, two, three = (EmergencyStop() for _ in range(3))
+    one.press("a", 0)
+    two.adopt(**said(one), now=1)
+    three.adopt(**said(two), now=2)
+    three.release("operator/5", 3)
+    for stop in (one, two):
+        stop.adopt(**said(three), now=4)
+    assert not any(stop.stopped for stop in (one, two, three))
+
+
+def test_an_agent_that_says_less_is_believed() -> None:
+    """One of an older version releases what it was told of."""
+    new, old = EmergencyStop(), EmergencyStop()
+    new.press("a", 0)
+    old.adopt(new.changes, new.pressed, new.by, 0)
+    old.release("operator/5", 1)
+    new.adopt(old.changes, old.pressed, old.by, 2)
+    assert not new.stopped
+
+
+def test_two_with_many_presses_fall_silent() -> None:
+    """More than are remembered, and other ones: they need not agree on all names."""
+    one, other = EmergencyStop(), EmergencyStop()
+    for number in range(EmergencyStop.PRESSED + 1):
+        one.press(f"unity/{number}", 0)
+        other.press(f"unity/{1000 + number}", 0)
+    hear_all(one, other)
+    assert one.stopped
+    assert other.stopped
+
+
+CUT_OFF = st.lists(
+    st.tuples(
+        st.sampled_from(["press", "release", "take back", "hear", "lose"]),
+        st.integers(0, AGENTS - 1),
+        st.integers(0, 4),
+    ),
+    max_size=40,
+)
+
+
+@given(CUT_OFF)
+def test_agents_that_lose_what_others_said_agree_in_the_end(steps: list[tuple[str, int, int]]) -> None:
+    """As soon as each hears what the others say now; and nobody's press is lost that no releasing agent knew."""
+    stops = [EmergencyStop() for _ in range(AGENTS)]
+    since_release = ""
+    for step, number, who in steps:
+        stop = stops[number]
+        if step == "hear":
+            stop.adopt(**said(stops[who % AGENTS]), now=0.0) if who % AGENTS != number else None
+        elif step != "lose":
+            {"press": stop.press, "release": stop.release, "take back": stop.take_back}[step](f"unity/{who}", 0.0)
+            since_release = f"unity/{who}" if step == "press" and stop.own.get(f"unity/{who}") == stop.changes else ""
+    hear_all(*stops)
+    assert len({(stop.stopped, tuple(sorted(stop.pressed))) for stop in stops}) == 1
+    assert not since_release or since_release in stops[0].pressed, "the last of all that happened was a press"
+
+
 # -- with processes --------------------------------------------------------------------------------------------------
 
 
