@@ -402,7 +402,7 @@ def _one_program(facts: Facts, program: Program, where: str) -> Iterator[Finding
     if pong.drops:
         yield found("losses", where, drops=tallied(pong.drops))
     now = dict(pong.now)
-    for kind in ("wrong_settings", "shared_graph"):
+    for kind in ("wrong_settings", "no_stop", "shared_graph"):
         if count := now.pop(kind, 0):
             yield found(kind, where, count=count)
     if now:

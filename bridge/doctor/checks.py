@@ -296,6 +296,12 @@ CHECKS: dict[str, Check] = {
         "messages of its [[robot.rules]] do not fit the types of its graph: {count}",
         "its log names the topic and the field; until then headsets cannot command there",
     ),
+    "no_stop": Check(
+        "programs",
+        ERROR,
+        "it has no emergency stop: the topic of its settings has another type on its graph",
+        "its log names both; set stop_topic to another topic, or give that one the type std_msgs/Bool",
+    ),
     "shared_graph": Check(
         "programs",
         WARNING,

@@ -61,6 +61,8 @@ JUDGED_S = 1.0
 """How long the registration of an agent that is not seen yet waits for its presence, where that decides."""
 SESSIONS = 8192
 """Of so many agents the robot remembers who had their ids last."""
+STOP_AGAIN_S = 2.0
+"""Pause between attempts to have an emergency stop, where its topic has another type."""
 STOP_MESSAGES_S = 0.1
 """How long ROS nodes get, at the end, to take the last messages: what a writer that ends has sent is lost unread."""
 
@@ -111,6 +113,7 @@ class RobotAgent:
         self._sessions: dict[Registrant, tuple[str, int]] = {}
         """Who has an id, or had it last."""
         self.stop_line: StopLine | None = None
+        self._stop_later: asyncio.Task[None] | None = None
 
     def _graph_changed(self, topics: NamesAndTypes, services: NamesAndTypes) -> None:
         """In the ROS thread."""
@@ -120,11 +123,8 @@ class RobotAgent:
     async def start(self) -> None:
         """Serve from now on."""
         settings = self.nodes.robot.rules.settings
-        if settings.stop_topic:
-            try:
-                await self.nodes.open_stop(settings.stop_topic)
-            except Refused as refusal:
-                log.error("there is no emergency stop: %s", refusal.reason)
+        if settings.stop_topic and not await self._open_stop(settings.stop_topic, logging.ERROR):
+            self._stop_later = asyncio.create_task(self._until_stop(settings.stop_topic))
         self.agent.on_presence(self._presence)
         self.agent.on_id(self._id_changed)
         self.agent.mesh.on_link(self._link)
@@ -139,16 +139,39 @@ class RobotAgent:
         ):
             self.agent.serve(verb, handler)
         self.agent.serve("stop", self._stopped, first=self._stop, stand_in=True)
-        if self.nodes.stop is not None and self.agent.mesh.settings.mode == "client":
-            self.stop_line = StopLine(self.agent.mesh.settings, self._serve_stop)
         self.agent.on_message(self._receive)
+        self._let_stop()
         if self._guard is not None:
             self._guard.on_dropped = self.nodes.drops.note
-            self._guard.stop_name = self.nodes.stop.key.node_name if self.nodes.stop is not None else ""
-            if self.nodes.stop is not None:
-                guard = self._guard
-                self.nodes.stop.overtaken = lambda message: guard.overtaken(message, now_s())
             self._guard.on_command = self.nodes.deliver
+
+    async def _open_stop(self, topic: str, level: int) -> bool:
+        try:
+            await self.nodes.open_stop(topic)
+        except Refused as refusal:
+            log.log(level, "there is no emergency stop: %s", refusal.reason)
+            return False
+        return True
+
+    async def _until_stop(self, topic: str) -> None:
+        """What has another type on its topic may end."""
+        while True:
+            await asyncio.sleep(STOP_AGAIN_S)
+            if await self._open_stop(topic, logging.DEBUG):
+                break
+        log.warning("there is an emergency stop now, %s", topic)
+        self._let_stop()
+
+    def _let_stop(self) -> None:
+        """Whoever stops is listened to by all ways, once there is an emergency stop."""
+        stop, guard = self.nodes.stop, self._guard
+        if stop is None:
+            return
+        if self.agent.mesh.settings.mode == "client":
+            self.stop_line = StopLine(self.agent.mesh.settings, self._serve_stop)
+        if guard is not None:
+            stop.overtaken = lambda message: guard.overtaken(message, now_s())
+            guard.stop_name = stop.key.node_name
 
     def _receive(self, message: Message) -> None:
         try:
@@ -174,6 +197,8 @@ class RobotAgent:
             self._guard.on_command = _ignore
         self.agent.on_message(_ignore)
         self.offers.close()
+        if self._stop_later is not None:
+            self._stop_later.cancel()
         for answer in self._answering:
             answer.cancel()
         self.nodes.close()
@@ -211,7 +236,9 @@ class RobotAgent:
     def _troubles(self) -> dict[str, int]:
         """What `macs doctor` shall find."""
         troubles = {"wrong_settings": len(self.checked.wrong)}
-        if self.nodes.stop is not None:
+        if self.nodes.stop is None:
+            troubles["no_stop"] = int(bool(self.nodes.robot.rules.settings.stop_topic))
+        else:
             troubles["shared_graph"] = len(self.nodes.stop.shared_with)
         return {name: count for name, count in (troubles | self._audit.troubles()).items() if count}
 

@@ -199,6 +199,8 @@ class InterfaceNodes:
     async def open_stop(self, topic: str) -> None:
         """Have an emergency stop on this topic. Raises Refused when the topic cannot be used for it."""
         stop = StopNode(self.robot, topic, self._stopped)
+        for node in self._places.all_of(stop.key):  # of headsets that registered what has its name meanwhile
+            self._remove(node)
         self._nodes[_work(stop)] = stop
         self._places.bind(stop.key, stop)
         await self._start(stop)

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from geometry_msgs.msg import Twist
+from std_msgs.msg import String
 
 from bridge.ros.checked import CheckedSettings
 from bridge.ros.interface import Drops
@@ -35,6 +36,23 @@ async def test_a_dead_man_that_does_not_fit_its_type_is_told_at_the_start(
         assert code == 1, errors
         found = [finding for finding in json.loads(out)["findings"] if finding["id"] == "wrong_settings"]
         assert [finding["severity"] for finding in found] == ["error"]
+
+
+async def test_a_robot_without_its_emergency_stop_is_found_and_gets_it(
+    domain: int, peer: Peer, tmp_path: Path
+) -> None:
+    """While its topic has another type `macs doctor` names that; when that is gone, the robot can be stopped."""
+    await peer.subscription(String, "/emergency_stop")
+    async with site(domain, tmp_path) as place, place.robot() as robot, place.headset() as driver:
+        assert any("there is no emergency stop" in line for line in robot.log)
+        code, out, errors = await ended("doctor", "--json", "--quick", "-e", place.router.endpoint)
+        found = [finding for finding in json.loads(out)["findings"] if finding["id"] == "no_stop"]
+        assert [finding["severity"] for finding in found] == ["error"], errors
+        assert code == 1
+        peer.session.close()
+        await until(lambda: any("there is an emergency stop now" in line for line in robot.log))
+        await driver.call("ros", 1, "stop", b"true", timeout_s=20)
+        assert json.loads(await driver.call("ros", 1, "status", timeout_s=20))["stopped"]
 
 
 async def test_two_agents_on_one_graph_are_found(domain: int, tmp_path: Path) -> None:

@@ -333,6 +333,11 @@ def _(facts: Facts) -> None:
     _said(facts, now={"wrong_settings": 1})
 
 
+@makes("no_stop", ERROR)
+def _(facts: Facts) -> None:
+    _said(facts, now={"no_stop": 1})
+
+
 @makes("shared_graph", WARNING)
 def _(facts: Facts) -> None:
     _said(facts, now={"shared_graph": 1})
