@@ -116,10 +116,7 @@ class InterfaceNodes:
         key = key_of(request)
         self._take_back_other(key, registrant, request)
         await self._make_room(request)
-        node = self._find_or_create(request)
-        meant = self._places.of(key, registrant)
-        if meant is not None and meant is not node:  # its messages say no more than the node name
-            raise meant.collision(node.topic, key.node_name)
+        node = self._find_or_create(request, self._places.of(key, registrant))
         is_new = registrant not in node.registrants
         node.register(registrant, unity=request.unity_cdr is True)
         self._places.bind(key, node, registrant)
@@ -179,7 +176,8 @@ class InterfaceNodes:
             metadata = Metadata(ROS, self.robot.agent_id, message_manager=told.manager)
             self.robot.send(registrant, metadata, encode_data(told))
 
-    def _find_or_create(self, request: AddNode) -> InterfaceNode:
+    def _find_or_create(self, request: AddNode, meant: InterfaceNode | None) -> InterfaceNode:
+        """``meant``: what its registrant has by this node name; more than that its messages do not say."""
         kind = KINDS.get(request.node_type)
         if kind is None:
             raise Refused(f"interface node type {request.node_type} is unknown on this robot")
@@ -187,6 +185,8 @@ class InterfaceNodes:
         if request.node_name != node_name(request.tos_name):
             problem = f"not a valid node name for {request.tos_name[:80]}, which is {node_name(request.tos_name)[:80]}"
             raise Refused(f"{request.node_name[:80]!r} is {problem}")
+        if meant is not None and meant.topic != topic:  # before a node is made that nobody would ever remove
+            raise meant.collision(topic, request.node_name)
         by_name = request.node_type == NodeType.SUBSCRIBER
         node = self._nodes.get((request.node_type, request.node_name if by_name else topic))
         if self.stop is not None and node is not self.stop and key_of(request) == self.stop.key:

@@ -141,6 +141,23 @@ async def test_one_sender_cannot_mean_two_topics_by_one_name(nodes: InterfaceNod
         await nodes.add(publishing("/cmd_vel"))
 
 
+@pytest.mark.parametrize(
+    ("node_type", "kind"),
+    [
+        (NodeType.PUBLISHER, "geometry_msgs/Twist"),
+        (NodeType.CLIENT, "std_srvs/Trigger"),
+        (NodeType.SERVICE, "std_srvs/Trigger"),
+    ],
+)
+async def test_a_refused_registration_leaves_no_node(nodes: InterfaceNodes, node_type: int, kind: str) -> None:
+    """What nobody has registered nobody would remove, and its name would be two topics' for ever."""
+    await nodes.add(adding("/plain/name", kind, node_type=node_type))
+    with pytest.raises(Refused, match="have the same node name"):
+        await nodes.add(adding("/plain_name", kind, node_type=node_type))
+    assert len(nodes) == 1
+    assert nodes.on_topic(node_type, "/plain_name") is None
+
+
 async def test_nobody_takes_the_name_of_the_emergency_stop(nodes: InterfaceNodes) -> None:
     """A stop is heard from anybody, so its node name has one meaning."""
     stop = await asyncio.gather(
