@@ -106,7 +106,7 @@ class Ages:
     NEW_S = 1.0
     HALF_S = 30.0
     FORGET_S = 600.0
-    """Two clocks drift apart: what was found so long ago says nothing."""
+    """Two clocks drift apart: what was found so long ago says little, and only of what comes first (`NEW_S`)."""
     STANDS_S = 1e-6
     """A hybrid clock that was put forward stands still until time has come up to it, but for a tick per sample."""
 
@@ -120,7 +120,7 @@ class Ages:
             self.least = self.before = now - stamp
             self.stands = False
             self.others = others
-            """The delay that others had when this one was new; infinite when there was nobody."""
+            """The delay that others had when this one was new, and itself before; infinite when there was neither."""
 
         @property
         def delay(self) -> float:
@@ -138,7 +138,7 @@ class Ages:
         own = self._ways.get(sender)
         way = own.get(clock) if own is not None else None
         if own is None or way is None or now - way.at > self.FORGET_S:
-            way = self._begin(sender, clock, stamp, now)
+            way = self._begin(sender, clock, stamp, now, way.delay if way is not None else math.inf)
             return max(0.0, now - stamp - min(way.least, way.others))
         self._ways.move_to_end(sender)
         own.move_to_end(clock)
@@ -156,9 +156,10 @@ class Ages:
             return max(0.0, delay - min(way.delay, way.others))
         return max(0.0, delay - way.delay)
 
-    def _begin(self, sender: str, clock: Hashable, stamp: float, now: float) -> Ages._Way:
-        """Meet a sender on a clock on which it has not been heard."""
-        way = self._Way(stamp, now, self._delay_of_others(sender, clock, now))
+    def _begin(self, sender: str, clock: Hashable, stamp: float, now: float, before: float) -> Ages._Way:
+        """Meet a sender on a clock on which it has not been heard, or not for long: then it had the delay ``before``,
+        and what comes now may have waited ever since (a program that was suspended)."""
+        way = self._Way(stamp, now, min(before, self._delay_of_others(sender, clock, now)))
         own = self._ways.setdefault(sender, OrderedDict())
         self._ways.move_to_end(sender)
         own[clock] = way

@@ -353,3 +353,20 @@ def test_nothing_is_taken_before_the_robot_is_there(guard: Guard) -> None:
     guard.on_command = None
     assert not guard.first(KEY, frame(), 0.0, 0.0)
     guard.rescue(KEY, frame(STOP), 0.0)
+
+
+@pytest.mark.parametrize("stood_s", [Ages.FORGET_S / 2, Ages.FORGET_S + 100, 86_400.0])
+@pytest.mark.parametrize("senders", [1, 3])
+def test_what_waited_while_the_robot_stood_still_is_old(stood_s: float, senders: int) -> None:
+    """A suspended program reads at once what has come since, however long that was; what is sent then is new."""
+    ages, fresh = Ages(), Fresh(1.0)
+    names = [f"unity/{number}" for number in range(senders)]
+
+    def taken(sent: float, now: float) -> int:
+        return sum(fresh.take(name, ages.age(name, "router", sent - 1e6, now), now) for name in names)
+
+    for tick in range(1200):
+        assert taken(tick / 20, tick / 20 + 0.01) == senders
+    now = 60.0 + stood_s
+    assert sum(taken(60.0 + tick / 20, now + tick / 1e4) for tick in range(40)) == 0
+    assert taken(now + 1.0, now + 1.01) == senders
