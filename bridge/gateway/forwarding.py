@@ -78,6 +78,7 @@ class Forwarding:
         """It has ended."""
         self._latest.go(connection)
         self._presses.leave(connection.key)
+        self._flooding.pop(connection, None)
         self._routes.pop(connection, None)
         self.afar.leave(connection)
 
