@@ -27,7 +27,7 @@ from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Subscription
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.addresses import joined
 from macs_zenoh.protocol.budget import Budget
-from macs_zenoh.protocol.credit import Credits
+from macs_zenoh.protocol.credit import Credit, Credits
 from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.directory import Change
 from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
@@ -55,7 +55,7 @@ from macs_zenoh.protocol.messages import (
     RemoveNode,
     encode_data,
 )
-from macs_zenoh.protocol.rate_limit import Pace
+from macs_zenoh.protocol.rate_limit import TOGETHER, Pace
 from macs_zenoh.protocol.recipient import Recipient, to_agent
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.rights import Grant
@@ -138,6 +138,8 @@ class Gateway:
         """Who is online, as the answer to whoever asks; empty when that has changed."""
         self._memory = Memory(settings.outbox_bytes, settings.max_frame_bytes)
         self._numbers = 0
+        self._requests = Credit(TOGETHER * settings.max_requests_per_s, time.monotonic())
+        """Of all who send robots much."""
         self._churn = Churn()
         self._coming: dict[Connection, asyncio.TimerHandle] = {}
         """Who is not greeted yet, since many from there have come and gone."""
@@ -406,7 +408,8 @@ class Gateway:
 
     def pace(self) -> Pace:
         """For a new connection."""
-        return Pace(self.settings.max_commands_per_s, self.settings.max_requests_per_s, time.monotonic())
+        settings = self.settings
+        return Pace(settings.max_commands_per_s, settings.max_requests_per_s, time.monotonic(), self._requests)
 
     def handle(self, connection: Connection, event: Event) -> None:
         """One thing a TCP agent did."""

@@ -64,7 +64,7 @@ class GatewaySettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=
     max_commands_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
     """Of these, commands to robots; as a robot's own limit, before they fill the way to it. Stops are not counted."""
     max_requests_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
-    """And all else that goes to robots."""
+    """And all else that goes to robots. All who send much have four times as much together."""
     handshake_timeout_s: Seconds = 10.0
     """A connection that has not configured itself by then is closed."""
     idle_timeout_s: Seconds = 60.0

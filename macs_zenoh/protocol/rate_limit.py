@@ -94,15 +94,26 @@ class Flow:
         return False
 
 
+TOGETHER = 4
+"""So many who send all the requests that one may are served by one gateway: more would fill the way of all others."""
+
+
 class Pace:
-    """Of one connection."""
+    """Of one connection. ``together`` is what all of a gateway may have; who sends little needs none of it."""
+
+    LITTLE = 0.75
+    """Who has as much of a second's requests left has sent little."""
 
     KINDS = 256
     """So many flows are known; of more than these the one that began first is forgotten."""
 
-    def __init__(self, commands_per_s: float, requests_per_s: float, now: float) -> None:
+    def __init__(
+        self, commands_per_s: float, requests_per_s: float, now: float, together: Credit | None = None
+    ) -> None:
         self._commands = Credit(commands_per_s, now)
         self._requests = Credit(requests_per_s, now)
+        self._little = self.LITTLE * requests_per_s
+        self._together = together
         self._flows: dict[Hashable, Flow] = {}
         self._last = -math.inf
         self._late_until = -math.inf
@@ -110,7 +121,11 @@ class Pace:
 
     def request(self, count: int, now: float) -> Passing:
         """Of so many messages that are no commands."""
-        return NOW if self._requests.take(count, now) else FLOODED
+        if not self._requests.take(count, now):
+            return FLOODED
+        if self._together is None or self._requests.left(now) >= self._little:
+            return NOW
+        return NOW if self._together.take(count, now) else FLOODED
 
     def command(self, kind: Hashable, count: int, now: float) -> Passing:
         """Of so many commands of one kind that came together; of those that may be an emergency stop nobody asks."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from macs_zenoh.protocol.rate_limit import FLOODED, NOW, WAITED, Pace, Passing
+from macs_zenoh.protocol.credit import Credit
+from macs_zenoh.protocol.rate_limit import FLOODED, NOW, TOGETHER, WAITED, Pace, Passing
 
 MOVE, ARM = "move", "arm"
 
@@ -23,6 +24,21 @@ def test_commands_and_requests_have_limits_of_their_own(pace: Pace) -> None:
     assert [pace.request(1, 0.0) for _ in range(12)] == [NOW] * 10 + [FLOODED] * 2
     assert [pace.command(MOVE, 50, 0.0) for _ in range(3)] == [NOW] * 2 + [FLOODED]
     assert pace.request(5, 0.5) is NOW
+
+
+def test_many_who_send_all_that_one_may_share_what_a_few_may() -> None:
+    """Twenty at their limit have no more together than four; who sends little passes whatever they do."""
+    together = Credit(TOGETHER * 100, 0.0)
+    crowd = [Pace(0, 100, 0.0, together) for _ in range(20)]
+    modest, passed, little = Pace(0, 100, 0.0, together), 0, 0
+    for number in range(10_000):
+        now = number / 1000
+        passed += sum(pace.request(1, now) is NOW for pace in crowd)
+        if number % 100 == 0:
+            little += modest.request(1, now) is NOW
+    at_first = 20 * 100 * (1 - Pace.LITTLE)
+    assert passed <= TOGETHER * 100 * 11 + 2 * at_first
+    assert little == 100
 
 
 def test_after_a_gap_in_a_flow_what_comes_together_has_waited(pace: Pace) -> None:
