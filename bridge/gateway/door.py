@@ -23,7 +23,7 @@ from macs_zenoh.protocol.attempts import Attempts
 from macs_zenoh.protocol.credit import Credit
 from macs_zenoh.protocol.rights import OPEN, Grant, Rights
 from macs_zenoh.protocol.tcp_agent import Admit
-from macs_zenoh.protocol.tokens import SECRET_BYTES, Token, hash_of, new_secret
+from macs_zenoh.protocol.tokens import SECRET_BYTES, Token, Tokens, hash_of, new_secret
 
 from .admission import is_in, networks
 
@@ -89,14 +89,18 @@ class Door:
         on_changed: Callable[[Connection, Grant], None],
         on_ended: Callable[[Connection], None],
         on_look: Callable[[], None] = lambda: None,
+        on_file: Callable[[str, str], None] = lambda event, name: None,
     ) -> None:
         """``on_changed`` hears of connections whose token has other rights now, ``on_ended`` of those whose token
-        holds no longer, ``on_look`` is called several times a second. Raises ConfigError: the file of tokens cannot be
+        holds no longer, ``on_look`` is called several times a second, ``on_file`` with what became of a token
+        in the file. Raises ConfigError: the file of tokens cannot be
         used."""
         self._on_changed = on_changed
         self._on_ended = on_ended
         self._on_look = on_look
+        self._on_file = on_file
         self._watch = Watch(path, self._look)
+        self._watch.on_read = self._tell_of_file
         self._holders: dict[Connection, _Holder] = {}
         self._grants: dict[str, Grant] = {}
         """Of tokens that somebody has come in by: all who have one share what it may send, also who comes again."""
@@ -170,7 +174,18 @@ class Door:
                 log.warning("a wrong pairing code was shown")
                 return None
             log.info("token %s was paired", name)
+            self._on_file("token_paired", name)
             return secret
+
+    def _tell_of_file(self, before: Tokens, now: Tokens) -> None:
+        had, has = ({token.name: token for token in tokens.tokens} for tokens in (before, now))
+        for name in sorted(had.keys() | has.keys()):
+            if name not in had:
+                self._on_file("token_created", name)
+            elif name not in has:
+                self._on_file("token_removed", name)
+            elif had[name] != has[name]:
+                self._on_file("token_changed", name)
 
     # -- pieces --------------------------------------------------------------------------------------------------
 

@@ -150,6 +150,7 @@ class Gateway:
             on_changed=self._rights_changed,
             on_ended=self._token_ended,
             on_look=lambda: self.listeners.look(),
+            on_file=lambda event, name: self._audit.record(event, who(token=name)),
         )
         self.listeners = Listeners(settings, entrances(settings), self._door, self._connection, self._drops)
         self.directory = self._presence.directory
@@ -530,7 +531,7 @@ class Gateway:
     def _rights_changed(self, connection: Connection, grant: Grant) -> None:
         """A token has other rights: they hold at once."""
         log.info("%s has other rights: its token %s has changed", connection, grant.name)
-        self._audit.record("token_changed", _who(connection))
+        self._audit.record("rights_changed", _who(connection))
         events = connection.peer.rights_change(grant)
         self._tell_access(connection, AccessRefused("changed", "the rights of this token have changed"))
         for event in events:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from macs_zenoh.errors import ConfigError
+from macs_zenoh.protocol.tokens import Tokens
 
 from . import store
 
@@ -29,6 +30,8 @@ class Watch:
         self._on_look = on_look
         self._seen = _seen(path)
         self.tokens = store.read(path)
+        self.on_read: Callable[[Tokens, Tokens], None] = lambda before, now: None
+        """Hears of a file that was read again."""
         self._complained = False
         self._timer: asyncio.TimerHandle | None = None
 
@@ -46,6 +49,7 @@ class Watch:
         seen = _seen(self.path)
         if seen == self._seen:
             return
+        before = self.tokens
         try:
             self.tokens = store.read(self.path)
             self._complained = False
@@ -55,6 +59,7 @@ class Watch:
                 log.error("tokens stay as they were: %s", error)
             return
         self._seen = seen
+        self.on_read(before, self.tokens)
         log.info("%s: %d tokens", self.path, len(self.tokens.tokens))
 
     def _look(self) -> None:

@@ -18,7 +18,7 @@ import pytest
 from bridge.audit import AuditFile, who
 from bridge.audit.writer import WAITING, older_files
 from bridge.headset.client import Headset
-from macs_zenoh.errors import ConfigError
+from macs_zenoh.errors import ConfigError, MacsError
 from tests.support.programs import ROOT, Program, ended, free_port
 
 
@@ -93,6 +93,38 @@ async def test_a_killed_gateway_goes_on_with_its_chain(gateway: tuple[Program, P
     code, said = await verified(path)
     assert code == 0, said
     assert [kind for kind in kinds(said) if kind != "open_end"] == ["torn", "killed"]
+
+
+async def test_tokens_are_in_the_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Made, changed and revoked, by name; who is connected with one when that happens; and who comes without one."""
+    endpoint, path, tokens = f"tcp/127.0.0.1:{free_port()}", tmp_path / "audit.jsonl", tmp_path / "tokens.json"
+    monkeypatch.setenv("MACS_TOKENS", str(tokens))
+    settings = tmp_path / "macs.toml"
+    settings.write_text(f'[gateway]\naudit_file = "{path}"\nplain_without_token = "nobody"\n')
+    command = ("gateway", "--settings", str(settings), "--port", "0", "-e", endpoint)
+
+    def events() -> list[tuple[str, str | None]]:
+        return [(line["event"], line["by"].get("token")) for line in lines_of(path)]
+
+    async with Program("router", "-l", endpoint), Program(*command) as one:
+        with pytest.raises(MacsError):
+            async with await Headset.connect("127.0.0.1", one.port) as stranger:
+                await stranger.online()
+        code, shown, errors = await ended("token", "create", "anna", "--may", "see,call")
+        assert code == 0, errors
+        async with await Headset.connect("127.0.0.1", one.port, token=shown.split()[0]) as headset:
+            await headset.online()
+            for argv in (["change", "anna", "--may", "see"], ["revoke", "anna"]):
+                code, _, errors = await ended("token", *argv)
+                assert code == 0, errors
+                until(lambda word=argv[0][:6]: any(word in event or "ended" in event for event, _ in events()))
+        until(lambda: ("left", "anna") in events())
+    assert ("refused", None) in events()
+    told = [each for each in events() if each[1] == "anna"]
+    assert told[:2] == [("token_created", "anna"), ("joined", "anna")]
+    assert sorted(told[2:]) == sorted(
+        (event, "anna") for event in ("token_changed", "rights_changed", "token_removed", "token_ended", "left")
+    )
 
 
 WRITER = """

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from bridge.cli import VERBS
+from bridge.conformance.vectors import FILES
 from tests.support.once import made_once
 from tests.support.processes import ROOT
 
@@ -94,6 +95,7 @@ def test_wheel_and_sdist_have_the_shipped_files(built: Path) -> None:
         in_sdist = {name.partition("/")[2] for name in archive.getnames()}
     wanted = [f"bridge/data/config/{name}" for name in SETTINGS]
     wanted += [f"bridge/data/interfaces/{name}" for name in INTERFACES]
+    wanted += [f"bridge/conformance/vectors/{name}.json" for name in FILES]
     wanted += ["bridge/py.typed", "macs_zenoh/py.typed"]
     assert [name for name in wanted if name not in in_wheel] == []
     assert [name for name in wanted if name not in in_sdist] == []
