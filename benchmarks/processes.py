@@ -6,7 +6,6 @@ import json
 import os
 import queue
 import re
-import socket
 import subprocess
 import sys
 import tempfile
@@ -16,7 +15,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
-ROOT = Path(__file__).parents[1]
+from tests.support.processes import ROOT
+from tests.support.programs import free_port
 
 UNLIMITED = Path(__file__).with_name("unlimited.toml")
 GATEWAY = ("-m", "bridge", "gateway", "--settings", str(UNLIMITED))
@@ -193,14 +193,6 @@ class Stage:
 
 def _warnings(program: Program) -> list[str]:
     return [line for line in program.log_tail(1000).splitlines() if re.search(r"\b[WE] macs\.|lost in all", line)]
-
-
-def free_port() -> int:
-    """A TCP port that nobody uses at this moment."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def _port_in(ready: str) -> int:
