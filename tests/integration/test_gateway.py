@@ -330,8 +330,14 @@ async def test_who_drives_is_not_held_for_what_else_he_sends(
             await sender.send_frame(command + mail)
             assert not receiver.backpressure.holds
         connection.drove_at = -math.inf
-        while not receiver.backpressure.holds:
-            await sender.send_frame(mail)
+
+        async def talk() -> None:
+            while True:  # until it is held, maybe in the middle of a frame
+                await sender.send_frame(mail)
+
+        talking = asyncio.create_task(talk())
+        await until(lambda: receiver.backpressure.holds)
+        talking.cancel()
 
 
 async def test_encoding_of_the_first_message(start_gateway: StartGateway) -> None:
