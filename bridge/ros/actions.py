@@ -258,7 +258,7 @@ class ActionNode(InterfaceNode):
             return
         try:
             await self.robot.session.run(lambda: self._send_goal(goal, body))
-        except RuntimeError as error:
+        except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is
             self._drop(goal, f"the goal is no {self.interface}: {first_line(error)}")
             return
         self._watch()

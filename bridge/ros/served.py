@@ -241,7 +241,7 @@ class ServiceNode(InterfaceNode):
     def _send(self, request_id: int, sender: Registrant, header: Any, answer: bytes) -> None:
         try:
             response = deserialize_message(answer, self._types.Response)
-        except RuntimeError as error:
+        except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is
             problem = first_line(error)
             about = f"{self.topic} from {sender}"
             self._loop.call_soon_threadsafe(
@@ -274,5 +274,5 @@ class ServiceNode(InterfaceNode):
         self._answered_at = time.monotonic()
         try:
             self._respond(response, header)
-        except RuntimeError as error:  # the caller is gone
+        except Exception as error:  # noqa: BLE001 - rclpy's, as when the caller is gone
             self._loop.call_soon_threadsafe(self.robot.drops.note, "failed", self.topic, first_line(error))

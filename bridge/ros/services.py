@@ -7,6 +7,7 @@ written in docs/robot.md.
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -24,6 +25,8 @@ from macs_zenoh.protocol.messages import AddNode, NodeType
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.robot_state import NodeStatus
 from macs_zenoh.timeouts import within
+
+log = logging.getLogger("macs.ros")
 
 BURST = 8
 """ROS keeps 10 requests of a service, and 10 responses of a client, that were not taken yet, and loses the oldest of
@@ -118,6 +121,9 @@ class ClientNode(InterfaceNode):
             self._fail(message, error)
         except asyncio.TimeoutError:
             self._fail(message, CallFailed("timeout", f"{self.topic} did not answer within {self._deadline_s:g} s"))
+        except Exception as error:
+            log.exception("%s: a call failed", self.topic)
+            self._fail(message, CallFailed("failed", first_line(error)))
         else:
             asker = Registrant.of(message)
             if asker in self.unity:
@@ -185,7 +191,7 @@ class ClientNode(InterfaceNode):
             raise self._stopped()
         try:
             sent = self._client.call_async(deserialize_message(request, self._service.Request))
-        except RuntimeError as error:
+        except Exception as error:  # rclpy's, whatever it is
             raise CallFailed("invalid", f"the request is no {self.interface}: {first_line(error)}") from error
 
         def answered(future: Any) -> None:

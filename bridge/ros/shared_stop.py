@@ -160,7 +160,7 @@ class SharedStop:
             if len(cdr) > STATE_BYTES:
                 raise msgspec.DecodeError(f"{len(cdr)} bytes")
             state = msgspec.json.decode(deserialize_message(cdr, self._text).data, type=StopState)
-        except (msgspec.DecodeError, RuntimeError) as error:
+        except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is, or msgspec's
             self._robot.drops.note("bad_stop_state", self._topic + AGENTS, f"this is no state of an agent: {error}")
             return
         if state.session == self._robot.stop.session:

@@ -434,7 +434,7 @@ class PublisherNode(TopicNode):
     def _publish(self, cdr: bytes) -> bool:
         try:
             self._publisher.publish(cdr)
-        except RuntimeError as error:
+        except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is
             self.robot.drops.note("failed", self.topic, f"ROS did not publish: {error}")
             return False
         return True
