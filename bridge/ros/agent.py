@@ -358,8 +358,7 @@ class RobotAgent:
 
     def _still_cut_off(self) -> None:
         if not self.agent.mesh.linked:
-            for node in self.nodes:
-                node.cut_off()
+            self.nodes.cut_off()
 
     def _presence(self, agent: AgentInfo, online: bool) -> None:
         agent_key = Registrant(agent.type, agent.id)

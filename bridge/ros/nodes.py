@@ -11,7 +11,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 
 from bridge.ros.actions import ActionNode, tell_no_goal
@@ -207,11 +207,16 @@ class InterfaceNodes:
         self.stop = stop
 
     def _stopped(self, by: str) -> None:
-        for node in sorted(self, key=_has_no_stop_message):  # what moves the robot now comes first
+        # what moves the robot now comes first
+        self._each(lambda node: node.emergency_stop(by), sorted(self, key=_has_no_stop_message))
+
+    def _each(self, do: Callable[[InterfaceNode], None], nodes: Iterable[InterfaceNode] | None = None) -> None:
+        """One node that fails keeps no other from being stopped, left or removed."""
+        for node in self if nodes is None else nodes:
             try:
-                node.emergency_stop(by)
-            except Exception:  # the others are stopped all the same
-                log.exception("%s: stopping it failed", node.topic)
+                do(node)
+            except Exception:
+                log.exception("%s: a %s failed", node.topic, node.ROLE)
 
     def remove(self, request: RemoveNode) -> None:
         """Take a registrant off a node; the last one removes it. Asking for what is not there changes nothing."""
@@ -227,13 +232,15 @@ class InterfaceNodes:
         will not come back, its id is another one's."""
         with self._early_lock:
             self._early.drop(registrant)
-        for node in self:
-            node.left(registrant)
-            if registrant in node.registrants:
-                if node.linger_s and not for_good:
-                    self._linger(node, registrant)
-                else:
-                    self._deregister(node, registrant)
+        self._each(lambda node: node.left(registrant))
+
+        def let_go(node: InterfaceNode) -> None:
+            if node.linger_s and not for_good:
+                self._linger(node, registrant)
+            else:
+                self._deregister(node, registrant)
+
+        self._each(let_go, [node for node in self if registrant in node.registrants])
 
     def arrived(self, registrant: Registrant) -> None:
         """An agent is seen now; what it sent before waits to be judged."""
@@ -244,14 +251,15 @@ class InterfaceNodes:
 
     def returned(self, registrant: Registrant) -> None:
         """An agent that seemed to have left is there again, the same one."""
-        for node in self:
-            node.returned(registrant)
+        self._each(lambda node: node.returned(registrant))
+
+    def cut_off(self) -> None:
+        """The robot has lost the mesh: all who commanded count as gone."""
+        self._each(lambda node: node.cut_off())
 
     def forget_all(self) -> None:
         """Remove all that anybody registered; only the emergency stop stays."""
-        for node in self:
-            if node is not self.stop:
-                self._remove(node)
+        self._each(self._remove, [node for node in self if node is not self.stop])
 
     def deliver(self, message: Message) -> None:
         """Pass a message that names an interface node to it. Never raises for what a peer sent. On the loop; commands
@@ -373,14 +381,11 @@ class InterfaceNodes:
 
     def last_words(self) -> None:
         """This program is about to end without closing anything: no last command may stay. From any thread."""
-        for node in list(self):
-            if isinstance(node, PublisherNode):
-                node.retire()
+        self._each(lambda node: node.retire(), [node for node in self if isinstance(node, PublisherNode)])
 
     def close(self) -> None:
         """Remove all nodes."""
-        for node in self:
-            self._remove(node)
+        self._each(self._remove)
         self._expiry.cancel()
         self.robot.alarms.close()
 
@@ -500,7 +505,7 @@ class InterfaceNodes:
         self._places.remove(node)
         node.is_open = False
         self._note_removed(node.topic)
-        node.retire()
+        self._each(lambda node: node.retire(), [node])
         self.robot.session.submit(node.close)
         log.info("%s: %s removed", node.topic, node.ROLE)
 

@@ -189,3 +189,18 @@ async def test_an_answer_that_does_not_come_is_a_timeout(router: str) -> None:
         robot.serve("sleep", sleep)
         with pytest.raises(TimeoutError, match=r"ros/7 sleep .* no answer within 0\.3 s"):
             await robot.call("ros", 7, "sleep", timeout_s=0.3)
+
+
+async def test_a_callback_that_fails_keeps_nobody_from_hearing(router: str) -> None:
+    """Neither another one of who came, nor that one or another of who comes next."""
+    heard: list[int] = []
+
+    def failing(agent: macs_zenoh.AgentInfo, online: bool) -> None:
+        if agent.id in (6, 7):
+            raise RuntimeError("a fault of ours")
+
+    async with macs_zenoh.join("unity", id=5, connect=[router]) as one:
+        one.on_presence(failing)
+        one.on_presence(lambda agent, online: heard.append(agent.id))
+        async with macs_zenoh.join("unity", id=6, connect=[router]), macs_zenoh.join("unity", id=7, connect=[router]):
+            await until(lambda: {6, 7} <= set(heard))
