@@ -7,6 +7,9 @@ from .config import Priority
 from .mesh import Traffic
 from .protocol.keyexpr import STREAM
 
+KNOWN = 4096
+"""Names of interface nodes whose keys are remembered."""
+
 
 class Streams:
     """The stream keys of one robot, one for each interface node. All methods may be called from any thread."""
@@ -33,6 +36,8 @@ class Streams:
     def _key(self, node: str) -> str:
         key = self._keys.get(node)
         if key is None:
+            if len(self._keys) >= KNOWN:  # names come from the network
+                self._keys = {}
             key = self._keys[node] = STREAM.of(type=self._agent.type_number, id=self._agent.id, node=node)
         return key
 

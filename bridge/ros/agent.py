@@ -114,6 +114,7 @@ class RobotAgent:
         """Who has an id, or had it last."""
         self.stop_line: StopLine | None = None
         self._stop_later: asyncio.Task[None] | None = None
+        self._last_words: Handle | None = None
 
     def _graph_changed(self, topics: NamesAndTypes, services: NamesAndTypes) -> None:
         """In the ROS thread."""
@@ -128,7 +129,7 @@ class RobotAgent:
         self.agent.on_presence(self._presence)
         self.agent.on_id(self._id_changed)
         self.agent.mesh.on_link(self._link)
-        self.agent.mesh.last_words(self.nodes.last_words)
+        self._last_words = self.agent.mesh.last_words(self.nodes.last_words)
         self.agent.mesh.tells = self._troubles
         for verb, handler in (
             ("add_node", self._add_node),
@@ -202,6 +203,8 @@ class RobotAgent:
         for answer in self._answering:
             answer.cancel()
         self.nodes.close()
+        if self._last_words is not None:
+            self._last_words.close()
         if self.stop_line is not None:
             await self.stop_line.close()
         await asyncio.to_thread(self._audit.close)

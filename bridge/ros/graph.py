@@ -38,6 +38,8 @@ FRESH_S = 0.05
 """So long what the graph was read to be is given to others that ask."""
 SETTLE_LOOKS = 3
 """So many looks after a change read everything: ROS knows a topic before it knows whose it is."""
+FOLLOWERS = 4096
+"""Agents that are told of changes; of more, those that asked last."""
 
 NamesAndTypes = list[tuple[str, list[str]]]
 
@@ -145,6 +147,9 @@ class Offers:
         """Tell this agent of every change from now on, if its request asks for that."""
         with suppress(WireError):
             if request.data and decode_data(FollowRequest, request.data).follow:
+                self._followers.pop(agent, None)
+                if len(self._followers) >= FOLLOWERS:  # one that was never seen is not seen to leave, either
+                    del self._followers[next(iter(self._followers))]
                 self._followers[agent] = request.metadata.request_id
 
     def forget(self, agent: Registrant) -> None:

@@ -18,6 +18,8 @@ from typing import Any, cast
 
 import zenoh
 
+from macs_zenoh.handles import Callbacks, Handle
+
 log = logging.getLogger("macs.mesh")
 
 PANICKED = 70
@@ -26,13 +28,13 @@ PANICKED = 70
 LAST_WORDS_S = 0.5
 """How long what must still be said may take, as a robot's stop messages."""
 
-_last_words: list[Callable[[], None]] = []
+_last_words: Callbacks[Callable[[], None]] = Callbacks()
 """Of the whole process: a panic ends all of it."""
 
 
-def last_words(say: Callable[[], None]) -> None:
+def last_words(say: Callable[[], None]) -> Handle:
     """Call ``say``, from any thread, before a panic ends this program."""
-    _last_words.append(say)
+    return _last_words.add(say)
 
 
 def is_panic(error: object) -> bool:

@@ -170,9 +170,9 @@ class Mesh:
         """How many of what had to wait were sent."""
         return self._outgoing.backlog_sent
 
-    def last_words(self, say: Callable[[], None]) -> None:
+    def last_words(self, say: Callable[[], None]) -> Handle:
         """Call ``say``, from any thread, before a panic of Zenoh ends this program, which does not leave the mesh."""
-        last_words(say)
+        return last_words(say)
 
     def _beat(self) -> None:
         """Put something to nobody: a panic in a thread of Zenoh's own would show nowhere else."""

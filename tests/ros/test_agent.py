@@ -14,13 +14,15 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Bool, String
 
 import macs_zenoh
+from bridge.ros import graph
 from bridge.ros.agent import RobotAgent, open_robot
 from bridge.ros.graph import Offered, TopicQos
+from bridge.ros.interface import Registrant
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Refused
-from macs_zenoh.mesh import Mesh, Sample
+from macs_zenoh.mesh import Mesh, Sample, panics
 from macs_zenoh.protocol.keyexpr import PRESENCE, STREAM
 from macs_zenoh.protocol.messages import (
     Functionality,
@@ -32,6 +34,7 @@ from macs_zenoh.protocol.messages import (
     decode_management,
 )
 from macs_zenoh.protocol.messages import encode_data as encode
+from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.robot_state import STATUS
 from macs_zenoh.protocol.routing import call
 from macs_zenoh.protocol.wire import parse_frame
@@ -55,6 +58,24 @@ async def headset(router: str, robot: RobotAgent) -> AsyncIterator[Agent]:
     async with macs_zenoh.join("unity", id=5, connect=[router]) as headset:
         await until(lambda: (1, ROBOT) in headset.directory)
         yield headset
+
+
+async def test_a_robot_that_has_ended_has_no_last_words(router: str, domain: int) -> None:
+    """Nor do its nodes stay, in a program that has one robot after the other."""
+    settings = Settings(mesh=MeshSettings(connect=[router]), robot=RobotSettings(id=ROBOT))
+    before = len(list(panics._last_words))
+    async with open_robot(settings, domain_id=domain):
+        assert len(list(panics._last_words)) == before + 1
+    assert len(list(panics._last_words)) == before
+
+
+async def test_who_was_never_seen_does_not_follow_for_ever(robot: RobotAgent) -> None:
+    """Those that asked last are told of changes."""
+    for number in range(graph.FOLLOWERS + 5):
+        asked = Message("unity", number, Metadata(), b'{"follow": true}')
+        robot.offers.follow(Registrant(2, number), asked)
+    assert len(robot.offers._followers) == graph.FOLLOWERS
+    assert Registrant(2, graph.FOLLOWERS + 4) in robot.offers._followers
 
 
 class Streams:
