@@ -256,6 +256,9 @@ class Driver:
         self.headset = headset
         self._commands = commands
         self.sent: list[float] = []
+        """When each command was due."""
+        self.last_at = -math.inf
+        """When the last one was sent: the loop of this process may have been late."""
         self.drives = True
         self._task = asyncio.create_task(self._drive())
 
@@ -267,6 +270,7 @@ class Driver:
                     twist = Twist()
                     twist.linear.x, twist.linear.y = 0.5, due
                     self.sent.append(due)
+                    self.last_at = time.monotonic()
                     await self._commands.publish(bytes(serialize_message(twist)))
                 due += DRIVE_EVERY_S
                 await asyncio.sleep(due - time.monotonic())
@@ -450,7 +454,7 @@ class Scene:
         if not await self._moves(window):
             return True
         self.driver.drives = False
-        last = self.driver.sent[-1]
+        last = self.driver.last_at
         stopped = await until(lambda: self._stopped_since(last), NO_EFFECT_S, quietly=True)
         self.driver.drives = True
         at = next((h.at for h in self.wheels.heard if h.stop and h.at > last), math.inf)
