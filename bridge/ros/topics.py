@@ -34,6 +34,7 @@ from bridge.ros.types import InterfaceName, least_cdr_bytes, resolve
 from bridge.ros.unity_cdr import TooManyParts, UnityCdr, to_ros, to_unity
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.protocol.messages import AddNode, NodeType, StreamData
+from macs_zenoh.protocol.rate import Rate
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.recovery import SILENT_S
 from macs_zenoh.protocol.robot_state import ControlStatus, DeadManStatus, NodeStatus
@@ -274,7 +275,7 @@ class RateLimit:
 
     def __init__(self, max_hz: float) -> None:
         self._period_s = 1 / max_hz
-        self._next = -math.inf
+        self._pace = Rate(max_hz)
         self._latest: bytes | None = None
 
     @property
@@ -284,11 +285,11 @@ class RateLimit:
 
     def offer(self, message: bytes, now: float) -> float | None:
         """None: send it now. Otherwise it waits in place of an older one, until the time that is returned."""
-        if self._latest is None and now >= self._next:
+        if self._latest is None and self._pace.allows(now):
             self._sent(now)
             return None
         self._latest = message
-        return self._next
+        return self._pace.due
 
     def take(self, now: float) -> bytes | None:
         """The message that waits, to be sent now."""
@@ -299,8 +300,8 @@ class RateLimit:
 
     def _sent(self, now: float) -> None:
         """Keep the pace: a message that was a little late does not delay all that follow."""
-        late_s = now - self._next
-        self._next = (self._next if late_s < self._period_s else now) + self._period_s
+        due = self._pace.due
+        self._pace.take(1, due if now - due < self._period_s else now)
 
 
 class PublisherNode(TopicNode):

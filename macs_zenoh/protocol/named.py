@@ -18,6 +18,7 @@ from msgspec import Meta
 from ..errors import BadField, BadJson, UsageError
 from .keyexpr import NAME, WANTED, type_name
 from .limits import NESTING
+from .rate import Rate
 from .wire import encode_message, split_message
 
 _K = TypeVar("_K")
@@ -193,20 +194,22 @@ class RateLimits:
     LIMIT = 4096
 
     def __init__(self, max_hz: Mapping[str, float]) -> None:
-        self._pause_s = {message_type: 1.0 / rate for message_type, rate in max_hz.items()}
-        self._next: dict[tuple[str, str], float] = {}
+        self._max_hz = dict(max_hz)
+        self._paces: dict[tuple[str, str], Rate] = {}
 
     def admit(self, message_type: str, receiver: str, now: float) -> bool:
         """Whether a message may be sent now; if so, it counts."""
-        pause_s = self._pause_s.get(message_type)
-        if pause_s is None:
+        max_hz = self._max_hz.get(message_type)
+        if max_hz is None:
             return True
-        key = (message_type, receiver)
-        if now < self._next.get(key, now):
+        pace = self._paces.get((message_type, receiver))
+        if pace is None:
+            if len(self._paces) >= self.LIMIT:
+                self._paces = {key: each for key, each in self._paces.items() if not each.allows(now)}
+            pace = self._paces[message_type, receiver] = Rate(max_hz)
+        if not pace.allows(now):
             return False
-        if len(self._next) >= self.LIMIT:
-            self._next = {k: at for k, at in self._next.items() if at > now}
-        self._next[key] = now + pause_s
+        pace.take(1, now)
         return True
 
 

@@ -7,7 +7,6 @@ drop has a reason, ``over_size``, ``over_rate`` or ``over_budget``.
 
 from __future__ import annotations
 
-import math
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Sequence
@@ -15,6 +14,7 @@ from typing import NamedTuple, TypeVar
 
 from ..config import Priority, TrafficRule
 from .keyexpr import fits
+from .rate import Rate
 
 BURST_S = 0.1
 """So much of a rate or a budget may come at once, and one message more: senders and their machines are not regular."""
@@ -25,22 +25,6 @@ REASONS = {"max_bytes": "over_size", "max_hz": "over_rate", "max_bytes_per_s": "
 OTHER_KEYS = "other keys"
 
 T = TypeVar("T")
-
-
-class Pace:
-    """At most so much per second. After a pause something of any size passes; what follows waits for what it took."""
-
-    def __init__(self, per_s: float) -> None:
-        self._per_s = per_s
-        self._paid_until = -math.inf
-
-    def allows(self, now: float) -> bool:
-        """Whether anything may pass now."""
-        return self._paid_until - now <= BURST_S
-
-    def take(self, amount: float, now: float) -> None:
-        """Something passes."""
-        self._paid_until = max(self._paid_until, now) + amount / self._per_s
 
 
 class Overrun(NamedTuple):
@@ -62,7 +46,7 @@ class Limit:
         self.rule = rule.match
         self.setting = setting
         self.value: float = getattr(rule, setting)
-        self._pace = None if setting == "max_bytes" else Pace(self.value)
+        self._pace = None if setting == "max_bytes" else Rate(self.value, BURST_S)
 
     def allows(self, size: int, now: float) -> bool:
         """Whether a message of this size may pass now."""

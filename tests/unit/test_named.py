@@ -124,7 +124,7 @@ def test_the_rate_table_is_bounded() -> None:
     limits = RateLimits({"pose": 2.0})
     for number in range(3 * RateLimits.LIMIT):
         assert limits.admit("pose", str(number), float(number))
-    assert len(limits._next) <= RateLimits.LIMIT
+    assert len(limits._paces) <= RateLimits.LIMIT
 
 
 def test_last_values_are_bounded_in_bytes() -> None:

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from macs_zenoh.config import TrafficRule
 from macs_zenoh.protocol import policing as shaping
-from macs_zenoh.protocol.policing import BURST_S, OTHER_KEYS, Pace, Policer, Policy
+from macs_zenoh.protocol.policing import BURST_S, OTHER_KEYS, Policer, Policy
+from macs_zenoh.protocol.rate import Rate
 
 CAMERA = "macs/from/ros/7/nd__camera_front"
 OTHER_CAMERA = "macs/from/ros/7/nd__camera_back"
@@ -146,7 +147,7 @@ def test_what_one_limit_drops_costs_the_others_nothing() -> None:
 
 def test_time_that_stands_still_or_runs_back_is_no_fault() -> None:
     """Threads bring their times in any order; a pace neither breaks nor opens."""
-    pace = Pace(10)
+    pace = Rate(10, BURST_S)
     pace.take(1, 5.0)
     assert pace.allows(4.99 + BURST_S)
     pace.take(1, 4.9)
