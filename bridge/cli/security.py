@@ -39,7 +39,7 @@ SUMMARY = "certificates and access rules from a policy"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    verbs = parser.add_subparsers(dest="what", metavar="WHAT", required=True)
+    verbs = parser.add_subparsers(dest="what", metavar="VERB", required=True, title="verbs")
     generate = verbs.add_parser(
         "generate", help="write certificates, rules and settings", description=_generate.__doc__
     )

@@ -69,6 +69,7 @@ from macs_zenoh.protocol.tcp_agent import (
     NotLetIn,
     Registering,
     RegistrationRefused,
+    Sent,
     Streamed,
     TcpAgent,
     Withdrawn,
@@ -161,8 +162,6 @@ class Gateway:
         judged = JudgedFrames()
         self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged)
         self._delivery = Delivery(self.agents, self.directory, self._layout, stead, judged, forwarding.afar)
-        # what agents sent goes straight there: it is called for every message
-        self.forward, self.received = forwarding.forward, forwarding.finish
         self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
         self._leases = Leases(
             mesh,
@@ -406,6 +405,14 @@ class Gateway:
         return sender[0] == ROS and self._robots.registered(connection.key, metadata, int(sender[1] or 0))
 
     # -- from a TCP agent to the mesh ----------------------------------------------------------------------------
+
+    def forward(self, connection: Connection, sent: Sent) -> None:
+        """The agent sent a frame to others."""
+        self._forwarding.forward(connection, sent)
+
+    def received(self, connection: Connection) -> None:
+        """All events of one read were passed on."""
+        self._forwarding.finish(connection)
 
     def pace(self) -> Pace:
         """For a new connection."""
