@@ -31,6 +31,7 @@ from .nodes import REQUEST_IDS, Incoming, Node, Owner
 ID_BYTES = 16
 UNKNOWN, ACCEPTED, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = range(7)
 """action_msgs/GoalStatus."""
+FINISHED = "the goal has finished"
 
 
 class Result(NamedTuple):
@@ -65,6 +66,8 @@ class Goal:
 
     async def cancel(self, timeout_s: float = 5.0) -> None:
         """Ask the action to stop. Raises Refused when it does not, CallTimeout, Unreachable."""
+        if self.finished.done():
+            raise Refused(FINISHED)
         await self._client.tell(self.robot, ActionVerb.CANCEL, self.id)
         await _within(self.cancelling, f"cancellation of {self._client.spec.tos_name}", timeout_s)
 
@@ -84,6 +87,8 @@ class Goal:
             elif not self.finished.done():
                 self.finished.set_result(Result(code, rest))
                 self._feedback.close()
+                # the answer to a cancellation may be behind the result, and finds no goal then
+                _settle(self.cancelling, None if code == CANCELED else Refused(FINISHED))
 
     def _end(self, error: Exception) -> None:
         if not self.finished.done():

@@ -384,6 +384,7 @@ class ActionNode(InterfaceNode):
 
     def _send_cancel(self, goal: Goal) -> None:
         if goal.handle is None or self._client is None:
+            self._loop.call_soon_threadsafe(self._tell, goal, ActionVerb.CANCEL, 0, b"the goal has finished")
             return
 
         def cancelling(future: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import AsyncIterator
 from types import SimpleNamespace
 from typing import Any
@@ -291,6 +292,21 @@ async def test_an_emergency_stop_cancels_goals(site: SimpleNamespace) -> None:
         await site.five.client.send_goal(7, site.goal(1))
     site.nodes.stop.release("unity/5")
     await site.five.client.send_goal(7, site.goal(1))
+
+
+async def test_whoever_cancels_a_goal_that_ends_in_this_moment_is_answered(site: SimpleNamespace) -> None:
+    """It has ended by the time the ROS thread comes to it."""
+    goal = await site.five.client.send_goal(7, site.goal(1000))
+    node, go_on = site.nodes.get(NodeType.ACTION, "nd__count"), threading.Event()
+    site.nodes.robot.session.submit(go_on.wait)
+    try:
+        canceling = asyncio.create_task(goal.cancel(PATIENCE_S))
+        await asyncio.sleep(0.05)
+        node._finished(node._goals[goal.id], ABORTED, b"it has ended")
+    finally:
+        go_on.set()
+    with pytest.raises(Refused, match="the goal has finished"):
+        await canceling
 
 
 async def test_a_short_stop_cancels_goals(site: SimpleNamespace) -> None:
