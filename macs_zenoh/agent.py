@@ -423,11 +423,11 @@ class Agent:
         for change in changes:
             agent, online = change
             if self._nodes is not None:
-                _contained(self._nodes.presence, change)
+                _contained("what follows for interface nodes", self._nodes.presence, change)
             if agent.zid != self.mesh.zid:
                 log.info("%s/%d %s", agent.type_name, agent.id, "is online" if online else "has left")
             for callback in self._on_presence:
-                _contained(callback, agent, online)
+                _contained(f"telling of {agent.type_name}/{agent.id}", callback, agent, online)
 
     def _id_changed(self, old: int, new: int) -> None:
         self._presses.leave(AgentId(self.type_number, old))
@@ -436,7 +436,7 @@ class Agent:
         if self._nodes is not None:
             self._nodes.id_changed((self.type_number, old), new)
         for callback in self._on_id:
-            _contained(callback, old, new)
+            _contained(f"handling the new id of {self.type}/{new}", callback, old, new)
 
     # -- life ----------------------------------------------------------------------------------------------------
 
@@ -534,9 +534,9 @@ async def join(
             agent.close()
 
 
-def _contained(callback: Callable[..., object], *args: object) -> None:
+def _contained(what: str, callback: Callable[..., object], *args: object) -> None:
     """One that fails keeps no other from hearing, nor anybody from hearing of the others who came or left."""
     try:
         callback(*args)
     except Exception:
-        log.exception("a callback failed")
+        log.exception("%s failed", what)

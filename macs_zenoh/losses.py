@@ -45,7 +45,9 @@ class Losses(Counter[str]):
         with self._lock:
             if count:
                 self[name] += count
-            if (name, about) in self._logged or len(self._logged) >= self.LOGGED:
+            if len(self._logged) >= self.LOGGED:
+                about = ""  # names that others make up hide no loss of another kind
+            if (name, about) in self._logged:
                 return False
             self._logged.add((name, about))
             return True

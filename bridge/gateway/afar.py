@@ -124,6 +124,8 @@ class Afar:
                     self._end(connection, slowed)
 
     def _slow_down(self, connection: Connection, receiver: AgentKey) -> None:
+        if connection.drives:
+            return
         slowed = self.slowed.get(connection)
         if slowed is None:
             slowed = self.slowed[connection] = _Slowed()

@@ -478,7 +478,10 @@ class Connection(asyncio.BufferedProtocol):
 
     def _tick(self) -> None:
         now = time.monotonic()
-        if now < self.peer.next_deadline() or not self._must_be_read():
+        in_time = now < self.peer.next_deadline()
+        if in_time:
+            self._looked = False  # what comes when its time has run out another time is looked at anew
+        if in_time or not self._must_be_read():
             self._events(self.peer.tick(now))
         paused_at = self._writer.paused_at
         if paused_at is not None and now >= paused_at + self._write_timeout_s:

@@ -14,6 +14,7 @@ from macs_zenoh.presses import GOES, STOP_NAME, WAITS, WAITS_INSTEAD, Presses
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.existing import asks
+from macs_zenoh.protocol.guard import STOP_TYPES
 from macs_zenoh.protocol.messages import ROS, NodeType
 from macs_zenoh.protocol.rate_limit import Passing
 from macs_zenoh.protocol.routing import stream_key
@@ -28,9 +29,6 @@ from .latest import Latest
 from .routes import Route, Routes
 
 PUBLISHER = int(NodeType.PUBLISHER)
-STOP_TYPES = frozenset({"std_msgs/Bool", "std_msgs/msg/Bool"})
-"""Of emergency stops, which no limit here concerns: what a robot's is called, only the robot knows."""
-
 SLOWED_EACH_S, SLOWED_S = 0.02, 0.25
 """So long for each who floods now nobody of them is read from, and so long at most: a headset may freeze."""
 
@@ -205,14 +203,14 @@ class Forwarding:
         return passing is Passing.NOW
 
     def _keep_latest(self, connection: Connection, sent: Sent, route: Route, passing: Passing) -> None:
-        """Of commands that have waited the newest is kept; one that goes on now takes its place."""
+        """Of commands that have waited the newest is kept, and goes on before one that has not."""
         kind = sent.frame.destination, sent.metadata.node_name
         if passing is Passing.NOW:
-            older = int(self._latest.supersede(connection, kind))
-        else:
-            *_, newest = sent.frame.each()
-            older = sent.frame.count - 1
-            older += self._latest.hold(connection, kind, route, Sent(newest, sent.metadata, sent.readable))
+            self._latest.follow(connection, kind)
+            return
+        *_, newest = sent.frame.each()
+        older = sent.frame.count - 1
+        older += self._latest.hold(connection, kind, route, Sent(newest, sent.metadata, sent.readable))
         if older:
             connection.complain("too_old", "commands that waited with newer ones", older)
 

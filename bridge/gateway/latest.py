@@ -21,19 +21,18 @@ class Latest:
 
     def hold(self, connection: Connection, kind: Hashable, route: Route, newest: Sent) -> bool:
         """Let a command wait for a newer one. Whether one did that is now dropped."""
-        superseded = self.supersede(connection, kind)
+        held = self._held.setdefault(connection, {})
+        superseded = held.pop(kind, None)
+        if superseded is not None:
+            superseded[-1].cancel()
         timer = asyncio.get_running_loop().call_later(TOGETHER_S, self._go, connection, kind)
-        self._held.setdefault(connection, {})[kind] = route, newest, timer
-        return superseded
+        held[kind] = route, newest, timer
+        return superseded is not None
 
-    def supersede(self, connection: Connection, kind: Hashable) -> bool:
-        """A newer command has come. Whether one waited; it is dropped."""
-        held = self._held.get(connection)
-        waiting = held.pop(kind, None) if held else None
-        if waiting is None:
-            return False
-        waiting[-1].cancel()
-        return True
+    def follow(self, connection: Connection, kind: Hashable) -> None:
+        """A command has come that has not waited: nor has the one before it, which goes on first."""
+        if kind in self._held.get(connection, ()):
+            self._go(connection, kind)
 
     def go(self, connection: Connection) -> None:
         """Nothing newer can come: the connection has ended, or is about to have another id."""

@@ -26,6 +26,7 @@ from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Subscription
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.addresses import joined
+from macs_zenoh.protocol.attempts import Attempts
 from macs_zenoh.protocol.budget import Budget
 from macs_zenoh.protocol.credit import Credit, Credits
 from macs_zenoh.protocol.decoders import FrameDecoder
@@ -158,6 +159,7 @@ class Gateway:
         """Who is online."""
         self._robot_ids = RobotIds(settings.robots)
         self._audit: Audit = NO_AUDIT
+        self._not_let_in = Attempts()
         stead = Stead(mesh, self._layout)
         judged = JudgedFrames()
         self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged)
@@ -436,7 +438,10 @@ class Gateway:
         elif isinstance(event, Forbidden):
             self._tell_forbidden(connection, event)
         elif isinstance(event, NotLetIn):
-            self._audit.record("refused", who(address=connection.address), "join", "no valid token")
+            count = self._not_let_in.note(connection.host, time.monotonic())
+            if count:  # or who knocks all day would push what was done out of the record
+                told = "no valid token" if count == 1 else f"no valid token, {count} times by now"
+                self._audit.record("refused", who(address=connection.address), "join", told)
             self._tell_access(connection, AccessRefused("no_token", "a valid token is wanted here"))
         elif isinstance(event, Withdrawn):
             self._withdraw(connection, event)

@@ -20,12 +20,14 @@ from ..errors import WireError
 from .agent_id import AgentId
 from .credit import Credit
 from .keyexpr import GROUP, UNICAST, sender_of, type_number
-from .messages import ROS, NodeType
+from .messages import ROS, Metadata, NodeType
 from .reading import Message, Reader
 from .wire import Layout
 
 STOP_TOPIC = "/emergency_stop"
 """Of a robot whose settings name no other."""
+STOP_TYPES = frozenset({"std_msgs/Bool", "std_msgs/msg/Bool"})
+"""Of emergency stops: what a robot's is called, only the robot knows."""
 COMMAND = int(NodeType.PUBLISHER)
 FLOODED = "it sends more than one agent may"
 Buffer = bytes | bytearray
@@ -423,6 +425,12 @@ INBOX_KEYS, GROUP_KEYS = UNICAST.prefix, GROUP.prefix
 def presses(data: bytes) -> bool:
     """Whether data for the emergency stop stops: not more than is needed to know, the stop itself looks closer."""
     return len(data) > 4 and data[4] != 0
+
+
+def is_press(metadata: Metadata, data: Buffer | memoryview) -> bool:
+    """Whether a message to a robot may be a press of its emergency stop."""
+    command = metadata.node_type == COMMAND and metadata.data_exchange_type in STOP_TYPES
+    return command and presses(bytes(data[:5]))
 
 
 def _is_command(message: Message) -> bool:

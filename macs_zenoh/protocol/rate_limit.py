@@ -43,8 +43,8 @@ class Flow:
     flow."""
     GAP_S = 1.0
     """A flow that has a gap of so long has stood still, or somebody has stopped driving for a moment."""
-    LATE_S = 1.0
-    """For so long at most commands count as having waited."""
+    LATE_S = 3.0
+    """For so long at most commands count as having waited, whatever still comes."""
     PACED = 3
     """So many in a row that come like the flow before the gap have not waited."""
     MEAN_OF = 16
@@ -57,6 +57,8 @@ class Flow:
         self._late_since: float | None = None
         self._late = 0
         """How many came since."""
+        self._most_late = 0.0
+        """How many there can be that were said in the gap."""
         self._paced = 0
 
     @property
@@ -72,6 +74,7 @@ class Flow:
         self._late_since = None
         if gap > self.GAP_S and self._length >= self.LENGTH:
             self._length, self._late_since, self._late, self._paced = 0, now, count, 0
+            self._most_late = gap / max(self._usual_s, 1e-9) + 2
             return True
         if gap > self.MOST_S:
             self._length, self._usual_s = 0, 0.0
@@ -88,7 +91,7 @@ class Flow:
         if self._late <= 1 + 2 * late_s / max(self._usual_s, 1e-9):
             return False
         self._paced = self._paced + 1 if count == 1 and gap >= self._usual_s / 2 else 0
-        if self._paced < self.PACED:
+        if self._paced < self.PACED and self._late <= self._most_late:
             return True
         self._late_since = None
         return False

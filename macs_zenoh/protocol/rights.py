@@ -41,7 +41,7 @@ RIGHTS: dict[Right, str] = {
     "stop": "press and release emergency stops; a robot has its own say in who releases",
     "ask": "ask own managers of robots and gateways, send robots what belongs to no topic",
     "send": "send to other headsets by id and by group",
-    "broadcast": "send to everybody; only with --robots any, for robots hear it as well",
+    "broadcast": "send to everybody, what needs no other right; only with --robots any, for robots hear it as well",
     "robot": "join as a robot program, and not as a headset",
 }
 """Each right by its name, with what it permits."""
@@ -117,7 +117,7 @@ class Rights(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             why = self._to_headsets(metadata)
         elif why is None and metadata.node_name:
             why = self._of_node_data(metadata, name)
-        elif why is None and header.agent_type == ROS:
+        elif why is None and (header.agent_type == ROS or metadata.message_manager):
             why = self._of_request(metadata.message_manager)
         return why
 
@@ -139,7 +139,7 @@ class Rights(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         right = _OF_NODES.get(node_type)
         if right is None:
             return f"there are no nodes of type {node_type}"
-        if right == "command" and self._is_stop(name):
+        if right == "command" and self.is_stop(name):
             return None if self.has("stop") else _missing("stop")
         if not self.has(right):
             return _missing(right)
@@ -153,7 +153,7 @@ class Rights(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             return f"{name[:80]} is not among the topics of this token"
         return None
 
-    def _is_stop(self, name: str) -> bool:
+    def is_stop(self, name: str) -> bool:
         """Whether robots may take it for their stop: by its node name, for that is all that messages say."""
         own = node_name(name if name.startswith("/") else f"/{name}")
         return any(own == node_name(stop) for stop in self.stop_topics)

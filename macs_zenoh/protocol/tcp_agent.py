@@ -24,6 +24,7 @@ from ..errors import BadField, BadJson, NotAdmitted, NotAllowed, NotPermitted, T
 from . import greetings
 from .credit import Credit
 from .decoders import FrameDecoder
+from .guard import is_press
 from .judging import Judge
 from .limits import (
     CONFIGURATION_BYTES,
@@ -208,6 +209,8 @@ class TcpAgent:
     ``drops`` counts, by name, what was not passed on; ``corrected`` counts frames whose sender had to be put right.
     """
 
+    STOPS_PER_S = 20
+    """Presses of a stop that pass beyond a rate limit."""
     TOPICS = 128
     TOPIC_BYTES = 1024
     """So many lists of a topic's registrants are remembered, if they are not longer."""
@@ -268,6 +271,7 @@ class TcpAgent:
             self._limits = limits._replace(held_bytes=min(limits.held_bytes, STRANGER_HELD_BYTES))
         self._held: deque[Frames] = deque()
         self._held_bytes = 0
+        self._stops = Credit(self.STOPS_PER_S, now)
         self._connected_at = now
         self._heard_at = now
         self._partial_since: float | None = None
@@ -318,7 +322,7 @@ class TcpAgent:
                 if (limited and not self._covered(frame, now)) or (
                     shared is not None and not shared.take(frame.count, now)
                 ):
-                    self._too_fast(frame, events)
+                    self._too_fast(frame, now, events)
                 elif self.state is ONLINE and not frame.has_management:
                     events.append(self._sent(frame))
                     continue
@@ -418,9 +422,11 @@ class TcpAgent:
             return True
         return self.credit.take(frame.count, now)
 
-    def _too_fast(self, frame: Frames, events: list[Event]) -> None:
-        """A frame beyond the rate limit is dropped, but who leaves may say so. A registration is answered, which a
-        topic's data cannot be."""
+    def _too_fast(self, frame: Frames, now: float, events: list[Event]) -> None:
+        """A frame beyond the rate limit is dropped, but who leaves may say so, and who may stops a robot. A
+        registration is answered, which a topic's data cannot be."""
+        if self.state is ONLINE and self._presses(frame, now, events):
+            return
         error = TooFast(self._limits.frames_per_s or (self._rights.frames_per_s if self._rights else 0))
         if frame.has_management:
             with suppress(BadJson, BadField, UnknownManager):
@@ -431,6 +437,15 @@ class TcpAgent:
                 if isinstance(management, Registration):
                     events.append(_refusal(management, error))
         raise error
+
+    def _presses(self, frame: Frames, now: float, events: list[Event]) -> bool:
+        """Let a press of an emergency stop pass, a few in a second; whether it was one."""
+        if not isinstance(frame, Frame) or frame.has_management or not frame.metadata:
+            return False  # who is held to a rate sends no runs
+        if not is_press(Metadata.decode(frame.metadata), frame.body) or not self._stops.take(1, now):
+            return False
+        events.append(self._sent(frame))
+        return True
 
     def _management(self, frame: Frames) -> Management | Custom:
         raw = frame.management
@@ -547,6 +562,8 @@ class TcpAgent:
         self.grant, self._rights = grant, grant.rights
         self._permitted.clear()
         self._decoder.runs = not self._limits.frames_per_s and grant.credit is None
+        if self.agent_type != UNITY and grant.rights is not None and not grant.rights.has("robot"):
+            return [self._leave("its token does not give the right to be a robot any more")]
         withdrawn: list[tuple[AddNode, str]] = []
         for key, registering in list(self._registered.items()):
             node, why = registering.node, None
@@ -627,7 +644,9 @@ class TcpAgent:
 
     def registration_refused(self, refused: NodeRefused) -> None:
         """A robot refused what the agent registered. Messages say only the name of a node, which there may be another
-        topic's, so those of an agent with a token are not let pass to that robot."""
+        topic's, so those of an agent with a token are not let pass to that robot; a stop is, which needs no node."""
+        if not refused.robot_id or (self._rights is not None and self._rights.is_stop(refused.tos_name)):
+            return
         key = refused.node_type, refused.node_name
         if key in self._registered:
             self._refused_at.setdefault(key, set()).add(refused.robot_id)

@@ -195,7 +195,7 @@ async def test_without_descriptors_it_is_said() -> None:
         Program("gateway", "--port", "0", "-e", endpoint, within=few) as gateway,
         crowd(gateway.port, 20) as there,
     ):
-        assert "connections have room" in "\n".join(gateway.log)
+        await until(lambda: "connections have room" in "\n".join(gateway.log))
         newcomers = [await asyncio.open_connection("127.0.0.1", gateway.port) for _ in range(150)]
         ends = [await asyncio.wait_for(reader.read(1), PATIENCE_S) for reader, _ in newcomers]
         assert 20 < ends.count(b"") < 150
@@ -210,7 +210,7 @@ async def test_without_descriptors_it_is_said() -> None:
                     break
             except ConnectionError:  # it has not yet seen that the others are gone
                 assert time.monotonic() < deadline
-    assert "there are no descriptors left" in "\n".join(gateway.log)
+    await until(lambda: "there are no descriptors left" in "\n".join(gateway.log))
 
 
 async def test_many_that_come_and_go_wait_and_others_do_not(

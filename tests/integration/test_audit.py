@@ -19,6 +19,7 @@ from bridge.audit import AuditFile, who
 from bridge.audit.writer import WAITING, older_files
 from bridge.headset.client import Headset
 from macs_zenoh.errors import ConfigError, MacsError
+from tests.support import waiting
 from tests.support.programs import ROOT, Program, ended, free_port
 
 
@@ -244,7 +245,7 @@ async def test_a_gateway_on_a_full_disk(small_disk: Path, tmp_path: Path) -> Non
                 await headset.subscribe("/chatter", "std_msgs/String", agents=[1])
                 headset.forget(headset.nodes[0])
             await headset.online()
-            assert any("cannot be written" in line for line in one.log)
+            await waiting.until(lambda: any("cannot be written" in line for line in one.log))
             _, out, _ = await ended("doctor", "-e", endpoint, "--json")
             assert "audit_waiting" in out
 

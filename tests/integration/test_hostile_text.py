@@ -20,6 +20,7 @@ from macs_zenoh.protocol.messages import Metadata
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.test_bounds import Raw
 from tests.support.programs import Program, ended, free_port
+from tests.support.waiting import until
 
 EVIL = "x\x1b[2J\x1b]0;owned\x07\r\n12:00:00 I macs.gateway: all is well\x9b31m\u202e\x7f"
 
@@ -123,4 +124,4 @@ async def test_every_program_filters_what_it_shows(endpoint: str) -> None:
         raw.socket.close()
     for line in [*gateway.log, *router.log]:
         harmless(line)
-    assert any("unknown message manager" in line for line in gateway.log)
+    await until(lambda: any("unknown message manager" in line for line in gateway.log))

@@ -321,7 +321,7 @@ async def test_those_that_do_not_read_have_a_limit_together() -> None:
             sock.close()
         while len((await neighbour.online()).unity_agent_ids) > 1:
             await asyncio.sleep(0.05)
-        assert any("outbox_full" in line for line in gateway.log)
+        await until(lambda: any("outbox_full" in line for line in gateway.log))
 
 
 async def test_frames_that_do_not_end_have_a_limit_together() -> None:
@@ -350,7 +350,7 @@ async def test_frames_that_do_not_end_have_a_limit_together() -> None:
         ended = asyncio.wait_for(halves[0].read(), PATIENCE_S)
         with suppress(ConnectionError):
             await ended
-        assert any("its frame does not end" in line for line in gateway.log)
+        await until(lambda: any("its frame does not end" in line for line in gateway.log))
 
 
 async def test_a_group_is_chosen_from_its_networks(router: str, start_gateway: StartGateway) -> None:

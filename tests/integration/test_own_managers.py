@@ -30,6 +30,7 @@ from macs_zenoh.protocol.messages import Metadata, decode_data, encode_data
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.test_gateway import Socket, socket
 from tests.support.programs import ROOT, Program, ended, free_port, macs
+from tests.support.waiting import until
 
 EXAMPLES = ROOT / "examples"
 PAGE = (ROOT / "docs" / "managers.md").read_text(encoding="utf-8")
@@ -101,7 +102,7 @@ async def test_the_worked_example() -> None:
         agent.writer.write(asking('{"messageManager": "ClockComparer"}'))
         assert (await ask(agent, '{"message_manager": "ClockComparer", "sent_at_s": 2}'))["sentAtS"] == 2
         for said in ("ClockComparer: -1.0 is not a time", "Expected `float`, got `str`"):
-            assert any(said in line for line in program.log), program.log
+            await until(lambda said=said: any(said in line for line in program.log))
 
 
 async def test_the_worked_example_from_the_command_line() -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from tests.panicking import panicking
 from tests.support.programs import ROOT, Program, free_port
+from tests.support.waiting import until
 
 PANICKED = 70
 
@@ -31,7 +32,7 @@ async def test_a_gateway_ends(endpoint: str, where: str) -> None:
     why."""
     async with Program("gateway", "--port", "0", "-e", endpoint, env=panicking(where)) as gateway:
         assert await asyncio.wait_for(gateway.wait(), 40) == PANICKED
-    assert any("Zenoh has panicked" in line for line in gateway.log)
+    await until(lambda: any("Zenoh has panicked" in line for line in gateway.log))
 
 
 async def test_a_router_ends(endpoint: str) -> None:
@@ -39,7 +40,7 @@ async def test_a_router_ends(endpoint: str) -> None:
     listen = f"tcp/127.0.0.1:{free_port()}"
     async with Program("router", "-l", listen, "-e", endpoint, env=panicking("hidden")) as router:
         assert await asyncio.wait_for(router.wait(), 40) == PANICKED
-    assert any("Zenoh has panicked" in line for line in router.log)
+    await until(lambda: any("Zenoh has panicked" in line for line in router.log))
 
 
 async def test_up_starts_again_what_panicked(endpoint: str) -> None:

@@ -16,6 +16,7 @@ from macs_zenoh.errors import Unreachable
 from tests.support.certificates import Authority
 from tests.support.programs import Program, ended, free_port
 from tests.support.routers import Router
+from tests.support.waiting import until
 
 
 @dataclass
@@ -73,7 +74,7 @@ async def test_programs_that_wait_say_what_they_wait_at(site: Site) -> None:
         await asyncio.sleep(0.05)
     starting.cancel()
     await waiting.stop()
-    assert len([line for line in site.gateway.log if "zenoh_program" in line]) == 1
+    await until(lambda: len([line for line in site.gateway.log if "zenoh_program" in line]) == 1)
 
 
 async def test_a_router_is_no_gateway(site: Site) -> None:
@@ -123,12 +124,12 @@ async def test_why_no_router_answers(verb: str, tmp_path: Path) -> None:
 async def test_what_is_open_to_the_network_is_said(host: str, open_: bool) -> None:
     """A router and a gateway that others than this machine reach say so, with what to do."""
     async with Program("router", "-l", f"tcp/{host}:{free_port()}") as router:
-        assert any("is open: whoever reaches it" in line for line in router.log) is open_
+        await until(lambda: any("is open: whoever reaches it" in line for line in router.log) is open_)
         endpoint = f"tcp/127.0.0.1:{router.port}" if "1" not in host.strip("[]") or host == "127.0.0.1" else ""
         endpoint = endpoint or router.ready.removeprefix("router on ")
         gateway = Program("gateway", "--host", host, "--port", "0", "-e", endpoint)
         async with gateway:
-            assert any("is open: whoever reaches it" in line for line in gateway.log) is open_
+            await until(lambda: any("is open: whoever reaches it" in line for line in gateway.log) is open_)
         async with Program(
             "gateway", "--host", host, "--port", "0", "-e", endpoint, "--allow", "10.0.0.0/8"
         ) as gateway:

@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
-from tests.ros.driven import STOPPED, hear, may_command, send, site
+from tests.ros.driven import STOPPED, Heard, hear, may_command, send, site
 from tests.support.processes import ROOT, START_S
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
@@ -66,8 +66,12 @@ async def test_stops_reach_every_topic(domain: int, peer: Peer, tmp_path: Path) 
                     await may_command(driver, NUMBER, topic)
                 fill(writes)
                 for topic, said in heard.items():
-                    send(driver, NUMBER, 0.5, topic)
-                    await until(lambda said=said: 0.5 in said.since(0))
+
+                    def moves(topic: str = topic, said: Heard = said) -> bool:
+                        send(driver, NUMBER, 0.5, topic)
+                        return 0.5 in said.since(0)
+
+                    await until(moves, every_s=0.1)  # ROS may know the publisher before its subscriber
                 for said in heard.values():
                     await until(lambda said=said: said.last == STOPPED)
                 for said in heard.values():

@@ -18,6 +18,7 @@ from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.messages import encode_data
+from macs_zenoh.sections import changed
 from tests.support.ros_peer import Peer, adding, removing
 from tests.support.waiting import PATIENCE_S, until
 
@@ -80,7 +81,7 @@ async def seen(router: str) -> AsyncIterator[Seen]:
 @pytest.fixture
 async def headset(router: str, domain: int) -> AsyncIterator[Agent]:
     """Headset 5, which knows of a robot with the settings above."""
-    settings = macs_zenoh.config.changed(SETTINGS, mesh=MeshSettings(connect=[router]))
+    settings = changed(SETTINGS, mesh=MeshSettings(connect=[router]))
     async with (
         open_robot(settings, domain_id=domain),
         macs_zenoh.join("unity", id=5, connect=[router]) as headset,

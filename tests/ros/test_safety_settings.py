@@ -44,7 +44,7 @@ async def test_a_robot_without_its_emergency_stop_is_found_and_gets_it(
     """While its topic has another type `macs doctor` names that; when that is gone, the robot can be stopped."""
     await peer.subscription(String, "/emergency_stop")
     async with site(domain, tmp_path) as place, place.robot() as robot, place.headset() as driver:
-        assert any("there is no emergency stop" in line for line in robot.log)
+        await until(lambda: any("there is no emergency stop" in line for line in robot.log))
         code, out, errors = await ended("doctor", "--json", "--quick", "-e", place.router.endpoint)
         found = [finding for finding in json.loads(out)["findings"] if finding["id"] == "no_stop"]
         assert [finding["severity"] for finding in found] == ["error"], errors

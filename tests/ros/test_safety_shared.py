@@ -224,8 +224,8 @@ async def test_a_stop_of_one_agent_holds_for_the_graph(domain: int, peer: Peer, 
                 assert len(heard.values) == count, "a command passed the other agent"
             others = (await told(driver, 2))["nodes"][0]["shared_with"]
             assert others == [1]
-            assert any("agent of robot 1 works on this ROS graph too" in line for line in second.log)
-            assert any("agent of robot 2 works on this ROS graph too" in line for line in first.log)
+            await until(lambda: any("agent of robot 1 works on this ROS graph too" in line for line in second.log))
+            await until(lambda: any("agent of robot 2 works on this ROS graph too" in line for line in first.log))
         async with place.robot(3):
             await stopped(driver, 3)
             await driver.call("ros", 3, "stop", b"false")  # by whoever stopped, at another agent

@@ -41,12 +41,15 @@ def test_once_is_once_whatever_it_concerns(caplog: pytest.LogCaptureFixture) -> 
 
 
 def test_what_is_remembered_is_bounded(caplog: pytest.LogCaptureFixture) -> None:
-    """Names come from the network: of more than can be remembered the rest is counted without a word."""
+    """Names come from the network: of more than can be remembered one more is told, and the first of another kind."""
     losses = Losses(log)
     for number in range(2 * Losses.LOGGED):
         losses.note("no_node", str(number), "nobody registered it")
     assert losses["no_node"] == 2 * Losses.LOGGED
-    assert len(caplog.messages) == Losses.LOGGED
+    losses.note("bad_cdr", "/pose", "it is empty")
+    losses.note("bad_cdr", "/scan", "it is empty")
+    assert len(caplog.messages) == Losses.LOGGED + 2
+    assert caplog.messages[-1].startswith("/pose: it is empty")
 
 
 def test_threads_lose_no_count(caplog: pytest.LogCaptureFixture) -> None:

@@ -68,12 +68,14 @@ def test_each_kind_of_command_has_a_flow_of_its_own() -> None:
 
 
 def test_what_has_waited_may_come_in_pieces() -> None:
-    """A network that comes back takes ten commands at first, then twenty, each a round trip of 80 ms later."""
+    """A network that comes back takes ten commands at first, then twenty, each a round trip of 100 ms later. More than
+    could be said meanwhile have not waited."""
     pace = Pace(0, 0, 0.0)
     drive(pace, 0.0, 100)
-    pieces = [(30.0 + 0.08 * trip, 10 << trip) for trip in range(6)]
+    pieces = [(50.0 + 0.1 * trip, 10 << trip) for trip in range(6)]
     taken = [pace.command(MOVE, 1, begin + number / 100_000) for begin, count in pieces for number in range(count)]
     assert set(taken) == {WAITED}
+    assert [pace.command(MOVE, 1, 50.6 + number / 1000) for number in range(400)][-1] is NOW
 
 
 def test_of_ever_new_kinds_only_so_many_are_known() -> None:

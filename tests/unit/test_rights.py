@@ -159,6 +159,10 @@ def test_headsets_and_everybody_need_rights_of_their_own() -> None:
     loud = rights("broadcast", robots="any")
     assert loud.of_frame(header(BROADCAST), Metadata(), None) is None
     assert loud.of_frame(header(BROADCAST), data(2, "/cmd_vel"), "/cmd_vel") is not None
+    for manager, needed in {"RobotStatus": "see", "RobotControl": "command", "Own": "ask"}.items():
+        asking = Metadata(UNITY, 300, message_manager=manager)
+        assert loud.of_frame(header(BROADCAST), asking, None) is not None
+        assert rights("broadcast", needed, robots="any").of_frame(header(BROADCAST), asking, None) is None
     assert loud.of_frame(header(UNITY, (300,)), Metadata(), None) is not None
     assert loud.of_frame(header(7, (300,)), Metadata(), None) is not None
     with pytest.raises(ValueError, match="needs --robots any"):

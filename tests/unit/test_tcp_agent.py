@@ -674,6 +674,21 @@ def test_frames_beyond_the_rate_are_dropped() -> None:
     assert count_sent(peer, 15, 4.0) == 10
 
 
+def test_a_press_of_a_stop_passes_beyond_the_rate() -> None:
+    """Whoever has used up his rate may still stop a robot, a few times a second, and nothing else."""
+
+    def said(node: str, data_type: str, data: bytes) -> bytes:
+        metadata = Metadata(UNITY, 7, node_type=2, node_name=node, data_exchange_type=data_type)
+        return encode_frame(ROS, (1,), message=encode_message(metadata.encode(), data))
+
+    peer = online(limits=LIMITS._replace(frames_per_s=1.0))
+    count_sent(peer, 5, 0.0)
+    press, release = (said("nd__emergency_stop", "std_msgs/Bool", b"\0\1\0\0" + end) for end in (b"\1", b"\0"))
+    assert [type(event) for event in peer.receive(press, 0.0)] == [Sent]
+    assert errors(peer.receive(release + said("nd__cmd_vel", "geometry_msgs/Twist", bytes(52)), 0.0)) == [TooFast] * 2
+    assert sum(type(event) is Sent for event in peer.receive(press * 100, 0.0)) < TcpAgent.STOPS_PER_S
+
+
 def test_a_slow_rate_lets_something_through() -> None:
     """With less than one frame per second allowed, one passes in each such time."""
     peer = online(limits=LIMITS._replace(frames_per_s=0.5))
@@ -1014,6 +1029,23 @@ def test_changed_rights_take_back_what_they_do_not_permit() -> None:
     assert (peer.group, peer.agent_type) == (0, UNITY)
     assert errors(peer.receive(node_data("nd__talk"), 0.0)) == [NotPermitted]
     assert peer.rights_change(Grant("g", Rights(may=["see"], robots=[2]))) == []
+
+
+def test_a_robot_that_refused_the_node_of_its_stop_can_be_stopped() -> None:
+    """A press needs no interface node: who may stop may do so where he may not register, as without a token."""
+    peer = guarded(Rights(may=["stop"], robots=[1]))
+    peer.receive(shown("good") + registered("/emergency_stop", [1]), 0.0)
+    peer.registration_refused(NodeRefused(1, 2, "nd__emergency_stop", "/emergency_stop", "not allowed"))
+    assert errors(peer.receive(node_data("nd__emergency_stop", (1,)), 0.0)) == []
+
+
+def test_a_robot_whose_token_makes_it_none_any_more_leaves() -> None:
+    """It came in by a right that its token has lost."""
+    peer = guarded(Rights(may=["robot"]))
+    peer.receive(shown("good", agent_type=ROS), 0.0)
+    assert peer.rights_change(Grant("g", Rights(may=["robot", "see"]))) == []
+    assert [type(event).__name__ for event in peer.rights_change(Grant("g", Rights(may=["see"])))] == ["Left"]
+    assert peer.state is State.GONE
 
 
 def test_a_group_of_others_is_not_to_be_chosen() -> None:
