@@ -201,7 +201,8 @@ def _with_web_port(gateway: GatewaySettings, wanted: int | None, apart: Apart | 
         log.info("no web port: pip install 'macs-zenoh[web]'")
         return gateway
     else:
-        port = _free(host, WEB_PORT) or _port(host, 0, "choose another one with --web-port", apart, chosen=False)
+        usual = WEB_PORT if _free(host, WEB_PORT) else 0
+        port = _port(host, usual, "choose another one with --web-port", apart, chosen=False)
     return changed(gateway, web_host=host, web_port=port)
 
 
