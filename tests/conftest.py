@@ -27,6 +27,7 @@ ALONE = (
     "tests/ros/test_commands_at_once.py",
     "tests/ros/test_deadman.py",
     "tests/ros/test_killed.py",
+    "tests/ros/test_safety_floods.py",
 )
 """What measures how long something takes, or needs the machine for itself: marked ``alone``."""
 

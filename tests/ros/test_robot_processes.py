@@ -233,7 +233,7 @@ async def test_who_holds_a_service_keeps_it_when_the_robot_restarts(
             await until(client.service_is_ready)
             call = await peer.session.run(lambda: client.call_async(SetBool.Request(data=True)))
             with contextlib.suppress(AssertionError):  # it went to a server that is no more
-                await until(call.done)
+                await until(call.done, 5)
                 return str(call.result().message)
 
     async with AsyncExitStack() as stack:
