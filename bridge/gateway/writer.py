@@ -136,7 +136,8 @@ class Writer:
             self.flush()
             if self.paused_at is None:
                 self._transport.close()
-                asyncio.get_running_loop().call_later(most_s, self._transport.abort)
+                if self._transport.get_write_buffer_size():  # else it ends by itself, and nothing is to be kept for it
+                    asyncio.get_running_loop().call_later(most_s, self._transport.abort)
             else:
                 self._transport.abort()
 

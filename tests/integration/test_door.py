@@ -615,6 +615,7 @@ async def test_ten_thousand_attempts_leave_nothing_behind(
     start_door: StartDoor, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Without, with ended, revoked, cut-off and foreign tokens: none gets in, no memory stays, and the log counts."""
+    began = time.monotonic()
     door = await start_door(**NOBODY)
     good = door.tokens.make("good")
     wrong = [
@@ -662,7 +663,7 @@ async def test_ten_thousand_attempts_leave_nothing_behind(
     assert after - before < 64 << 10
     shown = [record.getMessage() for record in caplog.records if "shows no valid token" in record.getMessage()]
     assert shown[0].startswith("127.0.0.1 shows no valid token at the plain port")
-    assert len(shown) <= 3
+    assert len(shown) <= 2 + (time.monotonic() - began) / 60, "once a minute"
     assert not any(secret in caplog.text for secret in (good, good[:-1]))
 
 
