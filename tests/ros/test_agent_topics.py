@@ -119,7 +119,7 @@ async def test_a_command_is_what_a_headset_sends(robot: RobotAgent, agent: Agent
         drive.publish(cdr)
         assert await get(received, PATIENCE_S) == twist
         spec = NodeSpec(NodeType.PUBLISHER, "/cmd_vel", "geometry_msgs/Twist")
-        await until(lambda: bool(sent), PATIENCE_S)
+        await until(lambda: sent and cdr in sent[-1], PATIENCE_S)
         ours, theirs = parse_frame(sent[-1]), parse_frame(frames.node_data(5, spec, cdr, [ROBOT]))
         assert (ours.header, ours.management, bytes(ours.body)) == (theirs.header, b"", bytes(theirs.body))
         assert json.loads(ours.metadata) == json.loads(theirs.metadata)

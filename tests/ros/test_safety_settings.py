@@ -44,7 +44,15 @@ async def test_a_robot_without_its_emergency_stop_is_found_and_gets_it(
     """While its topic has another type `macs doctor` names that; when that is gone, the robot can be stopped."""
     await peer.subscription(String, "/emergency_stop")
     async with site(domain, tmp_path) as place, place.robot() as robot, place.headset() as driver:
-        await until(lambda: any("there is no emergency stop" in line for line in robot.log))
+
+        async def has_none() -> bool:
+            if any("/emergency_stop: emergency stop" in line for line in robot.log):  # it was quicker than ROS
+                await robot.stop()
+                robot.log.clear()
+                await robot.start()
+            return any("there is no emergency stop" in line for line in robot.log)
+
+        await until(has_none, every_s=0.2)
         code, out, errors = await ended("doctor", "--json", "--quick", "-e", place.router.endpoint)
         found = [finding for finding in json.loads(out)["findings"] if finding["id"] == "no_stop"]
         assert [finding["severity"] for finding in found] == ["error"], errors
