@@ -3,39 +3,16 @@
 from __future__ import annotations
 
 import json
-from typing import NamedTuple
 
 from macs_zenoh.protocol.wire import encode_message
-from tests.conformance.proxy import Link, Rewrite, changed, message_of, parts, said, with_management, with_message
+from tests.conformance.faults import Faults
+from tests.conformance.proxy import Link, changed, message_of, parts, said, with_management, with_message
 
 EMPTY = bytes(8)
 
 
-class Fault(NamedTuple):
-    """``found_by`` is the check meant for it."""
-
-    found_by: str
-    frame: Rewrite | None = None
-    message: Rewrite | None = None
-
-
-FAULTS: dict[str, Fault] = {}
-
-
-def frames(found_by: str):  # type: ignore[no-untyped-def]
-    def keep(rewrite: Rewrite) -> Rewrite:
-        FAULTS[rewrite.__name__] = Fault(found_by, frame=rewrite)
-        return rewrite
-
-    return keep
-
-
-def messages(found_by: str):  # type: ignore[no-untyped-def]
-    def keep(rewrite: Rewrite) -> Rewrite:
-        FAULTS[rewrite.__name__] = Fault(found_by, message=rewrite)
-        return rewrite
-
-    return keep
+FAULTS = Faults()
+frames, messages = FAULTS.frames, FAULTS.messages
 
 
 def manager(frame: bytes) -> object:

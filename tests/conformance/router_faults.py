@@ -5,26 +5,11 @@ from __future__ import annotations
 import json
 
 from macs_zenoh.protocol.wire import encode_message
-from tests.conformance.client_faults import Fault
-from tests.conformance.proxy import Link, Rewrite, changed, message_of, parts, said
+from tests.conformance.faults import Faults
+from tests.conformance.proxy import Link, changed, message_of, parts, said
 
-FAULTS: dict[str, Fault] = {}
-
-
-def messages(found_by: str):  # type: ignore[no-untyped-def]
-    def keep(rewrite: Rewrite) -> Rewrite:
-        FAULTS[rewrite.__name__] = Fault(found_by, message=rewrite)
-        return rewrite
-
-    return keep
-
-
-def frames(found_by: str):  # type: ignore[no-untyped-def]
-    def keep(rewrite: Rewrite) -> Rewrite:
-        FAULTS[rewrite.__name__] = Fault(found_by, frame=rewrite)
-        return rewrite
-
-    return keep
+FAULTS = Faults()
+frames, messages = FAULTS.frames, FAULTS.messages
 
 
 def named(message: bytes) -> str:

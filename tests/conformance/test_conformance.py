@@ -17,7 +17,7 @@ from bridge.conformance import gateway, headset
 from bridge.conformance.checks import Outcome, Verdict
 from bridge.headset.client import Headset
 from tests.conformance import client_faults, router_faults
-from tests.conformance.client_faults import Fault
+from tests.conformance.faults import Fault
 from tests.conformance.proxy import Proxy
 from tests.support.programs import ROOT, Program, ended, free_port
 
