@@ -129,7 +129,6 @@ class Door:
                 return OPEN
             token = self.find(shown)
             if token is None:
-                self.failed(connection.entrance, connection.host)
                 return None
             self._holders[connection] = _Holder(token.name, hash_of(shown or ""))
             return self._grant(token)
@@ -141,14 +140,15 @@ class Door:
         self._watch.read_again()  # it may have been made a moment ago
         return self._watch.tokens.find(shown, time.time())
 
-    def failed(self, entrance: Entrance, host: str) -> None:
-        """Somebody showed no token that holds."""
+    def failed(self, entrance: Entrance, host: str) -> int:
+        """Somebody was not let in. How often by now from there, when that is to be told; else 0."""
         count = self._attempts.note(host, time.monotonic())
         if count:
             so_far = "" if count == 1 else f", {count} times by now"
             log.warning(
                 "%s shows no valid token at the %s port%s (counted as NotAdmitted)", host, entrance.name, so_far
             )
+        return count
 
     def leave(self, connection: Connection) -> None:
         """A connection has ended."""

@@ -26,7 +26,6 @@ from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Subscription
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.addresses import joined
-from macs_zenoh.protocol.attempts import Attempts
 from macs_zenoh.protocol.budget import Budget
 from macs_zenoh.protocol.credit import Credit, Credits
 from macs_zenoh.protocol.decoders import FrameDecoder
@@ -159,7 +158,6 @@ class Gateway:
         """Who is online."""
         self._robot_ids = RobotIds(settings.robots)
         self._audit: Audit = NO_AUDIT
-        self._not_let_in = Attempts()
         stead = Stead(mesh, self._layout)
         judged = JudgedFrames()
         self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged)
@@ -438,7 +436,7 @@ class Gateway:
         elif isinstance(event, Forbidden):
             self._tell_forbidden(connection, event)
         elif isinstance(event, NotLetIn):
-            count = self._not_let_in.note(connection.host, time.monotonic())
+            count = self._door.failed(connection.entrance, connection.host)
             if count:  # or who knocks all day would push what was done out of the record
                 told = "no valid token" if count == 1 else f"no valid token, {count} times by now"
                 self._audit.record("refused", who(address=connection.address), "join", told)

@@ -54,7 +54,7 @@ from tests.support.certificates import Authority
 from tests.support.given import StartGateway
 from tests.support.local import patient
 from tests.support.programs import Program, ended, free_port, macs
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 PORTS = ["plain", "tls", "web", "web_tls"]
 
@@ -607,6 +607,19 @@ async def test_one_address_has_so_many_http_connections(start_door: StartDoor) -
         await asyncio.sleep(0.2)
         async with await door.come("web") as other:
             await other.online()
+
+
+async def test_a_robot_whose_token_makes_it_none_is_told_of(
+    start_door: StartDoor, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its token is good for a headset: the log says that it was not let in, as of who has none."""
+    door = await start_door(**NOBODY)
+    reader, writer = await asyncio.open_connection("127.0.0.1", door.gateway.listeners.port)
+    configuration = Configuration(ROS, 0, token=door.tokens.make("good", may=["see"]))
+    writer.write(encode_frame(management=encode_management(configuration)))
+    await asyncio.wait_for(reader.read(), PATIENCE_S)
+    writer.close()
+    await until(lambda: any("shows no valid token at the plain port" in message for message in caplog.messages))
 
 
 @pytest.mark.timeout(600)
