@@ -21,6 +21,7 @@ from .door import Door, Entrance, Entrances
 from .listener import BACKLOG, Listener, descriptors
 
 if TYPE_CHECKING:
+    from . import Gateway
     from .web import WebPort
 
 log = logging.getLogger("macs.gateway")
@@ -96,6 +97,7 @@ class Listeners:
         door: Door,
         connect: Connect,
         drops: Losses,
+        gateway: Gateway,
     ) -> None:
         """``connect`` makes what a socket becomes. Raises ConfigError: the certificate cannot be used."""
         self._settings = settings
@@ -103,6 +105,7 @@ class Listeners:
         self._door = door
         self._connect = connect
         self._drops = drops
+        self._gateway = gateway
         self._open: list[Closable] = []
         self._few = False
         self._web: WebPort | None = None
@@ -147,7 +150,13 @@ class Listeners:
         sockets = bound(self.web_host, port, shared=self._settings.reuse_port)
         number: int = sockets[0].getsockname()[1]
         self._web = WebPort(
-            self._settings, self._entrances.web, self._door, self._connect, self._drops, self.web_context
+            self._settings,
+            self._entrances.web,
+            self._door,
+            self._connect,
+            self._drops,
+            self.web_context,
+            self._gateway,
         )
         try:
             await self._web.open(sockets)

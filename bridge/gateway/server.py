@@ -153,7 +153,7 @@ class Gateway:
             on_look=lambda: self.listeners.look(),
             on_file=lambda event, name: self._audit.record(event, who(token=name)),
         )
-        self.listeners = Listeners(settings, entrances(settings), self._door, self._connection, self._drops)
+        self.listeners = Listeners(settings, entrances(settings), self._door, self._connection, self._drops, self)
         self.directory = self._presence.directory
         """Who is online."""
         self._robot_ids = RobotIds(settings.robots)

@@ -17,7 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import suppress
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from aiohttp import WSCloseCode, WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
@@ -33,10 +33,12 @@ from .admission import is_in, networks
 from .connection import Connection
 from .door import Door, Entrance
 from .listener import Listener
+from .site import COOKIE, WRONG, Site, add_routes
+
+if TYPE_CHECKING:
+    from . import Gateway
 
 log = logging.getLogger("macs.gateway")
-
-COOKIE = "macs_token"
 
 REQUEST_S = 10.0
 """How long a request may take to come, and a connection may wait for its next one."""
@@ -53,9 +55,6 @@ LEAST_READ_BYTES = 4 << 10
 MOST_READ_BYTES = 256 << 10
 COOKIE_S = 30 * 24 * 3600
 
-WRONG = {"error": "a valid token is wanted here"}
-"""Whatever was wrong with it."""
-
 Answer = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
@@ -70,6 +69,7 @@ class WebPort:
         connect: Callable[[Entrance], Connection],
         drops: Losses,
         context: ssl.SSLContext | None,
+        gateway: Gateway,
     ) -> None:
         self._settings = settings
         self._entrance = entrance
@@ -89,6 +89,7 @@ class WebPort:
         app.router.add_get(WEBSOCKET_PATH, self._websocket)
         app.router.add_post("/login", self._login)
         app.router.add_post("/pair", self._pair)
+        add_routes(Site(gateway, app.router, entrance, door, lambda request: _outer_of(request).host))
         self._runner = web.AppRunner(
             app,
             handle_signals=False,
@@ -156,7 +157,7 @@ class WebPort:
             finally:
                 outer.wait()
             if not response.prepared:
-                response.headers["Cache-Control"] = "no-store"
+                response.headers.setdefault("Cache-Control", "no-store")
                 response.headers["X-Content-Type-Options"] = "nosniff"
             return response
 
