@@ -1,8 +1,9 @@
 """The robot agent: an agent of type ``ros`` on the mesh that serves registrations of interface nodes.
 
 Verbs: ``add_node`` (data: AddNode) and ``remove_node`` (RemoveNode), answered with nothing or a refusal that says why;
-``offers`` (no data), answered with `robot_state.Offered`; ``status`` (no data), ``control`` (`ControlRequest`) and
-``stop`` (``true`` or ``false``), answered with JSON. See docs/robot.md.
+``offers`` (no data), answered with `robot_state.Offered`; ``definitions`` (`DefinitionsRequest`), with the texts of
+types; ``status`` (no data), ``control`` (`ControlRequest`) and ``stop`` (``true`` or ``false``), answered with JSON.
+See docs/robot.md.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import macs_zenoh
 from bridge.audit import open_audit, who
 from bridge.ros import parameters
 from bridge.ros.checked import CheckedSettings
+from bridge.ros.definitions import Definitions, offered_types
 from bridge.ros.graph import NamesAndTypes, Offers
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
@@ -42,6 +44,7 @@ from macs_zenoh.protocol.messages import AddNode, FunctionalityRequest, Metadata
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.registrations import check_own
 from macs_zenoh.protocol.robot_state import STATUS, ControlReply, ControlRequest
+from macs_zenoh.protocol.schemas import DefinitionsRequest
 from macs_zenoh.protocol.wire import Layout
 from macs_zenoh.serving import Call
 from macs_zenoh.streams import Streams
@@ -109,6 +112,7 @@ class RobotAgent:
         self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
         self.checked = CheckedSettings(robot.rules, robot.drops)
         self.offers = Offers(robot, self.streams.publish, self._graph_changed)
+        self._definitions = Definitions()
         self._answering: dict[asyncio.Task[None], Registrant] = {}
         self._sessions: dict[Registrant, tuple[str, int]] = {}
         """Who has an id, or had it last."""
@@ -135,6 +139,7 @@ class RobotAgent:
             ("add_node", self._add_node),
             ("remove_node", self._remove_node),
             ("offers", self._offers),
+            ("definitions", self._tell_definitions),
             ("status", self._status),
             ("control", self._control),
         ):
@@ -295,6 +300,11 @@ class RobotAgent:
 
     async def _offers(self, _call: Call) -> bytes:
         return encode_data(await self.offers.now())
+
+    async def _tell_definitions(self, call: Call) -> bytes:
+        request = decode_data(DefinitionsRequest, call.data) if call.data else DefinitionsRequest()
+        types = request.types or offered_types(await self.offers.now())
+        return encode_data(await asyncio.to_thread(self._definitions.tell, types))
 
     async def _status(self, _call: Call) -> bytes:
         return self._state()

@@ -120,6 +120,18 @@ def _registered(package: str) -> frozenset[str] | None:
     return None
 
 
+def interface_file(name: InterfaceName, file_name: str) -> Path | None:
+    """A file that an interface's package installed beside its definition, None when there is none.
+
+    Raises Refused when there is no such interface on this robot.
+    """
+    interfaces = _registered(name.package)
+    if interfaces is None or not {f"{name.kind}/{name.name}.{ending}" for ending in ("idl", name.kind)} & interfaces:
+        raise Refused(f"type {name} is not installed on this robot")
+    paths = (prefix / "share" / name.package / name.kind / file_name for prefix in _prefixes())
+    return next((path for path in paths if path.is_file()), None)
+
+
 def _prefixes() -> list[Path]:
     """Where ROS packages are installed: what was sourced, and this Python's own prefix for ROS from PyPI."""
     sourced = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]

@@ -48,7 +48,7 @@ RESERVED = {*KINDS, "routers", ALL, "ca"}
 
 PORT = 7447
 
-SEE_VERBS = ("add_node", "remove_node", "offers", "status")
+SEE_VERBS = ("add_node", "remove_node", "offers", "definitions", "status")
 """Calls that go with seeing a robot: to register for a topic, to ask what there is and how the robot is."""
 COMMAND_VERBS = (*SEE_VERBS, "control", "stop")
 """Calls that go with commanding it."""
