@@ -57,6 +57,9 @@ class TopicMessage:
         return self._types().deserialize(self.type, self.data)
 
 
+OnTopicMessage = Callable[[TopicMessage], None]
+
+
 @dataclass(eq=False)
 class Node:
     """An interface node that robots have, or shall have, for this agent."""
@@ -158,9 +161,26 @@ class TopicSubscription(NodeUser):
         self.dropped = 0
         self._waiting: deque[TopicMessage] = deque()
         self._arrived = asyncio.Event()
+        self._handler: OnTopicMessage | None = None
+
+    def on_message(self, handler: OnTopicMessage) -> Handle:
+        """Pass messages to ``handler``, as they come and on the loop, instead of holding them for `receive`; it should
+        not raise. There is one handler at a time; when the handle is closed, messages are held again."""
+        self._handler = handler
+        while self._waiting:
+            handler(self._waiting.popleft())
+
+        def end() -> None:
+            if self._handler is handler:
+                self._handler = None
+
+        return Handle(end)
 
     def put(self, message: TopicMessage) -> bool:
         """Hold a message; False when an older one had to go."""
+        if self._handler is not None:
+            self._handler(message)
+            return True
         full = len(self._waiting) >= self.depth
         if full:
             self._waiting.popleft()
