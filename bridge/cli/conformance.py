@@ -13,6 +13,7 @@ examples:
   macs conformance gateway --list                             what it would try
   macs conformance headset --listen 7000                      now start your headset, with this machine as its router
   macs conformance headset --listen 0 --run './headset 127.0.0.1 {port}' --junit headset.xml
+  macs conformance headset --listen 7080 --web                one that comes by WebSocket
 
 what it prints:
   failed  routing.broadcast: Type 0 without management data: to everybody. Copies: 1.
@@ -54,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     gateway.set_defaults(judge=_judge_gateway)
     headset = kinds.add_parser("headset", help="a headset: be its router", description=_judge_headset.__doc__)
     headset.add_argument("--listen", type=int, metavar="PORT", help="where it shall connect to (0 for any free port)")
+    headset.add_argument("--web", action="store_true", help="it comes by WebSocket, to ws://HOST:PORT/macs")
     headset.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     headset.add_argument(
         "--run",
@@ -140,6 +142,7 @@ def _judge_headset(args: argparse.Namespace) -> int:
                 start_s=args.wait,
                 on_listening=lambda port: output.note(f"listening on {joined(args.host, port)}: connect the headset"),
                 program=program,
+                web=args.web,
             )
         finally:
             if program is not None:

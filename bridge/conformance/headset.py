@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterable
-from typing import Protocol
+from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING, Protocol
 
-from macs_zenoh.errors import MacsError
+from macs_zenoh.errors import MacsError, MissingExtra
 from macs_zenoh.timeouts import within
 
 from . import client_frames, vectors
@@ -18,6 +19,9 @@ from .checks import Check, Level, Verdict, Verdicts
 from .client_frames import ClientFrames, Kind, Node, Said
 from .router import Client, Router, cdr_for
 from .vectors import Value, Vector
+
+if TYPE_CHECKING:
+    from .websocket import WebSockets
 
 STRICT = Level.STRICT
 
@@ -467,7 +471,7 @@ class Judge:
         """Its connection after it was started again. Raises Gone."""
         if self._program is None:
             raise Gone(why)
-        await self._program.start(self._router.port)
+        await self._program.start(self._router.entrance)
         client = await self._router.next(START_S)
         if client is None:
             raise Gone(f"{why}, nor after it was started again")
@@ -514,18 +518,22 @@ async def judge(
     most_s: float = MOST_S,
     on_listening: Callable[[int], object] = lambda port: None,
     program: Program | None = None,
+    web: bool = False,
 ) -> list[Verdict]:
     """Be the router of a headset, and hold it to every check of a level.
 
     ``on_listening`` is told the port when the headset may come; ``program`` is started then, and after a check that
-    ended it. Raises Unreachable when the port cannot be had.
+    ended it. With ``web`` it comes by WebSocket. Raises Unreachable when the port cannot be had, MissingExtra.
     """
     verdicts = Verdicts(CHECKS, level)
     frames = ClientFrames(verdicts)
-    async with Router(frames, host, port) as router:
-        on_listening(router.port)
+    async with AsyncExitStack() as stack:
+        router = await stack.enter_async_context(Router(frames, host, 0 if web else port))
+        if web:
+            router.entrance = (await stack.enter_async_context(_web_sockets(host, port, router.port))).port
+        on_listening(router.entrance)
         if program is not None:
-            await program.start(router.port)
+            await program.start(router.entrance)
         try:
             await within(Judge(router, frames, verdicts, patience_s, program).run(start_s), start_s + most_s)
         except (Gone, asyncio.TimeoutError) as why:
@@ -534,3 +542,11 @@ async def judge(
                     check.name, str(why) or f"no time was left of {most_s:g} s, for so much was waited in vain"
                 )
     return verdicts.all()
+
+
+def _web_sockets(host: str, port: int, to_port: int) -> WebSockets:
+    try:
+        from .websocket import WebSockets
+    except ModuleNotFoundError as error:
+        raise MissingExtra("a WebSocket", "aiohttp", "web") from error
+    return WebSockets(host, port, to_port)

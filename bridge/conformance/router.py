@@ -144,6 +144,8 @@ class Router:
 
     def __init__(self, frames: ClientFrames, host: str, port: int) -> None:
         self.port = port
+        self.entrance = port
+        """Where the headset comes in: another port where something is in front of this one."""
         self.arrivals = 0
         self._host = host
         self._frames = frames
@@ -155,7 +157,7 @@ class Router:
             self._server = await asyncio.start_server(self._accept, self._host, self.port)
         except OSError as error:
             raise Unreachable(joined(self._host, self.port), error.strerror or str(error)) from error
-        self.port = self._server.sockets[0].getsockname()[1]
+        self.port = self.entrance = self._server.sockets[0].getsockname()[1]
         return self
 
     async def __aexit__(self, *_: object) -> None:

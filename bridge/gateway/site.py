@@ -51,6 +51,16 @@ class Site:
         self._entrance = entrance
         self._door = door
         self._host_of = host_of
+        self._at_end: list[Callable[[], None]] = []
+
+    def on_close(self, callback: Callable[[], None]) -> None:
+        """Call this when the port ends."""
+        self._at_end.append(callback)
+
+    def close(self) -> None:
+        """The port has ended."""
+        for callback in self._at_end:
+            callback()
 
     def get(self, path: str, answer: Answer) -> None:
         """Answer this path, written as for aiohttp, to who shows a valid token where one is wanted."""

@@ -89,7 +89,8 @@ class WebPort:
         app.router.add_get(WEBSOCKET_PATH, self._websocket)
         app.router.add_post("/login", self._login)
         app.router.add_post("/pair", self._pair)
-        add_routes(Site(gateway, app.router, entrance, door, lambda request: _outer_of(request).host))
+        self._site = Site(gateway, app.router, entrance, door, lambda request: _outer_of(request).host)
+        add_routes(self._site)
         self._runner = web.AppRunner(
             app,
             handle_signals=False,
@@ -114,6 +115,7 @@ class WebPort:
 
     async def end(self) -> None:
         """After all connections have been closed: end what is left."""
+        self._site.close()
         await self._runner.cleanup()
 
     # -- connections ---------------------------------------------------------------------------------------------

@@ -1,0 +1,42 @@
+"""python browser_headset.py ws://HOST:PORT/macs: the headset of headset.js in Chromium, until SIGTERM."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from playwright.async_api import Route
+
+from tests.support.browser import STATIC, browser
+
+PAGE = "http://localhost/"
+"""Nobody answers there: each request is answered here."""
+
+
+async def answer(route: Route) -> None:
+    name = route.request.url.removeprefix(PAGE)
+    if name == "":
+        await route.fulfill(body="<!doctype html><title>headset</title>", content_type="text/html")
+        return
+    folder = Path(__file__).parent if name == "headset.js" else STATIC
+    await route.fulfill(path=folder / name, content_type="text/javascript")
+
+
+async def main(url: str) -> None:
+    told = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
+    async with browser() as chromium:
+        page = await chromium.new_page()
+        await page.route("**/*", answer)
+        await page.goto(PAGE)
+        begin = "async (url) => { window.end = (await import('/headset.js')).begin(await import('/macs.js'), url) }"
+        await page.evaluate(begin, url)
+        await told.wait()
+        await page.evaluate("async () => { end(); await new Promise((done) => setTimeout(done, 300)) }")
+
+
+asyncio.run(main(sys.argv[1]))

