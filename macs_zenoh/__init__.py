@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from bridge.headset.stream import Way as Way
 
     from .agent import Agent as Agent
-    from .agent import join as join
     from .config import MeshSettings as MeshSettings
     from .config import TrafficRule as TrafficRule
     from .errors import BadField as BadField
@@ -44,6 +43,7 @@ if TYPE_CHECKING:
     from .errors import UsageError as UsageError
     from .errors import WireError as WireError
     from .handles import Handle as Handle
+    from .joining import join as join
     from .protocol.agent_id import AgentId as AgentId
     from .protocol.directory import AgentInfo as AgentInfo
     from .protocol.messages import Metadata as Metadata
@@ -65,7 +65,7 @@ _WHERE = {
     "bridge.awareness.client": ("GatewayClient",),
     "bridge.headset.client": ("Headset",),
     "bridge.headset.stream": ("Way",),
-    "macs_zenoh.agent": ("Agent", "join"),
+    "macs_zenoh.agent": ("Agent",),
     "macs_zenoh.config": ("MeshSettings", "TrafficRule"),
     "macs_zenoh.errors": (
         "BadField",
@@ -93,6 +93,7 @@ _WHERE = {
         "WireError",
     ),
     "macs_zenoh.handles": ("Handle",),
+    "macs_zenoh.joining": ("join",),
     "macs_zenoh.protocol.agent_id": ("AgentId",),
     "macs_zenoh.protocol.directory": ("AgentInfo",),
     "macs_zenoh.protocol.messages": ("Metadata", "NodeType"),

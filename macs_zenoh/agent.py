@@ -1,12 +1,4 @@
-"""An agent on the mesh: join with type, id and group; send, receive, call, serve, see who is online. Asyncio.
-
-::
-
-    async with macs_zenoh.join("ros", id=7, group=3, connect=["tcp/127.0.0.1:7447"]) as agent:
-        agent.send(b"hello", to="unity", ids=[256])
-        async for message in agent:
-            print(message.sender_type, message.sender_id, message.data)
-"""
+"""An agent on the mesh: send, receive, call, serve, see who is online. Asyncio. It is made by `joining.join`."""
 
 from __future__ import annotations
 
@@ -15,12 +7,10 @@ import logging
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
-from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any, overload
 
-from .config import MeshSettings, TrafficRule
-from .errors import CallTimeout, Closed, OutOfRange, Unreachable, UsageError, WireError
+from .errors import CallTimeout, Closed, Unreachable, UsageError, WireError
 from .handles import Callbacks, Handle
 from .identity import Identity
 from .losses import Losses
@@ -37,7 +27,6 @@ from .protocol.messages import Metadata, NodeType
 from .protocol.reading import Message, Reader
 from .protocol.routing import call, inbox, keys_of
 from .protocol.wire import Layout, encode_frame, encode_message
-from .sections import changed
 from .serving import Call, CallFirst, CallHandler, Served
 from .topics import DEPTH, Chosen, TopicPublisher, TopicSubscription, Value
 
@@ -488,50 +477,6 @@ def check_bytes(data: object) -> None:
 async def _echo(call: Call) -> bytes:
     """The call ``ping``: whoever gets this answer may call this agent."""
     return call.data
-
-
-@asynccontextmanager
-async def join(
-    agent_type: str | int,
-    *,
-    id: int | None = None,  # noqa: A002 - what everybody calls it
-    group: int = 0,
-    connect: Sequence[str] = (),
-    settings: MeshSettings | None = None,
-    traffic: Sequence[TrafficRule] = (),
-    guard: Guard | None = None,
-    on_waiting: Callable[[str], None] | None = None,
-) -> AsyncIterator[Agent]:
-    """Join the mesh as an agent and leave it at the end of the block.
-
-    Args:
-        agent_type: ``"ros"``, ``"unity"`` or a number from 1 to 255.
-        id: 1 to 65535, unique per type; None takes a free one.
-        group: 1 to 255, or 0 for none.
-        connect: router endpoints, e.g. ``["tcp/127.0.0.1:7447"]``; several give fail-over.
-        settings: everything else about the connection; ``connect``, if given, replaces its endpoints.
-        traffic: rules for what this agent sends, by key.
-        guard: judges all that comes, before it can wait.
-        on_waiting: called once with the endpoints while no router answers; it waits as long as it takes.
-
-    Raises:
-        UsageError: the id is taken or out of range, the type unknown.
-        ConfigError: Zenoh does not accept the settings.
-    """
-    kind = type_number(agent_type)
-    if not 0 <= group <= 255:
-        raise OutOfRange("group", group, 0, 255)
-    settings = settings or MeshSettings()
-    if connect:
-        settings = changed(settings, connect=list(connect))
-    async with await Mesh.open(settings, traffic=traffic, on_waiting=on_waiting) as mesh:
-        agent = Agent(mesh, kind, group, guard)
-        try:
-            await agent._join(id)
-            log.info("joined as %s/%d%s", agent.type, agent.id, f" in group {group}" if group else "")
-            yield agent
-        finally:
-            agent.close()
 
 
 def _contained(what: str, callback: Callable[..., object], *args: object) -> None:

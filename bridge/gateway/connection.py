@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import logging
 import math
-import socket
-import struct
 import sys
-import termios
 import time
 from collections import Counter
 from collections.abc import Hashable, Sequence
@@ -31,16 +27,13 @@ from macs_zenoh.protocol.tcp_agent import Event, Joined, Left, Rejected, Sent, S
 from .backpressure import Backpressure
 from .door import OPEN_TO_ALL, Entrance
 from .memory import Memory
+from .tcp import is_gone, tune, waiting_bytes
 from .writer import BUFFER_BYTES, ENDED, Writer
 
 log = logging.getLogger("macs.gateway")
 
 AWAY_S = 10.0
 """An agent that nothing was heard of for so long, two heartbeats, is away."""
-
-DEAD_MS = 18_000
-"""A host that has acknowledged nothing for so long, while something is on its way to it, is gone. One whose program
-stands still acknowledges all the same."""
 
 LOOK_S = 1.0
 """How often it is looked whether the host of an agent that is away is gone."""
@@ -58,7 +51,6 @@ DRIVES_S = 1.0
 
 READ_S = 0.02
 """How long what waits in a socket has before the agent's time is looked at again."""
-
 
 TURN_S = 0.003
 """Work for one agent that takes longer lets all others have their turn before it goes on: an event loop may read from
@@ -169,7 +161,7 @@ class Connection(asyncio.BufferedProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         transport = cast(asyncio.Transport, transport)  # uvloop's is one without saying so
         self._transport = transport
-        _tune(transport.get_extra_info("socket"))
+        tune(transport.get_extra_info("socket"))
         peer_name = transport.get_extra_info("peername")
         self.host = of_peer(str(peer_name[0])) if peer_name else "?"
         self.address = joined(self.host, peer_name[1]) if peer_name else "?"
@@ -486,7 +478,7 @@ class Connection(asyncio.BufferedProtocol):
         paused_at = self._writer.paused_at
         if paused_at is not None and now >= paused_at + self._write_timeout_s:
             self.close(f"it has not read for {self._write_timeout_s:g} s")
-        elif self.is_away(now) and _is_gone(self._transport.get_extra_info("socket")):
+        elif self.is_away(now) and is_gone(self._transport.get_extra_info("socket")):
             self.close("its host does not answer")
         if self.peer.state is not State.GONE:
             self._schedule()
@@ -506,35 +498,8 @@ class Connection(asyncio.BufferedProtocol):
         have been held up, or reading paused. What comes later does not count, so that nobody can put that off."""
         if not self._looked:
             self._looked = True
-            self._unread = _waiting_bytes(self._transport.get_extra_info("socket"))
+            self._unread = waiting_bytes(self._transport.get_extra_info("socket"))
         if self._unread > 0:
             return True
         self._looked = False
         return False
-
-
-def _waiting_bytes(sock: socket.socket) -> int:
-    """How much has come that nobody has read."""
-    try:
-        return int.from_bytes(fcntl.ioctl(sock.fileno(), termios.FIONREAD, bytes(4)), sys.byteorder)
-    except OSError:  # it is closed
-        return 0
-
-
-def _is_gone(sock: socket.socket) -> bool:
-    """Whether data is on its way to a host that acknowledges nothing; while none is, keep-alive probes find out."""
-    try:
-        info = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 60)
-    except (OSError, AttributeError):  # it is closed; not Linux
-        return False
-    (unacknowledged,), (since_ms,) = (struct.unpack_from("=I", info, at) for at in (24, 56))  # struct tcp_info
-    return bool(unacknowledged) and since_ms >= DEAD_MS
-
-
-def _tune(sock: socket.socket) -> None:
-    """No delay for small messages; dead hosts are noticed within about 20 s even where heartbeats are off."""
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 3), ("TCP_KEEPCNT", 3)):
-        if hasattr(socket, name):
-            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

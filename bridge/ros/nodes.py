@@ -24,7 +24,8 @@ from bridge.ros.rights import Rights
 from bridge.ros.served import ServiceNode
 from bridge.ros.services import ClientNode
 from bridge.ros.stop import StopNode
-from bridge.ros.topics import PublisherNode, SubscriberNode
+from bridge.ros.subscriber import SubscriberNode
+from bridge.ros.topics import PublisherNode
 from bridge.ros.types import InterfaceName
 from macs_zenoh.deadline import Deadline
 from macs_zenoh.errors import MacsError, Refused

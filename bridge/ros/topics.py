@@ -1,7 +1,7 @@
-"""Interface nodes for topics: a robot's topic to headsets (type 1), and headsets to a robot's topic (type 2).
+"""Interface nodes by which headsets publish to a robot's topic (type 2), and what all nodes for topics have in common.
 
-Topic data crosses as bytes, never decoded: from the intake's thread straight into the mesh, and from the thread that
-brought it from the mesh, or the loop, straight into a publisher.
+Topic data crosses as bytes, never decoded: from the thread that brought it from the mesh, or the loop, straight into a
+publisher.
 """
 
 from __future__ import annotations
@@ -12,31 +12,25 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from collections.abc import Iterable
 from typing import Any
 
 from msgspec import UNSET, UnsetType, structs
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
+from rclpy.event_handler import PublisherEventCallbacks, UnsupportedEventTypeError
 from rclpy.serialization import serialize_message
 
 from bridge.audit import who
 from bridge.ros import fields, qos
 from bridge.ros.alarms import Alarm
-from bridge.ros.gaps import Gaps
-from bridge.ros.intake import OnRaw
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
-from bridge.ros.latched import Newcomers, Receivers, Told, message_of
 from bridge.ros.rules import DEFAULT_HOLD_S
 from bridge.ros.safety import Control, DeadMan
-from bridge.ros.stream import Fanout, cdr_problem
+from bridge.ros.stream import cdr_problem
 from bridge.ros.types import InterfaceName, least_cdr_bytes, resolve
-from bridge.ros.unity_cdr import TooManyParts, UnityCdr, to_ros, to_unity
-from macs_zenoh.errors import MacsError, Refused
-from macs_zenoh.protocol.messages import AddNode, NodeType, StreamData
-from macs_zenoh.protocol.rate import Rate
+from bridge.ros.unity_cdr import TooManyParts, UnityCdr, to_ros
+from macs_zenoh.errors import Refused
+from macs_zenoh.protocol.messages import AddNode, NodeType
 from macs_zenoh.protocol.reading import Message
-from macs_zenoh.protocol.recovery import SILENT_S
 from macs_zenoh.protocol.robot_state import ControlStatus, DeadManStatus, NodeStatus
 from macs_zenoh.timeouts import within
 
@@ -56,252 +50,6 @@ class TopicNode(InterfaceNode):
         subscriptions = types_of_others(node, node.get_subscriptions_info_by_topic(topic))
         found = (publishers or subscriptions) if publishers_first else (subscriptions or publishers)
         return set() if str(self.interface) in found else found
-
-
-class SubscriberNode(TopicNode):
-    """Type 1: a robot's topic to its registrants, one frame per message whoever receives it."""
-
-    NODE_TYPE = NodeType.SUBSCRIBER
-    ROLE = "subscriber"
-
-    def __init__(self, robot: Robot, request: AddNode) -> None:
-        super().__init__(robot, request)
-        self._subscription: Any = None
-        self._profile: Any = None
-        self._message: Any = None
-        self._rate = RateLimit(self.rule.max_hz) if self.rule.max_hz else None
-        self._rate_lock = threading.Lock()
-        self._gaps = Gaps()
-        self._max_frame_bytes = robot.rules.settings.max_frame_bytes
-        self._loop = asyncio.get_running_loop()
-        self._translate: Callable[[bytes], bytes] | None = None
-        self._fanout_lock = threading.Lock()
-        self._fanout = self._to_registrants()
-        self._is_latched = True
-        """Whether publishers hold messages for late ones, and until they are known."""
-        self._first: Receivers = frozenset()
-        """Who was registered when the subscription was made that gets what is held for late ones."""
-        self._told = Told()
-        self._newcomers = Newcomers(
-            robot.session, self._subscribe_also, self._publishers, self._profile_of, self._tell_newcomers
-        )
-
-    def registrants_changed(self) -> None:
-        with self._fanout_lock:
-            self._fanout = self._to_registrants()
-
-    def deregister(self, registrant: Registrant) -> None:
-        super().deregister(registrant)
-        self._first -= {registrant}
-        self._told.forget(registrant)
-
-    def welcome(self, registrant: Registrant) -> None:
-        if registrant not in self._first:
-            self._welcome([registrant])
-
-    def _welcome(self, registrants: Iterable[tuple[int, int]]) -> None:
-        if self.rule.durability != "volatile":
-            self._newcomers.welcome(registrants)
-
-    def open(self) -> None:
-        self._message = resolve(str(self.interface))
-        both = UnityCdr.of(self._message)
-        self._translate = partial(to_unity, both) if both is not None else None
-        self.registrants_changed()  # before the first message comes
-        check_topic_type(self.robot.session.node, self.request.tos_name, self.interface)
-        self.robot.prioritise_stream(self.key.node_name, self.rule.priority)
-        if self.robot.keep_stream(self.key.node_name, self.rule.cache):
-            self.linger_s = SILENT_S
-        self._subscribe(self._profile_of(self._publishers()))
-
-    def other_types(self) -> set[str]:
-        return self._others(publishers_first=True)
-
-    def close(self) -> None:
-        self._newcomers.close()
-        self._unsubscribe()
-
-    def _unsubscribe(self) -> None:
-        subscription, self._subscription = self._subscription, None
-        if subscription is not None:
-            self.robot.session.intake.unsubscribe(subscription)
-
-    def retire(self) -> None:
-        self.robot.keep_stream(self.key.node_name, None)
-
-    def receive(self, message: Message) -> None:
-        self.robot.drops.note("no_node", self.key.node_name, "data for a node that only sends")
-
-    def _to_registrants(self) -> Fanout:
-        return Fanout(
-            self.metadata(StreamData.manager),
-            frozenset(self.registrants),
-            frozenset(self.unity),
-            self.robot.layout,
-            translate=self._translate,
-        )
-
-    # -- in the ROS thread ---------------------------------------------------------------------------------------
-
-    def _publishers(self) -> list[Any]:
-        found = self.robot.session.node.get_publishers_info_by_topic(self.request.tos_name)
-        return [endpoint.qos_profile for endpoint in found]
-
-    def _profile_of(self, publishers: Iterable[Any]) -> Any:
-        offered = list(publishers)
-        profile = qos.for_subscription(offered, qos.depth_of(self.request.buffer_size))
-        return qos.for_each_of(len(offered), qos.overridden(profile, self.rule))
-
-    def _subscribe_also(self, profile: Any, on_raw: OnRaw, events: SubscriptionEventCallbacks | None) -> Any:
-        """For newcomers."""
-        return self.robot.session.intake.subscribe(
-            self._message, self.request.tos_name, on_raw, profile, events=events
-        )
-
-    def _subscribe(self, profile: Any) -> None:
-        self._first = self._fanout.receivers if qos.is_latched(profile) else frozenset()
-        subscribe, topic = self.robot.session.intake.subscribe, self.request.tos_name
-        events = SubscriptionEventCallbacks(
-            matched=self._publisher_matched,
-            incompatible_qos=self._publisher_incompatible,
-            message_lost=self._lost,
-            use_default_callbacks=False,
-        )
-        with ros_errors(topic):
-            try:
-                self._subscription = subscribe(self._message, topic, self._pass_on, profile, events=events)
-            except UnsupportedEventTypeError:  # of some middlewares; then the QoS stays as it is
-                self._subscription = subscribe(self._message, topic, self._pass_on, profile)
-        self._profile = profile
-
-    # -- in the thread of the intake -----------------------------------------------------------------------------
-
-    def _pass_on(self, cdr: bytes, info: Mapping[str, Any]) -> None:
-        """One message with what rclpy knows about it."""
-        if self._gaps.take(info["publication_sequence_number"]):
-            self._loop.call_soon_threadsafe(self._loop.call_later, self._gaps.SETTLE_S, self._tell_gaps)
-        if self._is_latched:
-            fanout = self._fanout
-            receivers = self._told.to_tell(message_of(info), fanout.receivers)
-            if receivers != fanout.receivers:
-                self._put(cdr, fanout.only(receivers))
-                return
-        self._publish(cdr)
-
-    def _tell_newcomers(self, cdr: bytes, info: Mapping[str, Any], newcomers: Receivers) -> bool:
-        """A message that the topic's publishers hold for late ones."""
-        fanout = self._fanout
-        receivers = self._told.to_tell(message_of(info), newcomers & fanout.receivers)
-        if receivers:
-            self._put(cdr, fanout.only(receivers))
-        return bool(receivers)
-
-    def _publish(self, cdr: bytes) -> None:
-        if self._rate is None:
-            self._put(cdr)
-            return
-        now = time.monotonic()
-        with self._rate_lock:
-            waits = self._rate.waiting
-            due = self._rate.offer(cdr, now)
-        if due is None:
-            self._put(cdr)
-        elif not waits:
-            self._loop.call_soon_threadsafe(self._loop.call_later, due - now, self._put_latest)
-
-    def _put_latest(self) -> None:
-        """What waited for its time, on the loop."""
-        if self._rate is not None and self._subscription is not None:
-            with self._rate_lock:
-                latest = self._rate.take(time.monotonic())
-            if latest is not None:
-                self._put(latest)
-
-    def _put(self, cdr: bytes, fanout: Fanout | None = None) -> None:
-        try:
-            for frame in (fanout or self._fanout)(cdr):
-                if len(frame) > self._max_frame_bytes:
-                    self._note_too_large(len(frame))
-                    continue
-                self.robot.publish_stream(self.key.node_name, frame)
-        except MacsError as error:
-            self.robot.drops.note("failed", self.topic, str(error))
-
-    def _note_too_large(self, size: int) -> None:
-        reason = f"a message makes a frame of {size} bytes, more than max_frame_bytes ({self._max_frame_bytes})"
-        self.robot.drops.note(TOO_LARGE, self.topic, reason)
-        self._loop.call_soon_threadsafe(self.tell_registrants, TOO_LARGE, reason)
-
-    def _publisher_matched(self, change: Any) -> None:
-        self._gaps.publishers(change.current_count)
-        if change.current_count_change > 0:
-            self._is_latched = True  # it may be
-            self.robot.session.submit(self._follow)
-
-    def _publisher_incompatible(self, _change: Any) -> None:
-        self.robot.session.submit(self._follow)
-
-    def _follow(self) -> None:
-        """Adopt the QoS of publishers that came after us."""
-        publishers = self._publishers()
-        if self._subscription is None or not publishers:
-            return
-        profile = self._profile_of(publishers)
-        self._is_latched = any(map(qos.is_latched, publishers))
-        if not qos.same(profile, self._profile):
-            log.info("%s: its publishers changed, subscribing again with %s", self.topic, _describe(profile))
-            self._unsubscribe()
-            self._subscribe(profile)
-        elif self._is_latched and not qos.is_latched(profile):
-            # one that does not latch is among them, so what a new one holds does not come by itself
-            self._welcome(self._fanout.receivers)
-
-    def _lost(self, status: Any) -> None:
-        """ROS itself counts what the network lost, not what it threw away for want of room."""
-        if not self._gaps.counting:
-            self._note_lost(int(status.total_count_change))
-
-    def _tell_gaps(self) -> None:
-        if missing := self._gaps.missing():
-            self._note_lost(missing)
-
-    def _note_lost(self, count: int) -> None:
-        text = "ROS lost messages before they were taken; a larger buffer size may help"
-        self.robot.drops.note("lost_in_ros", self.topic, text, count)
-
-
-class RateLimit:
-    """At most ``max_hz`` messages per second; of those that come too soon only the latest waits. Pure."""
-
-    def __init__(self, max_hz: float) -> None:
-        self._period_s = 1 / max_hz
-        self._pace = Rate(max_hz)
-        self._latest: bytes | None = None
-
-    @property
-    def waiting(self) -> bool:
-        """Whether a message waits for its time."""
-        return self._latest is not None
-
-    def offer(self, message: bytes, now: float) -> float | None:
-        """None: send it now. Otherwise it waits in place of an older one, until the time that is returned."""
-        if self._latest is None and self._pace.allows(now):
-            self._sent(now)
-            return None
-        self._latest = message
-        return self._pace.due
-
-    def take(self, now: float) -> bytes | None:
-        """The message that waits, to be sent now."""
-        latest, self._latest = self._latest, None
-        if latest is not None:
-            self._sent(now)
-        return latest
-
-    def _sent(self, now: float) -> None:
-        """Keep the pace: a message that was a little late does not delay all that follow."""
-        due = self._pace.due
-        self._pace.take(1, due if now - due < self._period_s else now)
 
 
 class PublisherNode(TopicNode):
@@ -511,7 +259,3 @@ def check_topic_type(node: Any, topic: str, interface: InterfaceName) -> None:
     """Raise Refused when the topic exists and carries another type. In the ROS thread."""
     endpoints = [*node.get_publishers_info_by_topic(topic), *node.get_subscriptions_info_by_topic(topic)]
     interface.check(topic, {endpoint.topic_type for endpoint in endpoints})
-
-
-def _describe(profile: Any) -> str:
-    return f"{profile.reliability.name.lower()}, {profile.durability.name.lower()}".replace("_", " ")

@@ -10,27 +10,17 @@ for what it says, with the wire's name in ``manager``.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from enum import Enum, IntEnum
-from functools import cache, lru_cache
-from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar
+from functools import lru_cache
+from typing import Annotated, ClassVar, NamedTuple
 
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from ..errors import BadField, BadJson, TooLong, UnknownManager
-from .limits import (
-    ANSWER_BYTES,
-    CONFIGURATION_BYTES,
-    JSON_FIELDS,
-    JSON_PARTS,
-    MANAGEMENT_BYTES,
-    METADATA_BYTES,
-    NAME_BYTES,
-    NESTING,
-    REQUEST_BYTES,
-)
+from .json_fields import StructT, converted, fields_of, json_object, judged, snake, snake_object, wire_names
+from .limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, NAME_BYTES, REQUEST_BYTES
 
 BROADCAST = 0
 """Agent type of a header that goes to everybody."""
@@ -112,7 +102,7 @@ class Metadata(Struct, frozen=True, rename="camel", forbid_unknown_fields=True):
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             # other keys than the seven plain ones: the tolerant way reads all of it, or tells what is wrong
             try:
-                return _convert("metadata", _json_object("metadata", bytes(data)), Metadata)
+                return converted("metadata", snake_object("metadata", bytes(data)), Metadata)
             except BadJson:
                 raise BadJson("metadata", str(error)) from error
 
@@ -354,8 +344,6 @@ FOR_NEWER = frozenset({DataRefused.manager})
 
 NO_CUSTOM: Mapping[str, type[Struct]] = {}
 
-StructT = TypeVar("StructT", bound=Struct)
-
 
 class Custom(NamedTuple):
     """Management data of a manager that somebody added: its name and its typed data."""
@@ -371,20 +359,20 @@ def decode_management(
 
     Raises TooLong, BadJson, BadField or UnknownManager.
     """
-    fields = _json_object("management data", _judged("management data", data, max_bytes))
+    fields = snake_object("management data", judged("management data", data, max_bytes))
     name = fields.pop("message_manager", None)
     if not isinstance(name, str):
         raise BadField("management data", "the key 'messageManager' is missing or not a string")
     if (kind := MANAGERS.get(name)) is not None:
-        return _convert(name, fields, kind)
+        return converted(name, fields, kind)
     if name in custom:
-        return Custom(name, _convert(name, fields, custom[name]))
+        return Custom(name, converted(name, fields, custom[name]))
     raise UnknownManager(name)
 
 
 def encode_management(value: Management) -> bytes:
     """Write management data: the value's fields and its manager's name."""
-    fields = {**_fields(value), "messageManager": value.manager}
+    fields = {**fields_of(value), "messageManager": value.manager}
     if isinstance(value, Configuration) and not value.extensions:
         del fields["extensions"]  # as existing programs write it
     return msgspec.json.encode(fields)
@@ -393,14 +381,14 @@ def encode_management(value: Management) -> bytes:
 def decode_data(kind: type[StructT], data: bytes | bytearray | memoryview, max_bytes: int = REQUEST_BYTES) -> StructT:
     """Read the JSON in a message's data part as ``kind``. Raises TooLong, BadJson or BadField."""
     name = getattr(kind, "manager", "") or kind.__name__
-    data = _judged(name, data, max_bytes)
-    return _convert(name, _json_object(name, data), kind)
+    data = judged(name, data, max_bytes)
+    return converted(name, snake_object(name, data), kind)
 
 
 def is_json_object(data: bytes | bytearray | memoryview, max_bytes: int = CONFIGURATION_BYTES) -> bool:
     """Whether data is a JSON object, of a size that may be parsed."""
     try:
-        _json("data", _judged("data", data, max_bytes))
+        json_object("data", judged("data", data, max_bytes))
     except (TooLong, BadJson):
         return False
     return True
@@ -420,11 +408,11 @@ def correct_sender(metadata: bytes, agent_type: int, agent_id: int) -> bytes:
 
     Keys that are the sender's to a reader who takes small and capital letters for the same are not kept.
     """
-    fields = _json("metadata", _judged("metadata", metadata, METADATA_BYTES))
-    names = _wire_names(Metadata)
+    fields = json_object("metadata", judged("metadata", metadata, METADATA_BYTES))
+    names = wire_names(Metadata)
     true = {}
     for key, value in fields.items():
-        name = names.get(_snake(key))
+        name = names.get(snake(key))
         if name is not None or key.casefold() not in _SENDER:
             true[name or key] = value
     true |= {"senderAgentType": agent_type, "senderAgentId": agent_id}
@@ -435,81 +423,3 @@ def correct_sender(metadata: bytes, agent_type: int, agent_id: int) -> bytes:
 def node_name(tos_name: str) -> str:
     """The name of the interface node for a topic or service: ``/cmd_vel`` → ``nd__cmd_vel``. Names can collide."""
     return "nd_" + tos_name.replace("/", "_").replace("~", "_")
-
-
-def _judged(what: str, data: bytes | bytearray | memoryview, max_bytes: int) -> bytes:
-    """The same bytes, if they may be parsed: not too many, and not made of too many parts."""
-    if len(data) > max_bytes:
-        raise TooLong(what, len(data), max_bytes)
-    data = bytes(data)
-    if len(data) > METADATA_BYTES and max_bytes < ANSWER_BYTES:
-        for parts in (data.count(b":"), data.count(b"[") + data.count(b"{")):
-            if parts > JSON_PARTS:
-                raise BadJson(what, f"it has {parts} parts, at most {JSON_PARTS} are allowed")
-    return data
-
-
-def _json_object(what: str, data: bytes) -> dict[str, Any]:
-    """The object in ``data`` with its top-level keys in snake_case. Raises BadJson."""
-    return {_snake(key): field for key, field in _json(what, data).items()}
-
-
-def _json(what: str, data: bytes) -> dict[str, Any]:
-    try:
-        value = msgspec.json.decode(data)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise BadJson(what, str(error)) from error
-    if not isinstance(value, dict):
-        raise BadJson(what, f"an object was expected, not {type(value).__name__}")
-    if len(value) > JSON_FIELDS:
-        raise BadJson(what, f"{len(value)} keys, at most {JSON_FIELDS} are allowed")
-    if data.count(b"[") + data.count(b"{") > NESTING and is_deep(value):
-        raise BadJson(what, f"more than {NESTING} objects and lists in each other")
-    return value
-
-
-def is_deep(value: object) -> bool:
-    """Whether more than ``NESTING`` objects and lists lie in each other: readers elsewhere follow less than we do."""
-    level: list[object] = [value]
-    for _ in range(NESTING + 1):
-        inner: list[object] = []
-        for one in level:
-            if isinstance(one, dict | list):
-                inner += one.values() if isinstance(one, dict) else one
-        level = inner
-    return bool(level)
-
-
-def _convert(what: str, fields: dict[str, Any], kind: type[StructT]) -> StructT:
-    names = _wire_names(kind)
-    known = {names[key]: value for key, value in fields.items() if key in names}
-    if (nested := known.get("functionality")) and isinstance(nested, dict) and len(nested) <= JSON_FIELDS:
-        known["functionality"] = {_snake(key): value for key, value in nested.items()}
-    try:
-        return msgspec.convert(known, kind)
-    except msgspec.ValidationError as error:
-        raise BadField(what, str(error)) from error
-
-
-@cache
-def _wire_names(kind: type[Struct]) -> dict[str, str]:
-    return dict(zip(kind.__struct_fields__, kind.__struct_encode_fields__, strict=True))
-
-
-def _fields(value: Struct) -> dict[str, Any]:
-    fields: dict[str, Any] = msgspec.to_builtins(value)
-    return {key: field for key, field in fields.items() if field is not None}
-
-
-_HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
-_LONGEST_KEY = 64
-"""No key of ours is longer; longer ones are not remembered, because a peer chooses them."""
-
-
-def _snake(key: str) -> str:
-    return _short_snake(key) if len(key) <= _LONGEST_KEY else key
-
-
-@lru_cache(maxsize=1024)
-def _short_snake(key: str) -> str:
-    return _HUMP.sub("_", key).lower()

@@ -10,14 +10,14 @@ from tests.network.hosts import Host, Network
 
 SERVE = """
 import json, socket, time
-from bridge.gateway.connection import _is_gone, _tune
+from bridge.gateway.tcp import is_gone, tune
 listener = socket.create_server(("0.0.0.0", 7000))
 print("ready", flush=True)
 socks = {}
 for _ in range(3):
     sock, _ = listener.accept()
     name = sock.recv(10).decode()
-    _tune(sock)
+    tune(sock)
     sock.setblocking(False)
     socks[name] = sock
 print("all", flush=True)
@@ -34,7 +34,7 @@ while time.monotonic() < began + 27 and len(gone) < 3:
             pass
         except OSError:
             gone[name] = time.monotonic() - began
-        if _is_gone(sock):
+        if is_gone(sock):
             gone.setdefault(name, time.monotonic() - began)
     time.sleep(0.25)
 print(json.dumps(gone), flush=True)

@@ -16,7 +16,7 @@ from bridge.ros.interface import Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
-from bridge.ros.topics import RateLimit
+from bridge.ros.subscriber import RateLimit
 from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.protocol.messages import NodeType
 from macs_zenoh.protocol.wire import parse_frame

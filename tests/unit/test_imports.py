@@ -31,6 +31,7 @@ WITH_ASYNCIO = WITH_ZENOH | {
         "claims.py",
         "deadline.py",
         "identity.py",
+        "joining.py",
         "locked_out.py",
         "nodes.py",
         "presence.py",
@@ -220,6 +221,14 @@ def test_help_needs_no_zenoh() -> None:
     """A command line that only explains itself loads neither Zenoh nor asyncio's programs."""
     code = "import sys, bridge.cli; bridge.cli.build_parser(); sys.exit('zenoh' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+def test_a_verb_loads_no_other() -> None:
+    """A command line loads the module of its verb, not those of all verbs."""
+    code = "import sys, bridge.cli; bridge.cli.build_parser('keys'); print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    assert "bridge.cli.keys" in loaded.split()
+    assert not {"bridge.cli.doctor", "bridge.cli.up", "bridge.cli.security"} & set(loaded.split())
 
 
 OURS = ("macs_zenoh", "bridge", "tests.support")
