@@ -9,55 +9,54 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import importlib
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import ModuleType
 from typing import Any
 
-from bridge.cli import (
-    agent,
-    audit,
-    awareness,
-    completion,
-    conformance,
-    doctor,
-    gateway,
-    headset,
-    init,
-    interfaces,
-    keys,
-    ls,
-    options,
-    output,
-    router,
-    running,
-    security,
-    stop,
-    token,
-    up,
-)
+from bridge.cli import completion, options, output, running
 from macs_zenoh.errors import ConfigError, MacsError, UsageError
 from macs_zenoh.plain import plain
 from macs_zenoh.versions import installed
 
-VERBS = {
-    "up": up,
-    "router": router,
-    "gateway": gateway,
-    "agent": agent,
-    "headset": headset,
-    "awareness": awareness,
-    "ls": ls,
-    "stop": stop,
-    "doctor": doctor,
-    "security": security,
-    "conformance": conformance,
-    "audit": audit,
-    "token": token,
-    "init": init,
-    "keys": keys,
-    "interfaces": interfaces,
-    "completion": completion,
-}
+NAMES = (
+    "up",
+    "router",
+    "gateway",
+    "agent",
+    "headset",
+    "awareness",
+    "ls",
+    "stop",
+    "doctor",
+    "security",
+    "conformance",
+    "audit",
+    "token",
+    "init",
+    "keys",
+    "interfaces",
+    "completion",
+)
+
+
+class Verbs(Mapping[str, ModuleType]):
+    """The modules of all verbs by name, in the order of the help; each is loaded when it is asked for."""
+
+    def __getitem__(self, name: str) -> ModuleType:
+        if name not in NAMES:
+            raise KeyError(name)
+        return importlib.import_module(f"{__name__}.{name}")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(NAMES)
+
+    def __len__(self) -> int:
+        return len(NAMES)
+
+
+VERBS = Verbs()
 
 DESCRIPTION = """\
 ROS 2 robots and XR headsets on one Zenoh mesh, reached by id, by group or all at once.
@@ -126,23 +125,25 @@ class _VerbsInOneColumn(argparse.RawDescriptionHelpFormatter):
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog)
-        self._action_max_length = max(map(len, VERBS)) + 4
+        self._action_max_length = max(map(len, NAMES)) + 4
 
 
-def build_parser() -> Parser:
+def build_parser(verb: str = "") -> Parser:
+    """The command line: of one verb, whose module alone is loaded, or of all where it is none of them."""
     parser = Parser(prog="macs", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=_VerbsInOneColumn)
     parser.add_argument("--version", action=_Version, nargs=0, help="show program's version number and exit")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True, title="verbs")
-    for name, module in VERBS.items():
-        verb = verbs.add_parser(
+    for name in [verb] if verb in NAMES else NAMES:
+        module = VERBS[name]
+        added = verbs.add_parser(
             name,
             help=module.SUMMARY,
             description=module.__doc__,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        options.add_log_options(verb, getattr(module, "VERBOSE", "log more"))
-        module.add_arguments(verb)
-        verb.set_defaults(run=module.run)
+        options.add_log_options(added, getattr(module, "VERBOSE", "log more"))
+        module.add_arguments(added)
+        added.set_defaults(run=module.run)
     return parser
 
 
@@ -164,7 +165,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(words: Sequence[str]) -> int:
-    parser = build_parser()
+    parser = build_parser(words[0] if words else "")
     if not words:
         parser.print_help(sys.stderr)
         parser.exit(2, "\nmacs: no verb was given\n")
