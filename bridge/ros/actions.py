@@ -36,6 +36,12 @@ UNKNOWN, ACCEPTED, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = range(7)
 WATCH_S = 1.0
 GONE_S = 5.0
 """An action server that cannot be seen for so long has taken its goals with it."""
+CANCEL_AGAIN_S = 1.0
+CANCEL_TIMES = 5
+"""A cancellation without an answer is asked for again after so long, so many times in all. ROS loses the answer of a
+server that has found our client's goals but not yet its cancellations; to ask twice does no harm."""
+TERMINATED = 3
+"""action_msgs/CancelGoal: the goal cannot be canceled any more, because it is being canceled or has ended."""
 
 
 @dataclass
@@ -382,18 +388,30 @@ class ActionNode(InterfaceNode):
             self._loop.call_soon_threadsafe(self._finished, goal, ABORTED, reason)
             return None
 
-    def _send_cancel(self, goal: Goal) -> None:
+    def _send_cancel(self, goal: Goal, times: int = 1) -> None:
         if goal.handle is None or self._client is None:
             self._loop.call_soon_threadsafe(self._tell, goal, ActionVerb.CANCEL, 0, b"the goal has finished")
             return
 
+        answered = False
+
         def cancelling(future: Any) -> None:
+            nonlocal answered
+            answered = True
             response = self._outcome(goal, future)
-            done = response is not None and bool(response.goals_canceling)
+            if response is None:
+                done = False
+            else:  # it may be the question before this one that it took, whose answer was lost
+                done = bool(response.goals_canceling) or (times > 1 and response.return_code == TERMINATED)
             reason = b"" if done else b"the action does not cancel it"
             self._loop.call_soon_threadsafe(self._tell, goal, ActionVerb.CANCEL, int(done), reason)
 
+        def look() -> None:
+            if not answered and goal.finished_at is None and times < CANCEL_TIMES:
+                self._send_cancel(goal, times + 1)
+
         goal.handle.cancel_goal_async().add_done_callback(cancelling)
+        self.robot.session.later(CANCEL_AGAIN_S, look)
 
 
 def tell_no_goal(robot: Robot, message: Message, reason: str) -> None:
