@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.support.isolation import isolate
+from tests.support.patience import be_patient
 
 NEED_ROS_TESTS = "MACS_NEED_ROS_TESTS"
 """Set by ``make test`` and CI: a run in which no ROS test passed is a failed run."""
@@ -98,6 +99,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.alone)
         if item.nodeid.startswith(SOAK):
             item.add_marker(pytest.mark.soak)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _patient() -> None:
+    """No test fails because an answer takes longer than people would wait for it."""
+    be_patient()
 
 
 @pytest.fixture(autouse=True)

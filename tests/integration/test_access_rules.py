@@ -120,7 +120,7 @@ async def test_an_agent_uses_a_robot_within_the_rules(as_user: Callable[[str], M
 
         robot.serve("add_node", add)
         await online(agent, 1, 7)
-        poses = await agent.subscribe("/pose", robot=7, type="std_msgs/String", timeout_s=20)
+        poses = await agent.subscribe("/pose", robot=7, type="std_msgs/String", timeout_s=PATIENCE_S)
         assert asked == ["unity/9"]
         metadata = Metadata(1, 7, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__pose", "std_msgs/String")
         management = encode_management(StreamData({"2": [9]}))
@@ -186,7 +186,7 @@ async def test_an_observer_sees_who_is_online(as_user: Callable[[str], MeshSetti
         macs_zenoh.join("ros", id=7, group=3, settings=as_user("robot-7")),
         await Mesh.open(as_user("observer")) as mesh,
     ):
-        keys = await mesh.tokens(PRESENCE.every(), timeout_s=20)
+        keys = await mesh.tokens(PRESENCE.every(), timeout_s=PATIENCE_S)
     assert [fields.id for key in keys if (fields := PRESENCE.parse(key))] == [7]
 
 

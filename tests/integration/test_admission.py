@@ -203,7 +203,7 @@ async def test_without_descriptors_it_is_said() -> None:
             writer.close()
         there[0].writer.write(frames.online_request(there[0].id, 1))
         assert await asyncio.wait_for(there[0].read(), PATIENCE_S)
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + PATIENCE_S
         while True:
             try:
                 async with crowd(gateway.port, 20):

@@ -8,7 +8,7 @@ import pytest
 
 import macs_zenoh
 from tests.support.local import patient
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 
 async def test_what_says_who_is_there_says_where_to_send(router: str) -> None:
@@ -22,10 +22,10 @@ async def test_what_says_who_is_there_says_where_to_send(router: str) -> None:
         info = next(agent for agent in headset.online() if agent.id == 7)
         assert str(info.key) == "ros/7"
         headset.send(b"by number", to=info.type, ids=[info.id])
-        message = await asyncio.wait_for(robot.receive(), 20)
+        message = await asyncio.wait_for(robot.receive(), PATIENCE_S)
         assert message.data == b"by number"
         robot.send(b"by text", to=message.sender_type, ids=[message.sender_id])
-        assert (await asyncio.wait_for(headset.receive(), 20)).data == b"by text"
+        assert (await asyncio.wait_for(headset.receive(), PATIENCE_S)).data == b"by text"
         assert await headset.call(info.type, info.id, "ping", b"x") == b"x"
         with pytest.raises(macs_zenoh.UsageError, match="unknown agent type '0'"):
             headset.send(b"", to=0, ids=[7])
@@ -40,11 +40,11 @@ async def test_a_reply_goes_to_who_asked_with_its_number(router: str) -> None:
     ):
         await until(lambda: len(headset.online()) == len(robot.online()) == 3)
         headset.send(b"?", to="ros", ids=[7], metadata=macs_zenoh.Metadata(request_id=41))
-        robot.reply(await asyncio.wait_for(robot.receive(), 20), b"!")
+        robot.reply(await asyncio.wait_for(robot.receive(), PATIENCE_S), b"!")
         robot.send(b"to you", to="unity", ids=[301])
-        answer = await asyncio.wait_for(headset.receive(), 20)
+        answer = await asyncio.wait_for(headset.receive(), PATIENCE_S)
         assert (answer.data, answer.metadata.request_id, answer.sender_id) == (b"!", 41, 7)
-        assert (await asyncio.wait_for(other.receive(), 20)).data == b"to you"
+        assert (await asyncio.wait_for(other.receive(), PATIENCE_S)).data == b"to you"
 
 
 @pytest.mark.parametrize("data", ["text", ["a list"], 7, None])
@@ -92,7 +92,7 @@ async def test_drain_waits_for_what_was_sent_before(router: str) -> None:
         assert not draining.done()
         await asyncio.wait_for(draining, 60)
         assert len((await asyncio.wait_for(robot.receive(), 60)).data) == 12 << 20
-        assert (await asyncio.wait_for(robot.receive(), 20)).data == b"after it"
+        assert (await asyncio.wait_for(robot.receive(), PATIENCE_S)).data == b"after it"
 
 
 async def test_every_callback_ends_with_its_handle(router: str) -> None:
@@ -125,7 +125,7 @@ async def test_every_callback_ends_with_its_handle(router: str) -> None:
                 headset.send(b"to the callback", to="ros", ids=[7])
                 await until(lambda: heard == [b"to the callback"])
             headset.send(b"to receive", to="ros", ids=[7])
-            assert (await asyncio.wait_for(robot.receive(), 20)).data == b"to receive"
+            assert (await asyncio.wait_for(robot.receive(), PATIENCE_S)).data == b"to receive"
         assert heard == [b"to the callback"]
 
 

@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,19 +18,12 @@ from bridge.audit import AuditFile, who
 from bridge.audit.writer import WAITING, older_files
 from bridge.headset.client import Headset
 from macs_zenoh.errors import ConfigError, MacsError
-from tests.support import waiting
 from tests.support.programs import ROOT, Program, ended, free_port
+from tests.support.waiting import until
 
 
 def lines_of(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for file in (*older_files(path), path) for line in file.read_bytes().splitlines()]
-
-
-def until(condition: Any, seconds: float = 20.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 async def verified(path: Path, *more: str) -> tuple[int | None, dict[str, Any]]:
@@ -62,7 +54,7 @@ async def test_a_gateway_keeps_a_record(gateway: tuple[Program, Path]) -> None:
         await headset.subscribe("/chatter", "std_msgs/String", agents=[1])
         await headset.online()
         agent = f"unity/{headset.id}"
-    until(lambda: any(line["event"] == "left" for line in lines_of(path)))
+    await until(lambda: any(line["event"] == "left" for line in lines_of(path)))
     assert await one.stop() == 0
     told = [(line["event"], line["by"].get("agent"), line["what"]) for line in lines_of(path)]
     assert told[0][0] == "started"
@@ -84,7 +76,7 @@ async def test_a_killed_gateway_goes_on_with_its_chain(gateway: tuple[Program, P
     """Killed in the middle of a line and started again it continues, and verify tells of both."""
     one, path = gateway
     async with await Headset.connect("127.0.0.1", one.port):
-        until(lambda: any(line["event"] == "joined" for line in lines_of(path)))
+        await until(lambda: any(line["event"] == "joined" for line in lines_of(path)))
         one.send_signal(signal.SIGKILL)
         await one.wait()
     with path.open("ab") as file:
@@ -118,8 +110,8 @@ async def test_tokens_are_in_the_record(tmp_path: Path, monkeypatch: pytest.Monk
             for argv in (["change", "anna", "--may", "see"], ["revoke", "anna"]):
                 code, _, errors = await ended("token", *argv)
                 assert code == 0, errors
-                until(lambda word=argv[0][:6]: any(word in event or "ended" in event for event, _ in events()))
-        until(lambda: ("left", "anna") in events())
+                await until(lambda word=argv[0][:6]: any(word in event or "ended" in event for event, _ in events()))
+        await until(lambda: ("left", "anna") in events())
     assert ("refused", None) in events()
     told = [each for each in events() if each[1] == "anna"]
     assert told[:2] == [("token_created", "anna"), ("joined", "anna")]
@@ -156,7 +148,7 @@ async def test_kills_while_writing(tmp_path: Path) -> None:
     for round_ in range(6):
         process = writer(path, "p", 50_000, 1_000_000)
         before = path.stat().st_size + len(older_files(path))
-        until(lambda before=before: path.exists() and path.stat().st_size + len(older_files(path)) != before)
+        await until(lambda before=before: path.exists() and path.stat().st_size + len(older_files(path)) != before)
         await asyncio.sleep(0.05 * round_)
         process.kill()
         process.wait()
@@ -180,13 +172,13 @@ async def test_several_programs_write_one_record(tmp_path: Path) -> None:
     assert {line["program"] for line in lines_of(path)} == {"p0", "p1", "p2"}
 
 
-def test_only_so_many_files_are_kept(tmp_path: Path) -> None:
+async def test_only_so_many_files_are_kept(tmp_path: Path) -> None:
     """The oldest are removed, the newest stay."""
     path = tmp_path / "audit.jsonl"
     audit = AuditFile(path, "p", max_bytes=4096, keep=2)
     for number in range(200):
         audit.record("joined", who(f"unity/{number}"), "y" * 100)
-        until(lambda: not audit._notes)
+        await until(lambda: not audit._notes)
     audit.close()
     assert len(older_files(path)) == 2
     numbers = [line["n"] for line in lines_of(path)]
@@ -217,12 +209,12 @@ async def test_a_full_disk(small_disk: Path, caplog: pytest.LogCaptureFixture) -
     for number in range(WAITING + 2000):
         audit.record("joined", who(f"unity/{number}"), "z" * 50)
         if number == 500:
-            until(lambda: "audit_waiting" in audit.troubles())
+            await until(lambda: "audit_waiting" in audit.troubles())
     assert lost[0] > 0
     assert path.read_bytes().endswith(b"\n")  # nothing half is left
     assert [record.levelname for record in caplog.records if record.name == "macs.audit"] == ["ERROR"]
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
-    until(lambda: not audit._notes)
+    await until(lambda: not audit._notes)
     audit.record("left", who("unity/1"))
     audit.close()
     code, said = await verified(path)
@@ -245,7 +237,7 @@ async def test_a_gateway_on_a_full_disk(small_disk: Path, tmp_path: Path) -> Non
                 await headset.subscribe("/chatter", "std_msgs/String", agents=[1])
                 headset.forget(headset.nodes[0])
             await headset.online()
-            await waiting.until(lambda: any("cannot be written" in line for line in one.log))
+            await until(lambda: any("cannot be written" in line for line in one.log))
             _, out, _ = await ended("doctor", "-e", endpoint, "--json")
             assert "audit_waiting" in out
 
@@ -294,7 +286,7 @@ async def test_a_file_that_is_cut_under_a_running_program(tmp_path: Path) -> Non
     audit = AuditFile(path, "p")
     for number in range(10):
         audit.record("joined", who(f"unity/{number}"))
-    until(lambda: path.read_bytes().count(b"\n") == 11)
+    await until(lambda: path.read_bytes().count(b"\n") == 11)
     os.truncate(path, path.read_bytes().index(b"\n") + 1)
     audit.record("left", who("unity/1"))
     audit.close()

@@ -53,7 +53,7 @@ class Raw:
     """A TCP agent that sends whatever it is told to."""
 
     def __init__(self, port: int, agent_type: int = 2, group: int = 0) -> None:
-        self.socket = socket.create_connection(("127.0.0.1", port), timeout=20)
+        self.socket = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
         self.decoder = MessageDecoder()
         self.messages: list[tuple[Metadata, bytes]] = []
         self.socket.sendall(encode_frame(management=encode_management(Configuration(agent_type, 0, group))))
@@ -70,7 +70,7 @@ class Raw:
                 for message in self.decoder.feed(data):
                     metadata, body = split_message(message)
                     self.messages.append((Metadata.decode(metadata), bytes(body)))
-        self.socket.settimeout(20)
+        self.socket.settimeout(PATIENCE_S)
         return self.messages
 
     def refusals(self) -> list[NodeRefused]:

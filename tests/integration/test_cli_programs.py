@@ -205,7 +205,7 @@ async def test_a_waiting_gateway_stops_too(endpoint: str) -> None:
         stderr=asyncio.subprocess.PIPE,
     )
     assert process.stderr is not None
-    assert endpoint in (await asyncio.wait_for(process.stderr.readline(), 20)).decode()
+    assert endpoint in (await asyncio.wait_for(process.stderr.readline(), PATIENCE_S)).decode()
     process.send_signal(signal.SIGTERM)
     assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
 
@@ -223,10 +223,10 @@ async def test_an_interrupted_question_is_130(verb: str, number: signal.Signals)
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
         )
-        begun, _ = await asyncio.wait_for(asyncio.get_running_loop().sock_accept(says_nothing), 20)
+        begun, _ = await asyncio.wait_for(asyncio.get_running_loop().sock_accept(says_nothing), PATIENCE_S)
         process.send_signal(number)
         begun.close()
-    assert await asyncio.wait_for(process.communicate(), 20) == (b"", b"")
+    assert await asyncio.wait_for(process.communicate(), PATIENCE_S) == (b"", b"")
     assert process.returncode == 130
 
 
@@ -262,7 +262,7 @@ async def test_up_runs_router_and_gateway(endpoint: str) -> None:
     assert process.stdout is not None
     shown = b""
     while b"A Unity headset connects" not in shown:
-        line = await asyncio.wait_for(process.stdout.readline(), 20)
+        line = await asyncio.wait_for(process.stdout.readline(), PATIENCE_S)
         assert line, (await process.communicate())[1].decode()
         shown += line
     async with await Headset.connect("127.0.0.1", port) as headset:
@@ -286,7 +286,7 @@ async def test_up_once_gives_up() -> None:
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
     )
-    _, errors = await asyncio.wait_for(process.communicate(), 30)
+    _, errors = await asyncio.wait_for(process.communicate(), PATIENCE_S)
     assert process.returncode == 1
     last = errors.decode().splitlines()[-1]
     assert last == f"macs up: not ready within 3 s: gateway, agent; is there a router at {nowhere}?"
@@ -312,6 +312,6 @@ async def test_zenohs_log_stays_out_of_the_data(endpoint: str) -> None:
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
         )
-        out, errors = await asyncio.wait_for(process.communicate(), 20)
+        out, errors = await asyncio.wait_for(process.communicate(), PATIENCE_S)
         assert json.loads(out) == []
         assert b"DEBUG" in errors

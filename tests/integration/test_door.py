@@ -25,13 +25,15 @@ import aiohttp
 import pytest
 
 from bridge.gateway import Gateway
+from bridge.gateway.admission import Churn
 from bridge.headset import frames
 from bridge.headset.client import Headset
 from bridge.headset.frames import NodeSpec
 from bridge.headset.stream import Way, open_stream
 from bridge.tokens import store
-from macs_zenoh.agent import Agent, join
+from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Refused, Unreachable
+from macs_zenoh.joining import join
 from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.messages import (
     ROS,
@@ -108,6 +110,10 @@ class Door(NamedTuple):
         number, way = self.way(port)
         return await Headset.connect("127.0.0.1", number, token=token, way=way, **options)  # type: ignore[arg-type]
 
+    def know(self, *agents: tuple[int, int]) -> bool:
+        """Whether both gateways see these agents (type, id) online."""
+        return all(agent in gateway.directory for gateway in (self.gateway, self.other) for agent in agents)
+
 
 StartDoor = Callable[..., Awaitable[Door]]
 
@@ -148,17 +154,16 @@ async def test_each_port_leads_to_the_same_agents(start_door: StartDoor, port: s
     """A headset that came by TLS or WebSocket and one that came plainly send each other anything, small and large."""
     door = await start_door(web_without_token="everybody")
     async with await door.come(port, group=3) as one, await Headset.connect("127.0.0.1", door.gateway.port) as two:
-        await until(lambda: len([*door.gateway.agents.online(), *door.other.agents.online()]) == 2)
-        await asyncio.sleep(0.2)
+        await until(lambda: door.know((UNITY, one.id), (UNITY, two.id)))
         for size in (0, 1, 125, 126, 65_535, 65_536, 3 << 20):
             data = os.urandom(size)
             await one.send(data, to=UNITY, ids=[two.id])
-            assert (await two.receive(10)).data == data
+            assert (await two.receive(PATIENCE_S)).data == data
             await two.send(data, to=UNITY, ids=[one.id])
-            assert (await one.receive(10)).data == data
+            assert (await one.receive(PATIENCE_S)).data == data
         for number in range(2000):
             await one.send(b"%d" % number, to=UNITY, ids=[two.id])
-        assert [int((await two.receive(10)).data) for _ in range(2000)] == list(range(2000))
+        assert [int((await two.receive(PATIENCE_S)).data) for _ in range(2000)] == list(range(2000))
 
 
 @pytest.mark.parametrize("port", PORTS)
@@ -192,13 +197,13 @@ async def test_a_token_is_held_to_its_rights(start_door: StartDoor, robots: list
         robot.on_message(lambda message, number=robot.id: heard[number].append(bytes(message.data)))
     token = door.tokens.make("anna", may=["ask", "send"], robots=[1], groups=[3])
     async with await door.come(port, token) as anna, await door.come(port, token) as bert:
-        await asyncio.sleep(0.3)
+        await until(lambda: door.know((ROS, 1), (ROS, 2), (UNITY, anna.id), (UNITY, bert.id)))
         await anna.send(b"allowed", to=ROS, ids=[1])
         for forbidden in ({"ids": [2]}, {"ids": [1, 2]}, {"groups": [4]}, {"ids": [1], "groups": [4]}):
             await anna.send(b"forbidden", to=ROS, **forbidden)  # type: ignore[arg-type]
         await anna.send(b"forbidden")  # to everybody
         await anna.send(b"hello", to=UNITY, ids=[bert.id])
-        assert (await bert.receive(5)).data == b"hello"
+        assert (await bert.receive(PATIENCE_S)).data == b"hello"
         await anna.send(b"last", to=ROS, ids=[1])
         await until(lambda: b"last" in heard[1])
         assert heard == {1: [b"allowed", b"last"], 2: []}
@@ -260,7 +265,7 @@ async def test_each_right_holds_on_each_port(start_door: StartDoor, robots: list
             for headset, count in ((one, 3), (two, 1)):
                 reasons: set[str] = set()
                 while len(reasons) < count:
-                    message = await headset.receive(10)
+                    message = await headset.receive(PATIENCE_S)
                     if message.metadata.message_manager == NodeRefused.manager:
                         reasons.add(decode_data(NodeRefused, message.data).reason)
             await asyncio.sleep(0.1)
@@ -280,7 +285,7 @@ async def test_a_revoked_token_ends_its_connections(start_door: StartDoor) -> No
         stays = [await stack.enter_async_context(await door.come(port, kept)) for port in PORTS]
         began = time.monotonic()
         door.tokens.revoke("lost")
-        reasons = await asyncio.wait_for(asyncio.gather(*(headset.wait_ended() for headset in gone)), 30)
+        reasons = await asyncio.wait_for(asyncio.gather(*(headset.wait_ended() for headset in gone)), PATIENCE_S)
         took_s = time.monotonic() - began
         assert set(reasons) == {"this token holds no longer"}
         print(f"100 connections ended {took_s:.2f} s after their token")
@@ -297,7 +302,7 @@ async def test_changed_rights_hold_at_once(start_door: StartDoor, robots: list[A
     robots[0].on_message(lambda message: heard.append(bytes(message.data)))
     token = door.tokens.make("anna", may=["ask"], robots=[1])
     async with await door.come("plain", token) as anna:
-        await asyncio.sleep(0.3)
+        await until(lambda: door.know((ROS, 1), (UNITY, anna.id)))
 
         async def change(may: list[str]) -> None:
             def edit(now):  # type: ignore[no-untyped-def]
@@ -305,7 +310,7 @@ async def test_changed_rights_hold_at_once(start_door: StartDoor, robots: list[A
                 return now.with_token(Token(name="anna", rights=rights, hashes=now.named("anna").hashes)), None
 
             store.change(door.tokens.path, edit)
-            while (message := await anna.receive(5)).metadata.message_manager != AccessRefused.manager or (
+            while (message := await anna.receive(PATIENCE_S)).metadata.message_manager != AccessRefused.manager or (
                 decode_data(AccessRefused, message.data).kind != "changed"
             ):
                 pass
@@ -376,7 +381,7 @@ async def test_a_new_certificate_is_shown_without_a_restart(start_door: StartDoo
         except Unreachable:
             return False
 
-    deadline = time.monotonic() + 5
+    deadline = time.monotonic() + PATIENCE_S
     while not await shown():
         assert time.monotonic() < deadline
     with pytest.raises(Unreachable):
@@ -410,7 +415,7 @@ async def test_programs_keep_to_tokens(router: str, tokens: Tokens, tmp_path: Pa
         assert json.loads(out)["refused"] == "robot 1 is not among the robots of this token"
         anna = [await Headset.connect("127.0.0.1", gateway.port, token=secret) for _ in range(8)]
         tokens.revoke("anna")
-        reasons = await asyncio.wait_for(asyncio.gather(*(headset.wait_ended() for headset in anna)), 30)
+        reasons = await asyncio.wait_for(asyncio.gather(*(headset.wait_ended() for headset in anna)), PATIENCE_S)
         assert set(reasons) == {"this token holds no longer"}
         for headset in anna:
             await headset.close()
@@ -562,7 +567,7 @@ async def test_a_bad_websocket_costs_its_own_connection(start_door: StartDoor, w
         for piece in BAD_WEBSOCKETS[what]:
             writer.write(piece)
         with contextlib.suppress(ConnectionError):
-            await asyncio.wait_for(reader.read(), 10)  # to the end
+            await asyncio.wait_for(reader.read(), PATIENCE_S)  # to the end
         writer.close()
         await neighbour.online()
         await until(lambda: len(door.gateway.agents) == 1)
@@ -588,7 +593,7 @@ async def test_slow_headers_get_their_time_and_no_more(start_door: StartDoor, mo
         writer.close()
         ended.append(beginning)
 
-    await asyncio.wait_for(asyncio.gather(*map(slow, beginnings)), 20)
+    await asyncio.wait_for(asyncio.gather(*map(slow, beginnings)), PATIENCE_S)
     assert len(ended) == len(beginnings)
     async with await door.come("web") as headset:
         await headset.online()
@@ -625,10 +630,11 @@ async def test_a_robot_whose_token_makes_it_none_is_told_of(
 @pytest.mark.timeout(600)
 @pytest.mark.alone
 async def test_ten_thousand_attempts_leave_nothing_behind(
-    start_door: StartDoor, caplog: pytest.LogCaptureFixture
+    start_door: StartDoor, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without, with ended, revoked, cut-off and foreign tokens: none gets in, no memory stays, and the log counts."""
     began = time.monotonic()
+    monkeypatch.setattr(Churn, "FREE", 1_000_000)  # that they are greeted later and later is a test of its own
     door = await start_door(**NOBODY)
     good = door.tokens.make("good")
     wrong = [
@@ -697,7 +703,7 @@ async def test_what_is_no_request_is_answered_and_counted(
     ]:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(data)
-        assert b" 40" in (await asyncio.wait_for(reader.readline(), 10))
+        assert b" 40" in (await asyncio.wait_for(reader.readline(), PATIENCE_S))
         writer.close()
     assert door.gateway.drops["bad_http"] >= 2
     assert not [record for record in caplog.records if record.levelname == "ERROR"]

@@ -35,7 +35,8 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.routing import call, unicast_key
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.support.given import Connect, StartGateway
-from tests.support.waiting import until
+from tests.support.matching import matched
+from tests.support.waiting import PATIENCE_S, until
 
 TYPES = {"nd__chatter": "std_msgs/String", "nd__cmd": "std_msgs/String", "nd__set": "std_srvs/SetBool"}
 TYPES["nd__serve"] = "std_srvs/SetBool"
@@ -368,7 +369,7 @@ async def test_a_tcp_agent_deafens_nobody(kind: int, stage: tuple[Gateway, Heads
             *registration(other.id, robot.id, "nd__x", 1, **{"dataExchangeType": "std_msgs/String", **fields})
         )
     other.manage(*registration(other.id, robot.id, "nd__serve", 4))
-    await asyncio.wait_for(other.writer.drain(), 30)
+    await asyncio.wait_for(other.writer.drain(), PATIENCE_S)
     other.say(UNITY, [headset.id], b"{}", messageManager="Finished")
     await until(lambda: headset.deaf or headset.got[-1][0]["messageManager"] == "Finished", 60)
     other.writer.close()
@@ -461,7 +462,8 @@ async def test_what_its_own_robot_says_is_of_its_type(
             await until(lambda: (ROS, agent.id) in gateway.directory)
             headset.register(agent.id)
             await until(lambda: any(key.startswith(f"macs/from/ros/{agent.id}/") for key in gateway._delivery.streams))
-            await asyncio.sleep(0.2)  # the subscription reaches the robot
+            for key in list(gateway._delivery.streams):
+                await matched(agent.mesh, key)
         by, session = (agent.id, agent.mesh) if way == "agent" else (robot.id, mesh)
         put = session.put if way != "TCP" else lambda _key, frame: robot.writer.write(frame)
 
@@ -507,7 +509,7 @@ async def test_the_gateway_answers_for_an_existing_robot(
     told = {"agentType": ROS, "agentId": robot.id, "groupId": GROUP_ID, "requestId": 1}
     robot.manage("AgentclientConfigurer", {**told, "functionality": {**OFFERS, "publishers": {"/a": "b/msg/C"}}})
     robot.say(UNITY, [asking.id], b"{}", messageManager="Configured")
-    assert (await asking.receive(5)).metadata.message_manager == "Configured"
+    assert (await asking.receive(PATIENCE_S)).metadata.message_manager == "Configured"
     assert json.loads(await asking.ask(robot.id, "FunctionalityGetter"))["publishers"] == {"/a": "b/msg/C"}
     for manager in ("RobotStatus", "RobotControl", "MyOwn"):
         with pytest.raises(Refused, match=f"does not survive messages of {manager}"):

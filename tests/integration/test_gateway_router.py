@@ -13,7 +13,7 @@ from benchmarks.headset import Headset
 from bridge.headset import frames
 from macs_zenoh.config import MeshSettings
 from tests.support.programs import Program, ended, free_port
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 
 @pytest.mark.parametrize("namespace", [None, "site1"])
@@ -31,7 +31,7 @@ async def test_agents_and_headsets_reach_each_other_through_it(namespace: str | 
             headset.socket.sendall(question)
             await until(lambda: bool(got))
             robot.reply(got[0], b'{"answer": 1}')
-            headset.socket.settimeout(10)
+            headset.socket.settimeout(PATIENCE_S)
             answer = bytearray()
             while b'{"answer": 1}' not in answer:
                 answer += await asyncio.to_thread(headset.socket.recv, 65536)

@@ -117,7 +117,7 @@ class Process:
     async def line(self) -> dict[str, Any]:
         """Its next line on stdout."""
         assert self.process.stdout is not None
-        text = await asyncio.wait_for(self.process.stdout.readline(), 20)
+        text = await asyncio.wait_for(self.process.stdout.readline(), PATIENCE_S)
         assert text, (await self.process.communicate())[1].decode()
         value: dict[str, Any] = json.loads(text)
         return value
@@ -131,7 +131,7 @@ class Process:
         """Close its stdin; its exit code, the lines not read yet, and its log."""
         assert self.process.stdin is not None
         self.process.stdin.close()
-        out, log = await asyncio.wait_for(self.process.communicate(), 30)
+        out, log = await asyncio.wait_for(self.process.communicate(), PATIENCE_S)
         return self.process.returncode or 0, [json.loads(line) for line in out.splitlines()], log.decode()
 
 

@@ -15,8 +15,8 @@ from macs_zenoh.protocol.messages import Metadata
 from macs_zenoh.protocol.rate_limit import Flow, Pace, Passing
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import encode_frame, encode_message
-from tests.integration.test_gateway import Socket, socket
 from tests.support.given import Connect, StartGateway
+from tests.support.sockets import Socket, socket
 from tests.support.waiting import until
 
 MOVE, STOP = ("nd__cmd_vel", "geometry_msgs/Twist"), ("nd__emergency_stop", "std_msgs/Bool")

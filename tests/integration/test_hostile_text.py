@@ -20,7 +20,7 @@ from macs_zenoh.protocol.messages import Metadata
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.integration.test_bounds import Raw
 from tests.support.programs import Program, ended, free_port
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 EVIL = "x\x1b[2J\x1b]0;owned\x07\r\n12:00:00 I macs.gateway: all is well\x9b31m\u202e\x7f"
 
@@ -119,7 +119,7 @@ async def test_every_program_filters_what_it_shows(endpoint: str) -> None:
         ):
             await raw.send(message)
         await raw.send(encode_frame(2, [headset.id], message=encode_message(Metadata(2, 0, 0, "Hello").encode())))
-        while (await asyncio.wait_for(headset.receive(), 20)).metadata.message_manager != "Hello":
+        while (await asyncio.wait_for(headset.receive(), PATIENCE_S)).metadata.message_manager != "Hello":
             pass
         raw.socket.close()
     for line in [*gateway.log, *router.log]:

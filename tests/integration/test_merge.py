@@ -265,7 +265,7 @@ def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 async def next_with(headset: Headset, data: bytes) -> Incoming:
     """The next message with this data; others, as the router's own, are passed over."""
-    while (message := await headset.receive(5)).data != data:
+    while (message := await headset.receive(PATIENCE_S)).data != data:
         pass
     return message
 
@@ -327,7 +327,7 @@ async def test_both_sites_have_leased_the_same_block(sites: Sites, later_keeps: 
         for stream in streams[site]:
             await asyncio.wait_for(heard(robots[site], stream, b"parted"), PATIENCE_S)
         await headsets[site][0].send(b"inside", to=UNITY, ids=[2])
-        assert (await headsets[site][1].receive(5)).data == b"inside"
+        assert (await headsets[site][1].receive(PATIENCE_S)).data == b"inside"
 
     met_at = await sites.meet()
     keeps, moves = ("b", "a") if later_keeps else ("a", "b")
@@ -344,7 +344,7 @@ async def test_both_sites_have_leased_the_same_block(sites: Sites, later_keeps: 
         assert robot.registrants == {(NodeType.SUBSCRIBER, "nd__chatter"): {first.id, second.id}}
         await first.send(b"by id", to=UNITY, ids=[second.id])
         assert (await next_with(second, b"by id")).sender_id == first.id
-        assert await first.call("/set", "std_srvs/SetBool", robot.agent.id, b"1", timeout_s=PATIENCE_S) == b"done: 1"
+        assert await first.call("/set", "std_srvs/SetBool", robot.agent.id, b"1") == b"done: 1"
     await headsets[moves][0].send(b"group", to=UNITY, groups=[3])
     for headset in (headsets[moves][1], *headsets[keeps]):
         assert (await next_with(headset, b"group")).sender_id == headsets[moves][0].id
@@ -361,7 +361,7 @@ async def test_an_answer_to_the_former_id_arrives(sites: Sites) -> None:
     robot.answer_after = asyncio.Event()
     await sites.headset(here)
     headset = await sites.headset(there)
-    calling = asyncio.ensure_future(headset.call("/set", "std_srvs/SetBool", 1002, b"1", timeout_s=20))
+    calling = asyncio.ensure_future(headset.call("/set", "std_srvs/SetBool", 1002, b"1"))
     await until(lambda: robot.registrants.get((NodeType.CLIENT, "nd__set")) == {1})
     await sites.right(await sites.meet(), [(1, 1002), (2, 1), (2, 256)], [here, there])
     await until(lambda: headset.id == 256)
@@ -467,13 +467,13 @@ async def test_an_agent_uses_robots_under_its_new_id(sites: Sites) -> None:
                     pass
                 return
 
-    await asyncio.wait_for(heard(b"parted"), 20)
+    await asyncio.wait_for(heard(b"parted"), PATIENCE_S)
     assert await two.call_service("/set", b"x", robot=1002, type="std_srvs/SetBool") == b"done: x"
     await sites.meet()
     await until(lambda: two.id != one.id)
     topic, service = (NodeType.SUBSCRIBER, "nd__chatter"), (NodeType.CLIENT, "nd__set")
     await until(lambda: robot.registrants == {topic: {two.id}, service: {two.id}})
-    await asyncio.wait_for(heard(b"together"), 20)
+    await asyncio.wait_for(heard(b"together"), PATIENCE_S)
     assert await two.call_service("/set", b"y", robot=1002) == b"done: y"
 
 

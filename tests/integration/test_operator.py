@@ -15,9 +15,9 @@ import pytest
 
 import macs_zenoh
 from macs_zenoh.errors import Refused
-from tests.integration.test_gateway import socket
 from tests.support.given import Connect, StartGateway
 from tests.support.programs import ROOT, ended, macs
+from tests.support.sockets import socket
 from tests.support.waiting import PATIENCE_S, until
 
 MANY = 12

@@ -28,9 +28,9 @@ from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import type_number
 from macs_zenoh.protocol.messages import Metadata, decode_data, encode_data
 from macs_zenoh.protocol.wire import encode_frame, encode_message
-from tests.integration.test_gateway import Socket, socket
 from tests.support.programs import ROOT, Program, ended, free_port, macs
-from tests.support.waiting import until
+from tests.support.sockets import Socket, socket
+from tests.support.waiting import PATIENCE_S, until
 
 EXAMPLES = ROOT / "examples"
 PAGE = (ROOT / "docs" / "managers.md").read_text(encoding="utf-8")
@@ -158,7 +158,7 @@ async def test_a_wrong_settings_file_stops_the_start(tmp_path: Path) -> None:
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
         stderr=asyncio.subprocess.PIPE,
     )
-    _, errors = await asyncio.wait_for(process.communicate(), 20)
+    _, errors = await asyncio.wait_for(process.communicate(), PATIENCE_S)
     assert (process.returncode, "ClockComparer must live in a module called clock_comparer" in errors.decode()) == (
         2,
         True,

@@ -10,6 +10,7 @@ import macs_zenoh
 from bridge.gateway.server import Gateway
 from bridge.headset.client import Headset
 from tests.support.given import Connect, StartGateway
+from tests.support.waiting import PATIENCE_S
 
 
 async def test_what_waits_beyond_its_limit_is_dropped_and_the_connection_stays(
@@ -29,7 +30,7 @@ async def test_what_waits_beyond_its_limit_is_dropped_and_the_connection_stays(
                 break
         assert "counted as outbox_full" in caplog.text
         headset.resume()
-        received = [int.from_bytes((await asyncio.wait_for(headset.receive(), 20)).data[:4], "big") for _ in range(5)]
+        received = [int.from_bytes((await headset.receive(PATIENCE_S)).data[:4], "big") for _ in range(5)]
     assert received == list(range(5))  # those that waited, in order
     assert number in (await headset.online()).unity_agent_ids
     assert headset.id == number

@@ -32,8 +32,8 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.routing import call, unicast_key
 from macs_zenoh.protocol.wire import PROBE, encode_frame, encode_message
 from macs_zenoh.streams import Streams
-from tests.integration.test_gateway import Socket, socket
 from tests.support.given import Connect, StartGateway
+from tests.support.sockets import Socket, socket
 from tests.support.waiting import PATIENCE_S, until
 
 TEXT = CDR + b"\x05\x00\x00\x00text\x00"
@@ -107,7 +107,7 @@ async def test_messages_of_an_unknown_node_go_through(start_gateway: StartGatewa
         metadata = Metadata(1, robot.id, 0, "", NodeType.CLIENT, "nd__set", "std_srvs/SetBool").encode()
         robot.writer.write(encode_frame(2, (listener.id,), message=encode_message(metadata, b"answer")))
         await talker.send(json.dumps({"after": True}).encode(), ids=[listener.id], manager="Greeting")
-        heard = [await listener.receive(5), await listener.receive(5)]
+        heard = [await listener.receive(PATIENCE_S), await listener.receive(PATIENCE_S)]
         assert sorted(bytes(message.data) for message in heard) == [b"answer", b'{"after": true}']
 
 
@@ -271,7 +271,7 @@ async def test_a_registration_for_somebody_else_is_refused(router: str, start_ga
         async def ask(verb: str, node: AddNode | RemoveNode, caller: int) -> None:
             metadata = Metadata(UNITY, caller, message_manager=node.manager)
             key, frame = call((ROS, robot.id), verb, (UNITY, caller), encode_data(node), metadata)
-            deadline = time.monotonic() + 5
+            deadline = time.monotonic() + PATIENCE_S
             while True:
                 try:
                     await mesh.query(key, frame, timeout_s=PATIENCE_S)
@@ -304,7 +304,7 @@ async def test_a_probe_is_no_loss(router: str, start_gateway: StartGateway, conn
         mesh.put(BROADCAST.of(from_type=UNITY, from_id=last), PROBE)
         message = encode_message(Metadata(message_manager="Greeting").encode(), b"next")
         mesh.put(unicast_key(UNITY, headset.id, UNITY, last), encode_frame(UNITY, message=message))
-        assert bytes((await headset.receive(5)).data) == b"next"
+        assert bytes((await headset.receive(PATIENCE_S)).data) == b"next"
         assert gateway.drops == {"wrong_sender": 1}  # the greeting named nobody
 
 
@@ -347,7 +347,7 @@ async def test_a_silent_agent_is_away_and_stays(
             return ping.decode(await mesh.query(PING.of(zid=gateway.mesh.zid), b"", timeout_s=PATIENCE_S))[0].away
 
         await until(lambda: gateway.agents.find(UNITY, taken_off.id))
-        deadline = time.monotonic() + 5
+        deadline = time.monotonic() + PATIENCE_S
         while await told() != away:
             assert time.monotonic() < deadline
         assert lively.connected

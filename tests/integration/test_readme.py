@@ -49,7 +49,7 @@ async def test_the_example_runs(tmp_path: Path) -> None:
     ):
         process = await started(program)
         assert process.stdout is not None
-        hello = await asyncio.wait_for(headset.receive(), 20)
+        hello = await asyncio.wait_for(headset.receive(), PATIENCE_S)
         assert (hello.sender_type, hello.sender_id, hello.data) == ("ros", 7, b"robot 7 is here")
 
         assert await headset.call("ros", 7, "battery") == b"87 %"
@@ -69,7 +69,7 @@ async def test_the_example_misses_its_router(tmp_path: Path) -> None:
     program.write_text(the_example().replace(LOCAL_ROUTER, endpoint))
     process = await started(program)
     assert process.stderr is not None
-    said = (await asyncio.wait_for(process.stderr.readline(), 20)).decode()
+    said = (await asyncio.wait_for(process.stderr.readline(), PATIENCE_S)).decode()
     assert said == f"no router at {endpoint} yet; waiting for it\n"
     assert await interrupted(process) == ""
 

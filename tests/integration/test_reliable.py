@@ -33,6 +33,7 @@ from macs_zenoh.protocol.named import Outcome
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.serving import Call
 from macs_zenoh.streams import Streams
+from tests.support.matching import matched
 from tests.support.programs import free_port
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
@@ -227,7 +228,7 @@ async def test_replies_that_there_was_no_room_for_are_asked_for_again(
 async def test_the_last_message_before_silence_is_recovered(routers: Routers) -> None:
     """A message that is put while there is no router, and that nothing follows, arrives when there is one again."""
     async with robot_and_receiver(routers, KEEP_ALL) as (source, _, kept, _):
-        await asyncio.sleep(0.3)
+        await matched(source, KEPT)
         await routers.kill()
         await until(lambda: not source.linked)
         for number in range(3):  # the first messages that this source puts at all
@@ -257,7 +258,8 @@ async def test_other_keys_are_not_kept(routers: Routers) -> None:
     async with robot_and_receiver(routers, rules) as (source, receiver, kept, _):
         commands = Numbers()
         receiver.subscribe(command, commands.take, reliable=True)
-        await asyncio.sleep(0.3)
+        for key in (KEPT, command):
+            await matched(source, key)
         await routers.kill()
         await until(lambda: not source.linked)
         source.put(command, b"old", Traffic.COMMAND)

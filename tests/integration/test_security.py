@@ -308,7 +308,7 @@ async def test_presence_by_role(site: Site) -> None:
             while (
                 not found >= who
             ):  # a router tells subscribers of a token a moment before it answers questions for it
-                answers = {watcher: await watches[watcher].tokens(key, timeout_s=20) for watcher in names}
+                answers = {watcher: await watches[watcher].tokens(key, timeout_s=PATIENCE_S) for watcher in names}
                 found = {watcher for watcher, answer in answers.items() if answer}
             assert found == who, (name, key)
         for declared in tokens + watching:
@@ -450,7 +450,7 @@ async def test_a_client_that_says_it_is_a_router_may_no_more(site: Site) -> None
             await asyncio.sleep(0.05)
         assert {bytes(payload) for _, payload in (*stream, *inbox)} == {b"true"}
         assert {bytes(payload) for got in taken for _, payload in got} == {b"forged", b"x"}  # its own
-        assert await anna.tokens("macs/live/**", timeout_s=20) == ["macs/live/ros/8/3/a8"]
+        assert await anna.tokens("macs/live/**", timeout_s=PATIENCE_S) == ["macs/live/ros/8/3/a8"]
         for token in tokens:
             token.close()
 
@@ -937,9 +937,9 @@ async def test_a_check_that_was_stopped_is_none_that_went_well(how: signal.Signa
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.DEVNULL,
         )
-        begun, _ = await asyncio.wait_for(asyncio.get_running_loop().sock_accept(says_nothing), 30)
+        begun, _ = await asyncio.wait_for(asyncio.get_running_loop().sock_accept(says_nothing), PATIENCE_S)
         process.send_signal(how)
-        assert await asyncio.wait_for(process.wait(), 30) == 130
+        assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 130
         begun.close()
 
 

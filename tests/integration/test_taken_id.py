@@ -18,17 +18,13 @@ from macs_zenoh.locked_out import apart
 from macs_zenoh.mesh import Mesh
 from tests.support.links import counted
 from tests.support.routers import Router
-from tests.support.waiting import until
+from tests.support.thieves import notice_soon, stolen, zenoh_id
+from tests.support.waiting import PATIENCE_S, until
 
 
 @pytest.fixture(autouse=True)
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(locked_out, "PATIENCE_S", 0.5)
-    monkeypatch.setattr(locked_out, "AGAIN_S", 0.1)
-
-
-def zenoh_id(mesh: Mesh) -> str:
-    return str(mesh._session.zid())
+    notice_soon(monkeypatch)
 
 
 async def test_a_gateway_goes_on_under_another_id(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,21 +40,17 @@ async def test_a_gateway_goes_on_under_another_id(monkeypatch: pytest.MonkeyPatc
     async with Router() as router, counted(router.endpoint) as link:
         settings = Settings(mesh=MeshSettings(connect=[link.endpoint]), gateway=GatewaySettings(port=0))
         running = asyncio.create_task(verb._serve(settings))
-        await until(lambda: made and made[0].port, 60)
+        await until(lambda: made and made[0].port)
         port, before = made[0].port, zenoh_id(made[0].mesh)
         headset = await Headset.connect("127.0.0.1", port, reconnect=True)
-        link.cut()
-        await until(lambda: not made[0].mesh.linked, 60)
-        thief = MeshSettings(connect=[router.endpoint], overrides=[f'id:"{before}"'])
-        async with await Mesh.open(thief):
-            link.mend()
-            await until(lambda: len(made) == 2 and made[1].port, 60)
+        async with stolen(made[0].mesh, link, router.endpoint):
+            await until(lambda: len(made) == 2 and made[1].port)
             assert made[1].port == port
             assert zenoh_id(made[1].mesh) != before
-            await until(lambda: headset.connected and made[1].agents, 60)
+            await until(lambda: headset.connected and made[1].agents)
             async with await Headset.connect("127.0.0.1", port) as other:
                 await headset.send(b"still here", to=2, ids=[other.id], manager="Hi")
-                assert (await asyncio.wait_for(other.receive(), 30)).data == b"still here"
+                assert (await asyncio.wait_for(other.receive(), PATIENCE_S)).data == b"still here"
         await headset.close()
         running.cancel()
         await asyncio.wait([running])
@@ -78,10 +70,10 @@ async def test_an_id_that_was_chosen_is_kept(tmp_path: Path, where: str) -> None
             noticed = asyncio.create_task(locked_out.locked_out(mesh))
             ours = asyncio.create_task(locked_out.locked_out(mesh, any_id=True))
             link.cut()
-            await until(lambda: not mesh.linked, 60)
+            await until(lambda: not mesh.linked)
             async with await Mesh.open(MeshSettings(connect=[router.endpoint], overrides=['id:"abc123"'])):
                 link.mend()
-                await asyncio.wait_for(ours, 60)  # who made the id up himself wants another one
+                await asyncio.wait_for(ours, PATIENCE_S)  # who made the id up himself wants another one
                 assert not noticed.done()
             noticed.cancel()
 

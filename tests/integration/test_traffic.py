@@ -28,12 +28,12 @@ from macs_zenoh.protocol.messages import Metadata, NodeRefused, NodeType, Stream
 from macs_zenoh.protocol.named import Outcome
 from macs_zenoh.protocol.policing import BURST_S
 from macs_zenoh.protocol.wire import encode_frame, encode_message, parse_frames
-from tests.integration.test_gateway import socket
 from tests.support.given import Connect, StartGateway
 from tests.support.links import counted
 from tests.support.local import patient
 from tests.support.programs import Program
 from tests.support.routers import Router
+from tests.support.sockets import socket
 from tests.support.waiting import PATIENCE_S, until
 
 CAMERA = STREAM.of(type="ros", id=7, node="nd__camera_front")
@@ -189,7 +189,7 @@ async def test_a_call_that_is_too_large_is_refused(router: str) -> None:
         robot.serve("ask", answer)
         await until(lambda: (1, 7) in headset.directory)
         for _ in range(10):
-            assert await headset.call("ros", 7, "ask", timeout_s=PATIENCE_S) == b"yes"
+            assert await headset.call("ros", 7, "ask") == b"yes"
         with pytest.raises(OutOfRange, match=r"macs/call/ros/7/ask/unity/300 is 1\d\d\d, allowed is 0\.\.1000"):
             await headset.call("ros", 7, "ask", bytes(1000), timeout_s=5)
         assert headset.mesh.drops == {"over_size": 1}
@@ -279,7 +279,7 @@ async def test_a_registration_that_is_too_large_is_told(
     async with macs_zenoh.join("ros", id=1, connect=[router]):
         headset = await connect(gateway)
         await headset.subscribe("/map", "nav_msgs/OccupancyGrid", agents=[1])
-        refused = decode_data(NodeRefused, (await headset.receive(5)).data)
+        refused = decode_data(NodeRefused, (await headset.receive(PATIENCE_S)).data)
     assert "allowed is 0..50" in refused.reason
 
 

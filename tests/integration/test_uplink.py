@@ -40,7 +40,7 @@ async def test_one_copy_for_any_number_of_headsets(router: str, start_gateway: S
                 Streams(robot).publish("nd__image", image(count))
                 await asyncio.wait(arriving, timeout=0.2)
 
-        await asyncio.wait_for(deliver(20), 20)
+        await asyncio.wait_for(deliver(20), PATIENCE_S)
         cost = {}
         for count in (1, 20):
             before = link.up_bytes

@@ -17,11 +17,17 @@ import pytest
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.pop("ROS_STATIC_PEERS", None)
 
+import macs_zenoh
 from bridge.interfaces import build
+from bridge.ros.agent import RobotAgent, open_robot
 from bridge.ros.session import RosSession
+from bridge.settings import RobotSettings, Settings
+from macs_zenoh.agent import Agent
 from tests.support.isolation import worker_number
+from tests.support.local import patient
 from tests.support.once import made_once
-from tests.support.ros_peer import Peer
+from tests.support.ros_peer import ROBOT, Peer
+from tests.support.waiting import until
 
 DOMAINS = 100
 _domains = itertools.cycle(range(1, 1 + DOMAINS))
@@ -80,3 +86,19 @@ async def peer(domain: int) -> AsyncIterator[Peer]:
         yield peer
     finally:
         peer.session.close()
+
+
+@pytest.fixture
+async def robot(router: str, domain: int) -> AsyncIterator[RobotAgent]:
+    """Robot 7 in group 3."""
+    settings = Settings(mesh=patient(router), robot=RobotSettings(id=ROBOT, group=3))
+    async with open_robot(settings, domain_id=domain) as robot:
+        yield robot
+
+
+@pytest.fixture
+async def headset(router: str, robot: RobotAgent) -> AsyncIterator[Agent]:
+    """Headset 5, a Python agent, which knows of the robot."""
+    async with macs_zenoh.join("unity", id=5, settings=patient(router)) as headset:
+        await until(lambda: (1, ROBOT) in headset.directory)
+        yield headset

@@ -13,7 +13,6 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.serialization import deserialize_message, serialize_message
 
-from bridge.headset import actions
 from bridge.headset.actions import ABORTED, CANCELED, SUCCEEDED, ActionClient, Goal
 from bridge.headset.frames import NodeSpec
 from bridge.headset.nodes import Incoming
@@ -27,7 +26,7 @@ from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.protocol.messages import ActionVerb, Metadata, NodeType
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import MACS, split_message
-from tests.support.ros_peer import Peer, adding, pause
+from tests.support.ros_peer import Peer, adding, known_action, pause
 from tests.support.waiting import PATIENCE_S, until
 
 COUNT = "macs_test_msgs/Count"
@@ -90,13 +89,6 @@ class Headset:
             self.client.receive(Incoming(metadata, data))
 
 
-@pytest.fixture(autouse=True)
-def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a headset waits for may take as long as a busy machine needs."""
-    within = actions._within
-    monkeypatch.setattr(actions, "_within", lambda future, what, timeout_s: within(future, what, PATIENCE_S))
-
-
 @pytest.fixture
 async def site(session: RosSession, peer: Peer, count_action: Any) -> AsyncIterator[SimpleNamespace]:
     """A counting robot, headsets 5 and 6 of group 3, and 9 of none."""
@@ -114,13 +106,21 @@ async def site(session: RosSession, peer: Peer, count_action: Any) -> AsyncItera
     for headset in headsets.values():
         headset.nodes = nodes
     counter = await peer.session.run(lambda: Counter(peer, count_action))
+    await known_action(session, "/count")
     await nodes.add(adding("/count", COUNT, node_type=NodeType.ACTION))
 
     def goal(to: int, step_s: float = 0.01) -> bytes:
         return bytes(serialize_message(count_action.Goal(to=to, step_s=step_s)))
 
     yield SimpleNamespace(
-        nodes=nodes, five=headsets[5], six=headsets[6], nine=headsets[9], action=count_action, goal=goal, peer=peer
+        nodes=nodes,
+        five=headsets[5],
+        six=headsets[6],
+        nine=headsets[9],
+        action=count_action,
+        goal=goal,
+        peer=peer,
+        counter=counter,
     )
     nodes.close()
     await peer.session.run(counter.server.destroy)
@@ -232,6 +232,7 @@ async def test_a_goal_is_not_the_next_ones_who_has_the_id(site: SimpleNamespace)
 async def test_goals_end_with_their_headset_where_a_rule_says_so(site: SimpleNamespace) -> None:
     """With cancel_on_leave a headset's goals are canceled when it leaves, also one not yet accepted; others' go on."""
     counter = await site.peer.session.run(lambda: Counter(site.peer, site.action, "/other"))
+    await known_action(site.nodes.robot.session, "/other")
     for registrant in (5, 6):
         await site.nodes.add(adding("/other", COUNT, node_type=NodeType.ACTION, registrant=registrant))
     spec = NodeSpec(NodeType.ACTION, "/other", COUNT)
@@ -309,6 +310,36 @@ async def test_whoever_cancels_a_goal_that_ends_in_this_moment_is_answered(site:
         await canceling
 
 
+async def test_a_cancellation_whose_answer_is_lost_is_asked_for_again(
+    site: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server that does not know our client for cancellations yet answers nobody; who cancels a goal, which may take
+    its time to end, hears of it all the same."""
+    monkeypatch.setattr("bridge.ros.actions.CANCEL_AGAIN_S", 0.1)
+    lost = Answers(site.counter.server._handle)
+    monkeypatch.setattr(site.counter.server, "_handle", lost)
+    goal = await site.five.client.send_goal(7, site.goal(1, 3600))
+    await goal.cancel()
+    assert lost.count == 1
+
+
+class Answers:
+    """The inner part of an action server, of whose answers to cancellations the first is lost as ROS loses it."""
+
+    def __init__(self, handle: Any) -> None:
+        self._handle = handle
+        self.count = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._handle, name)
+
+    def send_cancel_response(self, *answer: Any) -> None:
+        if self.count:
+            self._handle.send_cancel_response(*answer)
+        else:
+            self.count = 1
+
+
 async def test_a_short_stop_cancels_goals(site: SimpleNamespace) -> None:
     """Also when it is released before the loop comes to it; a goal that waits for its action is never given."""
     await site.nodes.open_stop("/emergency_stop")
@@ -330,6 +361,7 @@ async def test_a_short_stop_cancels_goals(site: SimpleNamespace) -> None:
 async def test_goals_end_with_the_mesh_where_a_rule_says_so(site: SimpleNamespace) -> None:
     """With cancel_on_leave the robot cancels them when it loses the mesh."""
     counter = await site.peer.session.run(lambda: Counter(site.peer, site.action, "/other"))
+    await known_action(site.nodes.robot.session, "/other")
     await site.nodes.add(adding("/other", COUNT, node_type=NodeType.ACTION))
     elsewhere = await site.five.client.send_goal(7, site.goal(1000))
     site.five.client = ActionClient(site.five, NodeSpec(NodeType.ACTION, "/other", COUNT))

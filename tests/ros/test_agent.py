@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Iterator
 
 import pytest
 from geometry_msgs.msg import Twist
@@ -22,7 +21,7 @@ from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Refused
-from macs_zenoh.mesh import Mesh, Sample, panics
+from macs_zenoh.mesh import Mesh, panics
 from macs_zenoh.protocol.keyexpr import PRESENCE, STREAM
 from macs_zenoh.protocol.messages import (
     Functionality,
@@ -38,26 +37,8 @@ from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.robot_state import STATUS
 from macs_zenoh.protocol.routing import call
 from macs_zenoh.protocol.wire import parse_frame
-from tests.support.ros_peer import Peer, adding, command, removing
+from tests.support.ros_peer import ROBOT, Peer, Streams, adding, command, removing
 from tests.support.waiting import PATIENCE_S, get, until
-
-ROBOT = 7
-
-
-@pytest.fixture
-async def robot(router: str, domain: int) -> AsyncIterator[RobotAgent]:
-    """Robot 7 in group 3."""
-    settings = Settings(mesh=MeshSettings(connect=[router]), robot=RobotSettings(id=ROBOT, group=3))
-    async with open_robot(settings, domain_id=domain) as robot:
-        yield robot
-
-
-@pytest.fixture
-async def headset(router: str, robot: RobotAgent) -> AsyncIterator[Agent]:
-    """Headset 5, a Python agent, which knows of the robot."""
-    async with macs_zenoh.join("unity", id=5, connect=[router]) as headset:
-        await until(lambda: (1, ROBOT) in headset.directory)
-        yield headset
 
 
 async def test_a_robot_that_has_ended_has_no_last_words(router: str, domain: int) -> None:
@@ -76,31 +57,6 @@ async def test_who_was_never_seen_does_not_follow_for_ever(robot: RobotAgent) ->
         robot.offers.follow(Registrant(2, number), asked)
     assert len(robot.offers._followers) == graph.FOLLOWERS
     assert Registrant(2, graph.FOLLOWERS + 4) in robot.offers._followers
-
-
-class Streams:
-    """Everything that a robot streams, as an agent on the mesh gets it."""
-
-    def __init__(self, agent: Agent, robot: int = ROBOT) -> None:
-        self.frames: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue()
-        self._subscription = agent.mesh.subscribe(STREAM.every(type=1, id=robot), self._take)
-
-    def _take(self, batch: Iterator[Sample]) -> None:
-        for key, payload in batch:
-            self.frames.put_nowait((key, payload))
-
-    async def after(self, publish: Callable[[], None]) -> tuple[str, bytes]:
-        """Key and frame of what comes when ``publish`` is done, again and again until something comes.
-
-        The first can be earlier than the robot's router knows of our subscription.
-        """
-
-        def again() -> bool:
-            publish()
-            return not self.frames.empty()
-
-        await until(again)
-        return await get(self.frames)
 
 
 async def test_a_registered_topic_is_streamed(robot: RobotAgent, headset: Agent, peer: Peer) -> None:

@@ -142,8 +142,7 @@ async def test_a_group_is_commanded(robot: RobotAgent, agent: Agent, peer: Peer)
 
 async def test_a_service_is_called_typed_and_raw(robot: RobotAgent, agent: Agent, peer: Peer) -> None:
     """A value is answered with a value, CDR with CDR; a service that is not there is said to be absent."""
-    await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/set", set_bool))
-    await until(lambda: "/set" in dict(robot.session.node.get_service_names_and_types()), PATIENCE_S)
+    await peer.service(SetBool, "/set", set_bool, robot.session)
     request: dict[str, object] = {"data": True}
     answer = await agent.call_service("/set", request, robot=ROBOT, type="std_srvs/SetBool", timeout_s=PATIENCE_S)
     assert answer == {"success": True, "message": "set to True"}

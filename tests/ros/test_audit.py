@@ -13,7 +13,7 @@ from macs_zenoh.protocol.robot_state import ControlRequest
 from tests.ros.driven import hear, may_command, send, send_bool, site
 from tests.support.programs import ended
 from tests.support.ros_peer import Peer
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 SETTINGS = """
 [robot]
@@ -36,13 +36,15 @@ async def test_a_robot_keeps_a_record(domain: int, peer: Peer, tmp_path: Path) -
                 await may_command(driver, 1)
             await until(lambda: send(one, 1, 0.5) or heard.values)
             give = encode_data(ControlRequest("give", "/cmd_vel", to=301))
-            await one.call("ros", 1, "control", give, timeout_s=20)
-            await one.call("ros", 1, "control", encode_data(ControlRequest("take", "/cmd_vel")), timeout_s=20)
-            await other.call("ros", 1, "control", encode_data(ControlRequest("release", "/cmd_vel")), timeout_s=20)
+            await one.call("ros", 1, "control", give)
+            await one.call("ros", 1, "control", encode_data(ControlRequest("take", "/cmd_vel")))
+            await other.call(
+                "ros", 1, "control", encode_data(ControlRequest("release", "/cmd_vel")), timeout_s=PATIENCE_S
+            )
             send_bool(one, 1, True)
             await until(lambda: '"stop"' in path.read_text())
             with pytest.raises(Refused):
-                await one.call("ros", 1, "stop", b"false", timeout_s=20)
+                await one.call("ros", 1, "stop", b"false")
             code, _, errors = await ended("stop", "1", "--release", "-e", place.router.endpoint)
             assert code == 0, errors
         assert await robot.stop() == 0

@@ -457,7 +457,7 @@ async def test_a_wrong_option_is_wrong_usage(argument: str) -> None:
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "bridge", "awareness", argument), cwd=ROOT, stderr=asyncio.subprocess.PIPE
     )
-    _, log = await asyncio.wait_for(process.communicate(), 20)
+    _, log = await asyncio.wait_for(process.communicate(), PATIENCE_S)
     assert (process.returncode, "Traceback" in log.decode()) == (2, False)
 
 

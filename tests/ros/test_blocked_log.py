@@ -76,7 +76,7 @@ async def test_stops_reach_every_topic(domain: int, peer: Peer, tmp_path: Path) 
                     await until(lambda said=said: said.last == STOPPED)
                 for said in heard.values():
                     said.values.clear()
-                assert await driver.call("ros", NUMBER, "stop", b"true", timeout_s=20)
+                assert await driver.call("ros", NUMBER, "stop", b"true")
                 for said in heard.values():
                     await until(lambda said=said: said.last == STOPPED)
     finally:

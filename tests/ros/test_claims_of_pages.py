@@ -14,13 +14,12 @@ from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Refused, Unreachable
 from macs_zenoh.protocol.messages import encode_data as encode
 from macs_zenoh.protocol.wire import parse_frame
-from tests.ros.test_agent import ROBOT, Streams, headset, robot  # noqa: F401 - fixtures
-from tests.support.ros_peer import Peer, adding
+from tests.support.ros_peer import ROBOT, Peer, Streams, adding
 
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-async def test_a_robot_answers_the_verbs_of_the_page(robot: RobotAgent, headset: Agent) -> None:  # noqa: F811
+async def test_a_robot_answers_the_verbs_of_the_page(robot: RobotAgent, headset: Agent) -> None:
     """docs/protocol.md: each verb of the table is served by a robot's agent, another one is not."""
     table = (DOCS / "protocol.md").read_text(encoding="utf-8").partition("| verb |")[2].partition("\n\n")[0]
     verbs = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
@@ -32,7 +31,7 @@ async def test_a_robot_answers_the_verbs_of_the_page(robot: RobotAgent, headset:
         await headset.call("ros", ROBOT, "add_nodes", timeout_s=1)
 
 
-async def test_topic_data_is_not_decoded(robot: RobotAgent, headset: Agent, peer: Peer) -> None:  # noqa: F811
+async def test_topic_data_is_not_decoded(robot: RobotAgent, headset: Agent, peer: Peer) -> None:
     """docs/design.md: bytes that are no message of the topic's type cross as they are."""
     streams = Streams(headset)
     await headset.call("ros", ROBOT, "add_node", encode(adding("/chatter")))

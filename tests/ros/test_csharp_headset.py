@@ -16,7 +16,7 @@ from std_srvs.srv import SetBool
 from tests.support.once import made_once
 from tests.support.programs import ROOT, Program, free_port
 from tests.support.ros_peer import Peer, say_hello, set_bool
-from tests.support.waiting import get
+from tests.support.waiting import PATIENCE_S, get
 
 SOURCE = ROOT / "examples" / "unity" / "MacsHeadset.cs"
 
@@ -49,7 +49,7 @@ class CSharp:
     async def says(self, beginning: str) -> str:
         """The next line that begins like this."""
         assert self._process.stdout is not None
-        while line := (await asyncio.wait_for(self._process.stdout.readline(), 20)).decode().rstrip():
+        while line := (await asyncio.wait_for(self._process.stdout.readline(), PATIENCE_S)).decode().rstrip():
             self.said.append(line)
             if line.startswith(beginning):
                 return line
@@ -96,12 +96,12 @@ async def test_the_four_kinds_of_nodes(compiled: Path, domain: int, peer: Peer) 
 
 async def _all_four(headset: CSharp, talk: asyncio.Queue[String], peer: Peer, asking: object) -> None:
     assert await headset.says("/chatter of robot 1: ") == "/chatter of robot 1: hello from ROS"
-    assert (await get(talk, 20)).data == "hello from C#"
+    assert (await get(talk)).data == "hello from C#"
     assert await headset.says("/set: True") == "/set: True set to True"
-    assert await peer.session.run(lambda: asking.wait_for_service(10))  # type: ignore[attr-defined]
+    assert await peer.session.run(lambda: asking.wait_for_service(PATIENCE_S))  # type: ignore[attr-defined]
     loop = asyncio.get_running_loop()
     answered: asyncio.Future[SetBool.Response] = loop.create_future()
     call = await peer.session.run(lambda: asking.call_async(SetBool.Request(data=True)))  # type: ignore[attr-defined]
     call.add_done_callback(lambda done: loop.call_soon_threadsafe(answered.set_result, done.result()))
-    response = await asyncio.wait_for(answered, 20)
+    response = await asyncio.wait_for(answered, PATIENCE_S)
     assert (response.success, response.message) == (True, "headset says True")

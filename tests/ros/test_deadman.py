@@ -17,6 +17,7 @@ from rclpy.serialization import serialize_message
 
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Publisher
+from tests.support.delays import Delays
 from tests.support.programs import Program, free_port
 from tests.support.ros_peer import Peer
 from tests.support.waiting import get
@@ -47,6 +48,7 @@ class Driving:
     router: Program
     gateway: Program
     heard: asyncio.Queue[tuple[float, Any]]
+    delays: Delays
 
 
 @pytest.fixture
@@ -80,7 +82,8 @@ async def driving(request: Any, domain: int, peer: Peer, tmp_path: Path) -> Asyn
         task = asyncio.create_task(_drive(commands))
         for _ in range(20):
             await get(heard)
-        yield Driving(router, gateway, heard)
+        with Delays() as delays:
+            yield Driving(router, gateway, heard, delays)
         task.cancel()
 
 
@@ -93,21 +96,22 @@ async def _drive(commands: Publisher) -> None:
         await asyncio.sleep(0.05)
 
 
-async def _stop_message(driving: Driving, timeout_s: float) -> float:
-    """When the stop message arrived."""
+async def _stop_message(driving: Driving) -> tuple[float, float]:
+    """When the stop message arrived, and how much later than on an idle machine that may have been."""
     while True:
-        at, twist = await get(driving.heard, timeout_s)
+        at, twist = await get(driving.heard)
         if twist.linear.z == -1:
-            return float(at)
+            return float(at), driving.delays.s()
 
 
 @pytest.mark.parametrize("driving", ["/cmd_vel", "/arm"], indirect=True)
 async def test_a_killed_gateway_stops_the_robot(driving: Driving) -> None:
     """After kill -9 of the headset's gateway the stop message is there within the configured time and 100 ms."""
+    driving.delays.s()
     killed = time.monotonic()
     driving.gateway.send_signal(signal.SIGKILL)
-    took_s = await _stop_message(driving, 5) - killed
-    assert took_s < SILENCE_S + MARGIN_S
+    at, delay_s = await _stop_message(driving)
+    assert at - killed < SILENCE_S + MARGIN_S + delay_s
     await asyncio.sleep(SILENCE_S)
     assert driving.heard.empty(), "it is published once"
 
@@ -115,16 +119,18 @@ async def test_a_killed_gateway_stops_the_robot(driving: Driving) -> None:
 @pytest.mark.parametrize("driving", ["/arm"], indirect=True)
 async def test_a_stopped_gateway_stops_the_robot(driving: Driving) -> None:
     """After SIGSTOP of the gateway, which closes nothing, the message is there within a lease and 100 ms."""
+    driving.delays.s()
     stopped = time.monotonic()
     driving.gateway.send_signal(signal.SIGSTOP)
-    took_s = await _stop_message(driving, 10) - stopped
-    assert took_s < LEASE_S + MARGIN_S, f"{took_s:.3f} s"
+    at, delay_s = await _stop_message(driving)
+    assert at - stopped < LEASE_S + MARGIN_S + delay_s
 
 
 @pytest.mark.parametrize("driving", ["/arm"], indirect=True)
 async def test_a_lost_router_stops_the_robot(driving: Driving) -> None:
     """A robot that is cut off from the mesh stops after a lease, although it sees nobody leave."""
+    driving.delays.s()
     killed = time.monotonic()
     driving.router.send_signal(signal.SIGKILL)
-    took_s = await _stop_message(driving, 10) - killed
-    assert took_s < LEASE_S + 2 * MARGIN_S, f"{took_s:.3f} s"
+    at, delay_s = await _stop_message(driving)
+    assert at - killed < LEASE_S + 2 * MARGIN_S + delay_s

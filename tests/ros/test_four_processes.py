@@ -120,11 +120,11 @@ async def test_headsets_reach_each_other_once(site: Site, how: str) -> None:
     }[how]
     for text in (b"hello", b"end"):  # on one way the order is kept: what follows shows that nothing came twice
         await first.send(text, to=to, ids=ids, groups=groups, manager="Greeting")
-    messages = [await second.receive(5) for _ in range(2)]
+    messages = [await second.receive(PATIENCE_S) for _ in range(2)]
     assert [bytes(message.data) for message in messages] == [b"hello", b"end"]
     assert {(message.sender_type, message.sender_id) for message in messages} == {(2, first.id)}
     await second.send(b"nothing before this", to=2, ids=[first.id], manager="Greeting")
-    assert bytes((await first.receive(5)).data) == b"nothing before this"
+    assert bytes((await first.receive(PATIENCE_S)).data) == b"nothing before this"
 
 
 async def test_a_killed_gateway_takes_only_its_own_headsets(site: Site, peer: Peer, domain: int) -> None:

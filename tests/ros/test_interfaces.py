@@ -17,7 +17,7 @@ from bridge.interfaces import Package, build
 from macs_zenoh.errors import ConfigError, Unreachable
 from tests.support.processes import ROOT
 from tests.support.ros_peer import Peer
-from tests.support.waiting import get, until
+from tests.support.waiting import PATIENCE_S, get, until
 
 AS2_CA_MSGS = ROOT / "interfaces" / "as2_ca_msgs"
 
@@ -222,7 +222,7 @@ async def test_without_the_interfaces_awareness_says_what_to_do() -> None:
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-c", program), cwd=ROOT, stderr=asyncio.subprocess.PIPE
     )
-    _, log = await asyncio.wait_for(process.communicate(), 20)
+    _, log = await asyncio.wait_for(process.communicate(), PATIENCE_S)
     assert process.returncode == 1
     assert "macs interfaces build as2_ca_msgs --install" in log.decode()
     assert "Traceback" not in log.decode()

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 
 import pytest
 
@@ -15,30 +13,15 @@ from macs_zenoh import join, locked_out
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
-from tests.support.links import Link, counted
+from tests.support.links import counted
 from tests.support.routers import Router
-from tests.support.waiting import until
+from tests.support.thieves import notice_soon, stolen, zenoh_id
+from tests.support.waiting import PATIENCE_S, until
 
 
 @pytest.fixture(autouse=True)
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(locked_out, "PATIENCE_S", 0.5)
-    monkeypatch.setattr(locked_out, "AGAIN_S", 0.1)
-
-
-def zenoh_id(mesh: Mesh) -> str:
-    return str(mesh._session.zid())
-
-
-@asynccontextmanager
-async def stolen(mesh: Mesh, link: Link, router: Router) -> AsyncIterator[None]:
-    """A thief has the session's id: it was there when the link was lost."""
-    link.cut()
-    await until(lambda: not mesh.linked)
-    settings = MeshSettings(connect=[router.endpoint], overrides=[f'id:"{zenoh_id(mesh)}"'])
-    async with await Mesh.open(settings):
-        link.mend()
-        yield
+    notice_soon(monkeypatch)
 
 
 async def test_who_is_locked_out_notices_and_who_is_cut_off_is_not() -> None:
@@ -56,8 +39,8 @@ async def test_who_is_locked_out_notices_and_who_is_cut_off_is_not() -> None:
         await until(lambda: mesh.linked)
         await asyncio.sleep(0.5)
         assert not noticed.done()
-        async with stolen(mesh, link, router):
-            await asyncio.wait_for(noticed, 60)
+        async with stolen(mesh, link, router.endpoint):
+            await asyncio.wait_for(noticed, PATIENCE_S)
             assert not mesh.linked
 
 
@@ -72,11 +55,11 @@ async def test_a_robot_goes_on_under_another_id(domain: int, monkeypatch: pytest
             running = asyncio.create_task(agent.run(settings, on_ready=came.append, stop=stop))
             await until(lambda: came)
             before = zenoh_id(came[0].mesh)
-            await operator.call("ros", 7, "stop", b"true", timeout_s=20)
-            async with stolen(came[0].mesh, link, router):
-                await until(lambda: len(came) == 2, 60)
+            await operator.call("ros", 7, "stop", b"true")
+            async with stolen(came[0].mesh, link, router.endpoint):
+                await until(lambda: len(came) == 2)
                 assert zenoh_id(came[1].mesh) != before
-                status = json.loads(await operator.call("ros", 7, "status", timeout_s=20))
+                status = json.loads(await operator.call("ros", 7, "status"))
                 assert status["stopped"] is True, status
             stop.set()
-            await asyncio.wait_for(running, 30)
+            await asyncio.wait_for(running, PATIENCE_S)

@@ -16,9 +16,9 @@ from std_srvs.srv import SetBool
 from bridge.ros.agent import RobotAgent, open_robot
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
-from macs_zenoh.agent import join as join_mesh
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
+from macs_zenoh.joining import join as join_mesh
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import UNICAST
 from macs_zenoh.protocol.messages import Metadata, NodeType, encode_data, node_name
@@ -90,7 +90,7 @@ async def test_every_spoilt_field_costs_one_message(mesh: tuple[RobotAgent, Agen
         response.success = request.data
         return response
 
-    await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/set", answer))
+    await peer.service(SetBool, "/set", answer, robot.session)
     heard = await peer.subscription(String, "/said")
     for kind, (name, data_type) in NODES.items():
         await headset.call("ros", ROBOT, "add_node", encode_data(adding(name, data_type, node_type=kind)))

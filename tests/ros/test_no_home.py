@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.programs import ROOT, Program, free_port
+from tests.support.waiting import PATIENCE_S
 
 PROGRAMS = {
     "agent": ["-m", "bridge", "agent", "--id", "3", "-e"],
@@ -23,7 +24,7 @@ async def run(*words: str, **env: str) -> tuple[int | None, str]:
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, *words), cwd=ROOT, env={**kept, **env}, stderr=asyncio.subprocess.PIPE
     )
-    _, errors = await asyncio.wait_for(process.communicate(), 30)
+    _, errors = await asyncio.wait_for(process.communicate(), PATIENCE_S)
     return process.returncode, errors.decode()
 
 

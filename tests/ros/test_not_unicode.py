@@ -16,7 +16,7 @@ from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.session import RosSession
 from macs_zenoh.protocol.messages import ActionVerb, CallFailure, Metadata, NodeType, decode_data, node_name
 from macs_zenoh.protocol.reading import Message
-from tests.support.ros_peer import Peer, adding
+from tests.support.ros_peer import Peer, adding, known_action
 from tests.support.waiting import get, until
 
 pytestmark = pytest.mark.timeout(600)  # the first of them compiles its messages, on a busy machine for minutes
@@ -53,7 +53,7 @@ def message(name: str, node_type: int, kind: str, manager: str, data: bytes, num
 
 async def test_a_request(nodes: InterfaceNodes, sent: Sent, peer: Peer, say: Any) -> None:
     """Its caller hears that it is none."""
-    await peer.session.run(lambda: peer.session.node.create_service(say, "/say", lambda _, response: response))
+    await peer.service(say, "/say", lambda _, response: response, nodes.robot.session)
     await nodes.add(adding("/say", "macs_kinds_msgs/Say", node_type=NodeType.CLIENT))
     nodes.deliver(message("/say", NodeType.CLIENT, "Say", CallFailure.manager, HALF))
     _, _, data = await get(sent)
@@ -79,6 +79,7 @@ async def test_a_goal(nodes: InterfaceNodes, sent: Sent, peer: Peer, kinds: Any)
     """It is refused, and not kept."""
     tell = importlib.import_module("macs_kinds_msgs.action").Tell
     server = await peer.session.run(lambda: ActionServer(peer.session.node, tell, "/tell", lambda goal: tell.Result()))
+    await known_action(nodes.robot.session, "/tell")
     await nodes.add(adding("/tell", "macs_kinds_msgs/Tell", node_type=NodeType.ACTION))
     goal = bytes(16)
     nodes.deliver(message("/tell", NodeType.ACTION, "Tell", ActionVerb.GOAL.value, goal + HALF))

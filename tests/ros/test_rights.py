@@ -225,8 +225,7 @@ async def test_who_may_not_act_is_heard_nowhere(session: RosSession, peer: Peer)
             loop.call_soon_threadsafe(called.put_nowait, True)
             return response
 
-        await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/lights", serve))
-        await until(lambda: session.node.count_services("/lights") == 1)
+        await peer.service(SetBool, "/lights", serve, session)
         await nodes.add(publishing("/cmd_vel"))
         await nodes.add(adding("/lights", "std_srvs/SetBool", node_type=NodeType.CLIENT))
 

@@ -64,6 +64,13 @@ async def site(domain: int, count_action: Any) -> AsyncIterator[Site]:
         yield Site(gateway, robot, headsets)
 
 
+async def offered(site: Site, name: str, kind: str) -> None:
+    """Wait until the robot knows of a topic, service or action that has just been made beside it."""
+    wanted = f'"{name}":"{kind}"'.encode()
+    while wanted not in await site.headset.ask(1, "FunctionalityGetter"):
+        await asyncio.sleep(0.05)
+
+
 async def serve_set(peer: Peer, name: str) -> None:
     def answer(request: Any, response: Any) -> Any:
         response.success, response.message = request.data, "robot"
@@ -97,6 +104,7 @@ async def test_three_headsets_get_a_camera(site: Site, peer: Peer, how: str) -> 
 async def test_services_both_ways(site: Site, peer: Peer) -> None:
     """Headsets call a robot's service and run one for the robot's nodes, and hear why when a call fails."""
     await serve_set(peer, "/set")
+    await offered(site, "/set", "std_srvs/srv/SetBool")
     on = bytes(serialize_message(SetBool.Request(data=True)))
     answers = await asyncio.gather(*(h.call("/set", SET, 1, on, failures=True) for h in site.headsets))
     assert [deserialize_message(answer, SetBool.Response).success for answer in answers] == [True] * 3
@@ -152,8 +160,7 @@ async def test_an_action_over_the_wire(site: Site, peer: Peer, count_action: Any
         return count_action.Result(reached=goal.request.to, text="done")
 
     server = await peer.session.run(lambda: ActionServer(peer.session.node, count_action, "/count", execute))
-    while b'"/count":"macs_test_msgs/action/Count"' not in await site.headset.ask(1, "FunctionalityGetter"):
-        await asyncio.sleep(0.05)
+    await offered(site, "/count", "macs_test_msgs/action/Count")
     counting = await site.headset.action("/count", "macs_test_msgs/Count", agents=[1], buffer_size=100)
     goal = await counting.send_goal(1, bytes(serialize_message(count_action.Goal(to=3))), timeout_s=10)
     assert [deserialize_message(data, count_action.Feedback).at async for data in goal] == [0, 1, 2]
@@ -206,9 +213,12 @@ async def test_a_robot_that_restarts_streams_on(site: Site, peer: Peer, domain: 
     await site.robot.stop(signal.SIGKILL)
     await site.robot.start()
     restarted = published
-    while (
-        int(deserialize_message((await asyncio.wait_for(subscription.__anext__(), 20)).data, String).data) < restarted
-    ):
+
+    async def number() -> int:
+        message = await asyncio.wait_for(subscription.__anext__(), PATIENCE_S)
+        return int(deserialize_message(message.data, String).data)
+
+    while await number() < restarted:
         pass
     task.cancel()
 
@@ -257,8 +267,7 @@ async def test_who_holds_a_service_keeps_it_when_the_robot_restarts(
 async def test_what_a_robot_offers_and_its_state_are_asked_by_a_headset(site: Site, peer: Peer) -> None:
     """Over TCP, a headset asks the robot, and its other requests go on."""
     await peer.publisher(String, "/chatter")
-    while b'"/chatter":"std_msgs/msg/String"' not in await site.headset.ask(1, "FunctionalityGetter"):
-        await asyncio.sleep(0.05)
+    await offered(site, "/chatter", "std_msgs/msg/String")
     assert b'"stopped":false' in await site.headset.ask(1, "RobotStatus")
     control = await site.headset.ask(1, "RobotControl", b'{"action": "take", "topic": "/cmd_vel"}')
     assert b"nobody registered" in control
@@ -306,9 +315,10 @@ async def test_an_existing_headset_calls_and_commands_without_fields(site: Site,
         return response
 
     await peer.session.run(lambda: peer.session.node.create_service(Trigger, "/land", answer))
+    await offered(site, "/land", "std_srvs/srv/Trigger")
     async with await Headset.connect("127.0.0.1", site.gateway.port, extensions=0) as existing:
         takeoff = await existing.advertise("/takeoff", "std_msgs/Empty", agents=[1])
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + PATIENCE_S
         while taken_off.empty():  # what waits too long for its registration on a busy machine is not carried out
             assert time.monotonic() < deadline
             await takeoff.publish(unity_serializer.write(Empty()))
@@ -326,9 +336,9 @@ async def test_a_message_above_the_limit_costs_no_connection(site: Site, peer: P
         publisher = await peer.publisher(String, "/cloud", matched=1)
         for size in (33 << 20, 2 << 20, 5):
             publisher.publish(String(data="x" * size))
-        got = [(await asyncio.wait_for(subscriptions[0].__anext__(), 20)).data for _ in range(2)]
+        got = [(await asyncio.wait_for(subscriptions[0].__anext__(), PATIENCE_S)).data for _ in range(2)]
         assert [len(deserialize_message(data, String).data) for data in got] == [2 << 20, 5]
-        assert (await asyncio.wait_for(subscriptions[1].__anext__(), 20)).data == got[1]
+        assert (await asyncio.wait_for(subscriptions[1].__anext__(), PATIENCE_S)).data == got[1]
         await until(lambda: "more than max_frame_bytes" in str(subscriptions[0].refusing()))
         assert modest.connected
         assert site.headset.connected

@@ -18,7 +18,7 @@ from tests.panicking import panicking
 from tests.ros.driven import STOPPED, Heard, driving, hear, may_command, site
 from tests.support.programs import ROOT, Program, free_port
 from tests.support.ros_peer import Peer
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 LONG = """
 [[robot.rules]]
@@ -101,7 +101,7 @@ async def test_the_end_of_its_supervisor_stops_the_robot(
     finally:
         if process.returncode is None:
             process.terminate()
-        await asyncio.wait_for(process.wait(), 20)
+        await asyncio.wait_for(process.wait(), PATIENCE_S)
 
 
 async def _up(argv: Sequence[str], domain: int) -> asyncio.subprocess.Process:

@@ -25,7 +25,7 @@ from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.ros.driven import SETTINGS, STOPPED, Heard, driving, hear, may_command, send_bool, site
 from tests.ros.test_safety_shared import told
 from tests.support.ros_peer import Peer
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 ROBOT, FLOODER = 1, 4000
 GROWTH_MIB = 150
@@ -132,7 +132,7 @@ async def test_a_stop_pressed_once_takes_effect(domain: int, peer: Peer, tmp_pat
                 await stays_stopped(heard)
                 await release(presser)
                 await drives(heard)
-                await presser.call("ros", ROBOT, "stop", b"true", timeout_s=20)
+                await presser.call("ros", ROBOT, "stop", b"true")
                 await until(lambda: heard.last == STOPPED)
                 await release(presser)
                 await drives(heard)
@@ -143,7 +143,7 @@ async def test_a_stop_pressed_once_takes_effect(domain: int, peer: Peer, tmp_pat
 
 async def flooded(agent: Agent) -> None:
     """Wait until the flood is there, and drops."""
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + PATIENCE_S
     while not (await told(agent, ROBOT))["drops"].get("flooded"):
         assert time.monotonic() < deadline, "nothing of the flood was dropped for being one"
         await asyncio.sleep(0.1)
@@ -174,4 +174,4 @@ async def stays_stopped(heard: Heard) -> None:
 
 
 async def release(presser: Agent) -> None:
-    await presser.call("ros", ROBOT, "stop", b"false", timeout_s=20)
+    await presser.call("ros", ROBOT, "stop", b"false")

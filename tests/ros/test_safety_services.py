@@ -46,18 +46,18 @@ async def site(session: RosSession, peer: Peer) -> AsyncIterator[SimpleNamespace
     nodes = InterfaceNodes(robot)
     await nodes.open_stop("/emergency_stop")
     for name, kind in KINDS.items():
-        await serve(peer, kind, name, asked)
+        await serve(peer, kind, name, asked, session)
     yield SimpleNamespace(nodes=nodes, answers=answers, asked=asked, peer=peer)
     nodes.close()
 
 
-async def serve(peer: Peer, kind: Any, name: str, asked: list[str]) -> None:
+async def serve(peer: Peer, kind: Any, name: str, asked: list[str], robot: RosSession) -> None:
     def answer(_request: Any, response: Any) -> Any:
         asked.append(name)
         response.success = True
         return response
 
-    await peer.session.run(lambda: peer.session.node.create_service(kind, name, answer))
+    await peer.service(kind, name, answer, robot)
 
 
 def call(name: str, number: int) -> Message:

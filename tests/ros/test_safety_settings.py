@@ -59,8 +59,8 @@ async def test_a_robot_without_its_emergency_stop_is_found_and_gets_it(
         assert code == 1
         peer.session.close()
         await until(lambda: any("there is an emergency stop now" in line for line in robot.log))
-        await driver.call("ros", 1, "stop", b"true", timeout_s=20)
-        assert json.loads(await driver.call("ros", 1, "status", timeout_s=20))["stopped"]
+        await driver.call("ros", 1, "stop", b"true")
+        assert json.loads(await driver.call("ros", 1, "status"))["stopped"]
 
 
 async def test_two_agents_on_one_graph_are_found(domain: int, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Refused
 from tests.ros.driven import STOPPED, driving, hear, may_command, send_bool, site
 from tests.support.ros_peer import Peer
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -196,12 +196,12 @@ def test_agents_that_lose_what_others_said_agree_in_the_end(steps: list[tuple[st
 
 
 async def told(agent: Agent, robot: int) -> Any:
-    return json.loads(await agent.call("ros", robot, "status", timeout_s=20))
+    return json.loads(await agent.call("ros", robot, "status"))
 
 
 async def stopped(agent: Agent, robot: int, wanted: bool = True) -> None:
     """Wait until a robot says that it is, or is not."""
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + PATIENCE_S
     while (await told(agent, robot))["stopped"] is not wanted:
         assert time.monotonic() < deadline
         await asyncio.sleep(0.02)
@@ -289,7 +289,7 @@ async def test_the_stop_of_a_node_holds_beside_that_of_a_headset(domain: int, pe
         await headset.call("ros", 1, "stop", b"true")
         await until(lambda: button.get_subscription_count() >= 1)
         await peer.session.run(lambda: button.publish(Bool(data=True)))
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + PATIENCE_S
         while (await told(headset, 1))["stop"]["pressed"] != ["unity/300", A_NODE]:
             assert time.monotonic() < deadline
         with pytest.raises(Refused, match="a ROS node stopped it as well"):

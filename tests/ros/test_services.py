@@ -25,6 +25,7 @@ from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, encode_data, node_name
 from macs_zenoh.protocol.reading import Message
+from tests.support.delays import Delays
 from tests.support.ros_peer import Peer, adding, removing
 from tests.support.waiting import PATIENCE_S, get, until
 
@@ -79,11 +80,6 @@ def request(
     return Message("unity", sender, metadata, cdr)
 
 
-async def serve(peer: Peer, service: str, answer: Any) -> None:
-    """A ROS service of the peer; ``answer(request, response)``."""
-    await peer.session.run(lambda: peer.session.node.create_service(SetBool, service, answer))
-
-
 def said(request: Any, response: Any) -> Any:
     response.success = request.data
     response.message = f"robot says {request.data}"
@@ -95,7 +91,7 @@ def said(request: Any, response: Any) -> Any:
 
 async def test_a_headset_calls_a_ros_service(nodes: InterfaceNodes, headsets: Headsets, peer: Peer) -> None:
     """The answer goes to who asked, registered or not, with its request id, node and an empty manager."""
-    await serve(peer, "/set", said)
+    await peer.service(SetBool, "/set", said, nodes.robot.session)
     await nodes.add(adding("/set", SET, node_type=3))
     nodes.deliver(request("/set", SetBool.Request(data=True), number=0))
     nodes.deliver(request("/set", SetBool.Request(data=False), number=1, sender=900))
@@ -108,7 +104,7 @@ async def test_a_headset_calls_a_ros_service(nodes: InterfaceNodes, headsets: He
 
 async def test_many_calls_are_open_at_once(nodes: InterfaceNodes, headsets: Headsets, peer: Peer) -> None:
     """Two hundred calls of three headsets are all answered, each to its own."""
-    await serve(peer, "/slow", said)
+    await peer.service(SetBool, "/slow", said, nodes.robot.session)
     await nodes.add(adding("/slow", SET, node_type=3))
     asked = {(5 + number % 3, number) for number in range(200)}
     for sender, number in asked:
@@ -140,7 +136,7 @@ async def test_a_service_that_comes_late_is_called(nodes: InterfaceNodes, headse
     """A call shortly before its service starts is answered."""
     await nodes.add(adding("/slow", SET, node_type=3))
     nodes.deliver(request("/slow", SetBool.Request(data=True)))
-    await serve(peer, "/slow", said)
+    await peer.service(SetBool, "/slow", said, nodes.robot.session)
     _, _, data = await get(headsets.sent)
     assert deserialize_message(data, SetBool.Response).success
 
@@ -157,8 +153,8 @@ async def test_a_slow_service_times_out_and_others_go_on(
         return response
 
     try:
-        await serve(slow, "/hangs", hang)
-        await serve(peer, "/set", said)
+        await slow.service(SetBool, "/hangs", hang, nodes.robot.session)
+        await peer.service(SetBool, "/set", said, nodes.robot.session)
         for service in ("/hangs", "/set"):
             await nodes.add(adding(service, SET, node_type=3))
         began = time.monotonic()
@@ -177,7 +173,7 @@ async def test_a_slow_service_times_out_and_others_go_on(
 @pytest.mark.parametrize("bad", [b"", b"\x00", b"\x00\x01\x00\x00", b"\xff" * 30, b"\x01\x00\x00\x00\x01"])
 async def test_a_bad_request_is_refused(nodes: InterfaceNodes, headsets: Headsets, peer: Peer, bad: bytes) -> None:
     """What is no request never reaches the service, is told, and the next request is answered."""
-    await serve(peer, "/set", said)
+    await peer.service(SetBool, "/set", said, nodes.robot.session)
     await nodes.add(adding("/set", SET, node_type=3))
     nodes.deliver(request("/set", bad, number=1, manager=CallFailure.manager))
     assert decode_data(CallFailure, (await get(headsets.sent))[2]).kind == "invalid"
@@ -198,7 +194,7 @@ async def test_every_call_before_its_registration_is_answered(
     nodes: InterfaceNodes, headsets: Headsets, peer: Peer
 ) -> None:
     """Twenty first calls at once, which overtake the registration, have twenty answers."""
-    await serve(peer, "/slow", said)
+    await peer.service(SetBool, "/slow", said, nodes.robot.session)
     for number in range(20):
         nodes.deliver(request("/slow", SetBool.Request(data=True), number=number, manager=CallFailure.manager))
     await nodes.add(adding("/slow", SET, node_type=3))
@@ -212,7 +208,7 @@ async def test_calls_wait_for_a_node_that_opens_slowly(
 ) -> None:
     """A call is not given up while its node is being made, however long that takes."""
     monkeypatch.setattr(EarlyMessages, "HOLD_S", 0.02)
-    await serve(peer, "/slow", said)
+    await peer.service(SetBool, "/slow", said, nodes.robot.session)
     settle = ClientNode.settle
 
     async def slowly(node: ClientNode) -> None:
@@ -243,7 +239,7 @@ async def test_no_call_is_lost_without_a_word(
 
 async def test_a_service_of_another_type_is_refused(nodes: InterfaceNodes, peer: Peer) -> None:
     """A service that exists with another type cannot be registered, and the reason names its type."""
-    await serve(peer, "/set", said)
+    await peer.service(SetBool, "/set", said, nodes.robot.session)
     await until(lambda: nodes.robot.session.node.count_services("/set") == 1)
     with pytest.raises(Refused, match="/set has type std_srvs/srv/SetBool on this robot, not std_srvs/srv/Trigger"):
         await nodes.add(adding("/set", "std_srvs/Trigger", node_type=3))
@@ -442,23 +438,25 @@ async def test_a_thousand_calls_with_every_third_unanswered(
             nodes.deliver(request("/every_third", reply, number=metadata.request_id, node_type=4))
 
     headsets.answer = answer
-    late: list[float] = []
+    late: list[tuple[float, float]] = []
     answered = failed = 0
-    for _ in range(20):
-        calls: list[asyncio.Future[tuple[Any, float]]] = []
-        for _ in range(10):
-            calls += [caller.call(SetBool.Request(data=True)) for _ in range(5)]
-            await asyncio.sleep(0.01)
-        for call in calls:
-            response, took_s = await asyncio.wait_for(call, PATIENCE_S)
-            if response.success:
-                answered += 1
-            else:
-                failed += 1
-                late.append(took_s - DEADLINE_S)
+    with Delays() as delays:
+        for _ in range(20):
+            calls: list[asyncio.Future[tuple[Any, float]]] = []
+            for _ in range(10):
+                calls += [caller.call(SetBool.Request(data=True)) for _ in range(5)]
+                await asyncio.sleep(0.01)
+            delay_s = 0.0
+            for call in calls:
+                response, took_s = await asyncio.wait_for(call, PATIENCE_S)
+                if response.success:
+                    answered += 1
+                else:
+                    failed += 1
+                    delay_s += delays.s()
+                    late.append((took_s - DEADLINE_S, delay_s))
     assert (answered, failed) == (666, 334)
-    assert min(late) >= -0.001
-    assert max(late) < 0.2
+    assert all(-0.001 <= late_s < 0.2 + delay_s for late_s, delay_s in late), late
     talk = Metadata(2, 5, node_type=NodeType.PUBLISHER, node_name="nd__talk", data_exchange_type="std_msgs/String")
     nodes.deliver(Message("unity", 5, talk, bytes(serialize_message(String(data="still here")))))
     assert (await get(heard)).data == "still here"

@@ -13,7 +13,7 @@ from std_msgs.msg import String
 from bridge.ros.session import RosSession
 from macs_zenoh.errors import Unreachable
 from tests.support.ros_peer import Peer
-from tests.support.waiting import get, until
+from tests.support.waiting import PATIENCE_S, get, until
 
 
 async def test_jobs_run_in_order_in_one_thread(session: RosSession) -> None:
@@ -63,7 +63,7 @@ def test_a_closed_session_says_so(domain: int) -> None:
     session.close()
     session.close()
     with pytest.raises(Unreachable, match="closed"):
-        session.submit(lambda: None).result(timeout=1)
+        session.submit(lambda: None).result(PATIENCE_S)
 
 
 def test_jobs_that_the_end_overtakes_fail(domain: int) -> None:
@@ -81,7 +81,7 @@ def test_jobs_that_the_end_overtakes_fail(domain: int) -> None:
     assert begun.wait(5)
     waiting = session.submit(lambda: 7)
     go_on.set()
-    assert waiting.exception(timeout=5) is None or isinstance(waiting.exception(), Unreachable)
+    assert waiting.exception(PATIENCE_S) is None or isinstance(waiting.exception(), Unreachable)
     session.close()
 
 
@@ -124,7 +124,7 @@ async def test_without_ros_the_robot_says_what_to_install() -> None:
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-c", program), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
     )
-    out, log = await asyncio.wait_for(process.communicate(), 20)
+    out, log = await asyncio.wait_for(process.communicate(), PATIENCE_S)
     assert process.returncode == 1
     assert out == b""
     (line,) = log.decode().splitlines()

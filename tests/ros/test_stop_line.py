@@ -61,7 +61,7 @@ async def test_a_stop_takes_effect_while_the_robot_receives_something_else(
                 flooder.send(b"", to="ros", ids=[ROBOT])
                 await until(stuck.is_set)
                 for stop in (True, False, True):
-                    answer = await operator.call("ros", ROBOT, "stop", json.dumps(stop).encode(), timeout_s=20)
+                    answer = await operator.call("ros", ROBOT, "stop", json.dumps(stop).encode())
                     assert json.loads(answer)["stopped"] is stop
                     assert robot.nodes.robot.stop.stopped is stop
             finally:
@@ -78,18 +78,18 @@ async def test_the_stop_is_served_before_and_after_its_session(domain: int, over
         join("operator", id=5, settings=MeshSettings(connect=[router.endpoint])) as operator,
     ):
         await until(lambda: (1, ROBOT) in operator.directory)
-        await operator.call("ros", ROBOT, "stop", b"true", timeout_s=20)
+        await operator.call("ros", ROBOT, "stop", b"true")
         line = robot.stop_line
         assert line is not None
         await until(lambda: line.is_open)
-        await operator.call("ros", ROBOT, "stop", b"false", timeout_s=20)
+        await operator.call("ros", ROBOT, "stop", b"false")
         assert not robot.nodes.robot.stop.stopped
         about = Metadata(node_name="nd__another")
         with pytest.raises(Refused, match="is not the emergency stop of this robot, which is /emergency_stop"):
-            await operator.call("ros", ROBOT, "stop", b"true", metadata=about, timeout_s=20)
+            await operator.call("ros", ROBOT, "stop", b"true", metadata=about)
         assert not robot.nodes.robot.stop.stopped
         await line.close()
-        await operator.call("ros", ROBOT, "stop", b"true", timeout_s=20)
+        await operator.call("ros", ROBOT, "stop", b"true")
         assert robot.nodes.robot.stop.stopped
 
 

@@ -27,8 +27,7 @@ from macs_zenoh.mesh import now_s
 from macs_zenoh.protocol.messages import ROS, UNITY, Metadata, NodeType
 from macs_zenoh.protocol.routing import unicast_key
 from macs_zenoh.protocol.wire import encode_frame, encode_message
-from tests.ros.test_agent import ROBOT, headset, robot  # noqa: F401 - fixtures
-from tests.support.ros_peer import Peer, adding
+from tests.support.ros_peer import ROBOT, Peer, adding
 from tests.support.waiting import get, until
 
 TOPIC = "/emergency_stop"
@@ -65,7 +64,7 @@ def fails(*_: object) -> None:
     raise RuntimeError("this one fails")
 
 
-async def test_a_release_on_its_way_does_not_follow_a_stop(robot: RobotAgent, headset: Agent) -> None:  # noqa: F811
+async def test_a_release_on_its_way_does_not_follow_a_stop(robot: RobotAgent, headset: Agent) -> None:
     """Who asks for a stop overtakes the release that he put before: also while the robot is being stopped."""
     stop, guard = robot.nodes.stop, robot._guard
     assert stop is not None
@@ -83,10 +82,10 @@ async def test_a_release_on_its_way_does_not_follow_a_stop(robot: RobotAgent, he
         on_stop(by)
 
     stop._on_stop = meanwhile
-    await headset.call("ros", ROBOT, "stop", b"true", timeout_s=20)
+    await headset.call("ros", ROBOT, "stop", b"true")
     await asyncio.to_thread(come[0].join)
     assert robot.nodes.robot.stop.stopped
-    await headset.call("ros", ROBOT, "stop", b"false", timeout_s=20)
+    await headset.call("ros", ROBOT, "stop", b"false")
     assert not robot.nodes.robot.stop.stopped
 
 

@@ -191,7 +191,7 @@ async def test_a_type_of_ones_own_without_fields_reaches_an_existing_headset(
         publisher = await peer.publisher(kinds.Nothing, "/nothing", matched=1)
         for _ in range(3):
             await peer.session.run(lambda: publisher.publish(kinds.Nothing()))
-            message = await asyncio.wait_for(topic.__anext__(), 10)
+            message = await asyncio.wait_for(topic.__anext__(), PATIENCE_S)
             assert unity_serializer.read(kinds.Nothing, bytes(message.data)) == kinds.Nothing()
         assert gateway.drops.total() == 0
 
@@ -259,7 +259,7 @@ async def test_a_call_without_fields_reaches_ros(
             response.success = True
         return response
 
-    await peer.session.run(lambda: peer.session.node.create_service(kind, "/do", serve))
+    await peer.service(kind, "/do", serve, nodes.robot.session)
     registration = adding("/do", f"std_srvs/{kind.__name__}", node_type=3, **({"unity_cdr": True} if unity else {}))
     await nodes.add(registration)
     nodes.deliver(of_service("/do", NodeType.CLIENT, NOTHING))

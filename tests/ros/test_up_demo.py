@@ -16,6 +16,7 @@ from geometry_msgs.msg import Twist
 import macs_zenoh
 from tests.support.programs import ROOT, free_port
 from tests.support.ros_peer import Peer
+from tests.support.waiting import PATIENCE_S
 
 PATIENT = "import sys; from bridge.cli import main, up; up.READY_S = 80.0; sys.exit(main())"
 """`macs` on a machine that is busy."""
@@ -107,7 +108,7 @@ async def test_it_ends_whenever_it_is_told_to(domain: int, moments: range) -> No
         await asyncio.sleep(tenth / 10)
         process.send_signal(signal.SIGTERM)
         try:
-            text = (await asyncio.wait_for(reading, 20))[0].decode()
+            text = (await asyncio.wait_for(reading, PATIENCE_S))[0].decode()
         except asyncio.TimeoutError:
             process.kill()
             raise AssertionError(f"told after {tenth / 10} s, it did not end") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from geometry_msgs.msg import Twist
@@ -12,9 +13,15 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from bridge.ros.session import RosSession
+from macs_zenoh.agent import Agent
+from macs_zenoh.mesh import Sample
+from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, RemoveNode, node_name
 from macs_zenoh.protocol.reading import Message
-from tests.support.waiting import until
+from tests.support.waiting import get, until
+
+ROBOT = 7
+"""Id of the robot that the fixture ``robot`` gives."""
 
 
 class Peer:
@@ -40,12 +47,53 @@ class Peer:
         await self.session.run(lambda: self.session.node.create_subscription(kind, topic, receive, qos))
         return received
 
+    async def service(self, kind: type[Any], name: str, answer: Any, robot: RosSession) -> Any:
+        """A service, once the robot knows of it: for a call that comes sooner there is none."""
+        service = await self.session.run(lambda: self.session.node.create_service(kind, name, answer))
+        await known(robot, name)
+        return service
+
     async def sees(self, topic: str, *, publishers: int = 0, subscriptions: int = 0) -> None:
         """Wait until this node knows of exactly so many publishers and subscriptions of a topic, its own included."""
         node = self.session.node
         await until(
             lambda: node.count_publishers(topic) == publishers and node.count_subscribers(topic) == subscriptions
         )
+
+
+async def known(robot: RosSession, *services: str) -> None:
+    """Wait until the robot knows of a server of each of these services."""
+    await until(lambda: all(robot.node.count_services(service) for service in services))
+
+
+async def known_action(robot: RosSession, action: str) -> None:
+    """The same of an action."""
+    await known(robot, *(f"{action}/_action/{part}" for part in ("send_goal", "get_result", "cancel_goal")))
+
+
+class Streams:
+    """Everything that a robot streams, as an agent on the mesh gets it."""
+
+    def __init__(self, agent: Agent, robot: int = ROBOT) -> None:
+        self.frames: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue()
+        self._subscription = agent.mesh.subscribe(STREAM.every(type=1, id=robot), self._take)
+
+    def _take(self, batch: Iterator[Sample]) -> None:
+        for key, payload in batch:
+            self.frames.put_nowait((key, payload))
+
+    async def after(self, publish: Callable[[], None]) -> tuple[str, bytes]:
+        """Key and frame of what comes when ``publish`` is done, again and again until something comes.
+
+        The first can be earlier than the robot's router knows of our subscription.
+        """
+
+        def again() -> bool:
+            publish()
+            return not self.frames.empty()
+
+        await until(again)
+        return await get(self.frames)
 
 
 def pause(node: Any, seconds: float) -> Any:

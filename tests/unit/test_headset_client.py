@@ -310,7 +310,7 @@ async def test_a_call_times_out_alone(router: ScriptedRouter, headset: Headset) 
         await headset.call("/set", SET_BOOL, 1, b"", timeout_s=0.01)
     router.send(node_message(NodeType.CLIENT, "/set", b"late", request_id=0))
     router.send(plain_message(b"after"))
-    assert (await headset.receive(5)).data == b"after"
+    assert (await headset.receive(PATIENCE_S)).data == b"after"
 
 
 async def test_it_serves_as_recorded(router: ScriptedRouter, headset: Headset) -> None:
@@ -366,7 +366,7 @@ async def test_messages_in_pieces_are_whole(router: ScriptedRouter, headset: Hea
     for byte in messages[0]:
         router.send(bytes([byte]))
     router.send(b"".join(messages[1:]))
-    got = [(await headset.receive(5)).data for _ in messages]
+    got = [(await headset.receive(PATIENCE_S)).data for _ in messages]
     assert got == [b"%d" % number for number in range(50)]
 
 
@@ -382,7 +382,7 @@ async def test_a_callback_gets_every_message(router: ScriptedRouter, headset: He
     await headset.subscribe("/chatter", STRING, agents=[1], callback=callback)
     router.send(b"".join(node_message(1, "/chatter", b"%d" % number) for number in range(100)))
     router.send(plain_message(b"end"))
-    await headset.receive(5)
+    await headset.receive(PATIENCE_S)
     assert seen == [b"%d" % number for number in range(100)]
 
 
@@ -394,7 +394,7 @@ async def test_a_slow_taker_costs_no_memory(
     chatter = await headset.subscribe("/chatter", STRING, agents=[1], buffer_size=3, drop_new=drop_new)
     router.send(b"".join(node_message(1, "/chatter", b"%d" % number) for number in range(10)))
     router.send(plain_message(b"end"))
-    await headset.receive(5)
+    await headset.receive(PATIENCE_S)
     assert [int((await chatter.__anext__()).data) for _ in range(3)] == kept
     assert chatter.dropped == 7
 
@@ -438,17 +438,17 @@ async def test_bad_messages_are_survived(router: ScriptedRouter, headset: Headse
 async def test_a_pausing_headset_reads_nothing(router: ScriptedRouter, headset: Headset) -> None:
     """Paused, the headset leaves data in the socket but goes on sending; resumed, it has lost nothing."""
     router.send(plain_message(b"first"))
-    await headset.receive(5)
+    await headset.receive(PATIENCE_S)
     headset.pause()
     router.send(plain_message(b"one read was under way"))
-    await headset.receive(5)
+    await headset.receive(PATIENCE_S)
     router.send(plain_message(b"second"))
     await headset.send(b"still here")
     await router.received(1)
     with pytest.raises(CallTimeout):
         await headset.receive(0.05)
     headset.resume()
-    assert (await headset.receive(5)).data == b"second"
+    assert (await headset.receive(PATIENCE_S)).data == b"second"
 
 
 # --- its end ---
