@@ -1,9 +1,9 @@
 """Verify the record that gateways and robots keep with audit_file: who did what.
 
-Each line carries a hash over the one before, so a line that was changed, removed or put elsewhere is found, also over
-the files in which a record went on (they are found beside FILE). What cannot be found by the files alone: lines cut
-off at the end, and a record written anew as a whole. So note elsewhere what `macs audit head` prints from time to
-time, and hold the record to it with --seen.
+Each line carries a hash over the one before, so a line that was changed, removed or moved is found. Older files of the
+same record, beside FILE, are verified with it. Two things the files alone cannot show: that lines were cut off at the
+end, and that the whole record was written anew. For these, keep what `macs audit head` prints now and then in another
+place, and compare the record with it: --seen.
 
 Exit code 0: nothing is wrong; 1: something is, or a file cannot be read; 2: wrong usage.
 

@@ -2,7 +2,7 @@
 
 `generate` reads a policy (YAML: who exists, who may command, see, call or message whom) and writes a directory for
 each node: its certificate and key, a router's whole configuration, a client's settings. Run again, it keeps what is
-good, renews certificates with less than a third of their life left, and names what is in the policy no more.
+good, renews certificates with less than a third of their life left, and names what is no longer in the policy.
 
 `check` proves by trying, against running routers, that each may do what the policy says and nothing else.
 docs/security.md has the policy's fields and what to do when something is stolen.

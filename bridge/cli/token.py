@@ -1,8 +1,8 @@
-"""Make and end tokens: what a headset shows to be let in, and what it may do then.
+"""Make and end tokens: a headset shows one to be let in, and the token says what it may do then.
 
-A token is printed once, when it is made. The file has its hash, name, rights and end, and is
-good for each gateway that reads it, at once: what is revoked ends within a second, without a
-restart. Copy the file to other gateways, or keep it where all of them read it.
+A token is printed once, when it is made. The file keeps its hash, name, rights and end. Gateways
+follow the file without a restart: a token that is revoked ends within a second. Copy the file to
+other gateways, or keep it where all of them read it.
 
 Rights: see, command, call, serve, act, stop, ask, send, broadcast, robot (docs/security.md).
 What is not named is not permitted.
