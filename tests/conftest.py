@@ -80,6 +80,10 @@ class _RosTests:
         terminalreporter.write_line(verdict if self.passed else f"{verdict}: this run proves too little, so it failed")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--backwards", action="store_true", help="the last file first: no test needs one before it")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     if "PYTEST_XDIST_WORKER" in os.environ:
         isolate()
@@ -93,7 +97,10 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(_RosTests())
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--backwards"):
+        order = {path: -number for number, path in enumerate(dict.fromkeys(item.path for item in items))}
+        items.sort(key=lambda item: order[item.path])
     for item in items:
         if item.nodeid.startswith(ALONE):
             item.add_marker(pytest.mark.alone)

@@ -1,7 +1,8 @@
 """The tests: those that may share the machine at the same time, then one by one those that measure time.
 
 ``python -m tests.run`` is what ``make test`` runs; ``--all`` adds those that take minutes (``make test-all``, CI);
-``--fast`` is those of single modules (``make check``). A part is plain pytest: ``make test ARGS=tests/unit``.
+``--fast`` is those of single modules (``make check``); with ``--backwards`` the last file comes first. A part is plain
+pytest: ``make test ARGS=tests/unit``.
 """
 
 from __future__ import annotations
@@ -37,12 +38,13 @@ def part(name: str, *argv: str, workers: int = 0) -> tuple[bool, int, int]:
 
 def run(words: list[str]) -> list[tuple[bool, int, int]]:
     """The parts that were asked for."""
+    order = ["--backwards"] if "--backwards" in words else []
     if "--fast" in words:
-        return [part("fast", "tests/unit", workers=max(2, CORES))]
+        return [part("fast", "tests/unit", *order, workers=max(2, CORES))]
     tiers = TIERS if "--all" in words else f"{TIERS} and not soak"
-    parts = [part("together", "-m", f"{tiers} and not alone", workers=WORKERS)]
+    parts = [part("together", "-m", f"{tiers} and not alone", *order, workers=WORKERS)]
     os.environ.pop("MACS_NEED_ROS_TESTS", None)  # judged by the first part
-    return [*parts, part("alone", "-m", f"{tiers} and alone")]
+    return [*parts, part("alone", "-m", f"{tiers} and alone", *order)]
 
 
 def main() -> int:
