@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Sequence
 from contextlib import AsyncExitStack
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +16,7 @@ from macs_zenoh.mesh import Mesh
 from macs_zenoh.sections import changed
 from tests.support.given import Connect, StartGateway
 from tests.support.local import patient
+from tests.support.routers import Router
 
 
 @pytest.fixture
@@ -44,3 +46,13 @@ async def connect() -> AsyncIterator[Connect]:
             return headset
 
         yield connect
+
+
+@pytest.fixture
+async def site(tmp_path: Path) -> AsyncIterator[object]:
+    """A site whose router runs."""
+    from tests.support.secured import made  # most tests need no certificates
+
+    found = made(tmp_path / "pki")
+    async with Router(found.file()):
+        yield found
