@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import random
 import socket
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from tests.support.processes import ROOT as ROOT
@@ -14,12 +17,20 @@ from tests.support.processes import Process, finished
 READY = "ready: "
 
 
+_PORTS = range(20_000, 32_768)
+"""Below those that the kernel gives to whoever wants any: no connection gets one that a program shall have."""
+_ports = itertools.cycle(_PORTS)
+for _ in range(random.SystemRandom().randrange(len(_PORTS))):  # test runs beside each other begin elsewhere
+    next(_ports)
+
+
 def free_port() -> int:
-    """A port of 127.0.0.1 that nobody listens on now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    """A port of 127.0.0.1 that nobody listens on now, and that nobody else here is given soon."""
+    for port in _ports:
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError  # the ports never end
 
 
 class Program(Process):
