@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -23,6 +22,7 @@ from macs_zenoh.protocol.keyexpr import NAMED, PRESENCE, STREAM
 from macs_zenoh.protocol.messages import OPERATOR, Metadata, NodeType, StreamData, encode_management
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
+from tests.support.programs import free_port
 from tests.support.waiting import PATIENCE_S
 
 RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
@@ -36,9 +36,7 @@ async def as_user(tmp_path: Path) -> AsyncIterator[Callable[[str], MeshSettings]
     rules.write_text(RULES.read_text().replace("cert_common_names", "usernames"))
     passwords = tmp_path / "passwords"
     passwords.write_text("".join(f"{user}:secret\n" for user in USERS))
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     router = MeshSettings(
         mode="router",
         listen=[endpoint],
