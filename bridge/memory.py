@@ -1,8 +1,9 @@
-"""Memory that large frames took is given back when they are gone."""
+"""Memory: what large frames took is given back when they are gone, and what a program is built of is not gone through."""
 
 from __future__ import annotations
 
 import ctypes
+import gc
 import sys
 from contextlib import suppress
 
@@ -26,3 +27,13 @@ def give_back() -> None:
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(_M_MMAP_THRESHOLD, LARGE_BYTES)
         mallopt(_M_TRIM_THRESHOLD, SPARE_BYTES)
+
+
+def settle() -> None:
+    """What is there by now stays for as long as the program runs: the collector of circles need not go through it.
+
+    It would each time that enough has been made since, while everything waits: 5 to 15 ms in a gateway and 25 ms in a
+    robot agent, measured, where a message takes half of one.
+    """
+    gc.collect()
+    gc.freeze()

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Coroutine
 from typing import Any
 
+from bridge import memory
 from bridge.cli import output
 
 log = logging.getLogger("macs")
@@ -103,4 +104,5 @@ def _new_loop() -> asyncio.AbstractEventLoop:
 
 def say_ready(what: str) -> None:
     """Print on stdout that this program does its work now, and where: people and ``macs up`` wait for this line."""
+    memory.settle()
     output.say_if_possible(f"{READY}{what}")

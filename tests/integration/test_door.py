@@ -24,6 +24,7 @@ from typing import NamedTuple
 import aiohttp
 import pytest
 
+from bridge import memory
 from bridge.gateway import Gateway
 from bridge.gateway.admission import Churn
 from bridge.headset import frames
@@ -740,6 +741,7 @@ async def test_a_flood_leaves_others_their_turn(start_door: StartDoor, what: str
 
     flooding = asyncio.create_task(asyncio.to_thread(flood))
     turns_s = []
+    memory.settle()  # as gateways do; the tests' own heap takes 50 ms to go through
     deadline = time.monotonic() + 2
     began = time.thread_time()
     while time.monotonic() < deadline:
@@ -748,9 +750,10 @@ async def test_a_flood_leaves_others_their_turn(start_door: StartDoor, what: str
         turns_s.append(now - began)
         began = now
     stop.set()
+    gc.unfreeze()
     await flooding
     turns_s.sort()
-    assert turns_s[-3] < 0.1, turns_s[-5:]  # what is done once is not what a flood costs
+    assert turns_s[-3] < 0.05, turns_s[-5:]  # what is done once is not what a flood costs
 
 
 @pytest.mark.parametrize("port", ["plain", "tls", "web"])
