@@ -1,4 +1,4 @@
-"""Memory: what large frames took is given back when they are gone, and what a program is built of is not gone through."""
+"""Memory: what large frames took is given back, and what a program is built of is not gone through."""
 
 from __future__ import annotations
 
