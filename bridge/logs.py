@@ -11,8 +11,9 @@ import os
 import select
 import sys
 import threading
+import time
 from contextlib import suppress
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import TextIO
 
@@ -43,6 +44,11 @@ class Written(logging.Handler):
 
     MOST = 4096
     """Lines that wait."""
+    TOGETHER_S = 0.01
+    """After a write, lines are gathered for so long: in a burst, one write and one wake-up for each would cost the
+    program more than all the rest of the logging."""
+    AT_ONCE = 256
+    """Lines that are written together."""
     LAST_S = 0.3
     """How long `flush` waits for a stream that takes nothing: less than a program has for its last words."""
 
@@ -76,22 +82,37 @@ class Written(logging.Handler):
 
     def _write_all(self) -> None:
         while True:
-            item = self._waiting.get()
+            lines, told = self._gathered(self._waiting.get())
             if (lost := self.lost - self._told) > 0:
                 self._told += lost
-                self._write(self.format(_lost_lines(lost)))
-            if isinstance(item, threading.Event):
-                item.set()
-            else:
-                self._write(item)
+                lines.insert(0, self.format(_lost_lines(lost)))
+            if lines:
+                self._write("\n".join(lines))
+            if told is not None:
+                told.set()  # who waits for it may be ending this program
+            elif len(lines) < self.AT_ONCE:
+                time.sleep(self.TOGETHER_S)
 
-    def _write(self, line: str) -> None:
+    def _gathered(self, item: str | threading.Event) -> tuple[list[str], threading.Event | None]:
+        """The lines that wait, up to somebody who is to be told when these are written."""
+        lines: list[str] = []
+        with suppress(Empty):
+            while True:
+                if isinstance(item, threading.Event):
+                    return lines, item
+                lines.append(item)
+                if len(lines) == self.AT_ONCE:
+                    break
+                item = self._waiting.get_nowait()
+        return lines, None
+
+    def _write(self, text: str) -> None:
         with suppress(OSError, ValueError):  # nobody is there any more, and there is nobody to tell
             if self._descriptor is None:
-                self._stream.write(line + "\n")
+                self._stream.write(text + "\n")
                 self._stream.flush()
                 return
-            left = memoryview((line + "\n").encode(self._stream.encoding or "utf-8", "backslashreplace"))
+            left = memoryview((text + "\n").encode(self._stream.encoding or "utf-8", "backslashreplace"))
             while left:  # past Python's own buffer, whose lock must be free when the program ends
                 try:
                     left = left[os.write(self._descriptor, left) :]
@@ -115,6 +136,8 @@ def log_to_stderr() -> None:
     """Log to stderr, unless somebody has set that up before; other libraries only from WARNING on."""
     root = logging.getLogger()
     if not root.handlers:
+        # no line has these, and to find them out takes longer than to write it
+        logging.logThreads = logging.logProcesses = logging.logMultiprocessing = False
         root.addHandler(Written(sys.stderr))
         prefix_logs("")
 

@@ -12,6 +12,9 @@ LARGE_BYTES = 4 << 20
 SPARE_BYTES = 32 << 20
 """The heap keeps so much at its end."""
 
+SELDOM = 10_000
+"""So many objects more than before have Python look for circles among the young ones; by itself it does at 700."""
+
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 
@@ -37,3 +40,12 @@ def settle() -> None:
     """
     gc.collect()
     gc.freeze()
+
+
+def collect_seldom() -> None:
+    """Look for circles of objects less often, for programs to which thousands connect.
+
+    Connections end without circles, so there are few of these; but each that comes has hundreds of objects, and to
+    look at those of all others again and again took a tenth of what a connection costs.
+    """
+    gc.set_threshold(SELDOM)

@@ -182,6 +182,7 @@ async def _serve(settings: Settings) -> int:
 
     _raise_descriptor_limit()
     memory.give_back()
+    memory.collect_seldom()
     if settings.mesh.mode == "router":
         _judge_router(settings.mesh)
     own = managers.load(settings.gateway.managers)

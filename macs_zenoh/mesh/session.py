@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -74,6 +75,7 @@ class Mesh:
         """As whom others know this session. One that was chosen is no secret."""
         self._session = session = watched(session)
         self._loop = asyncio.get_running_loop()
+        self._loop_thread = threading.get_ident()
         end_on_panics(self._loop)
         self._loopback = Loopback()
         self._arrivals = Arrivals(self._loop, self._from_thread, self.drops, self._loopback)
@@ -451,8 +453,10 @@ class Mesh:
     # -- threads -------------------------------------------------------------------------------------------------
 
     def _from_thread(self, callback: Callable[..., object], *args: object) -> None:
+        # a token that is declared on the loop calls back there, and the loop need not be woken
+        here = threading.get_ident() == self._loop_thread
         try:
-            self._loop.call_soon_threadsafe(callback, *args)
+            (self._loop.call_soon if here else self._loop.call_soon_threadsafe)(callback, *args)
         except RuntimeError:  # the loop is closed: the program is ending and nobody waits for this
             log.debug("the event loop has ended")
 
