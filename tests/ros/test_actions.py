@@ -318,7 +318,7 @@ async def test_a_cancellation_whose_answer_is_lost_is_asked_for_again(
     monkeypatch.setattr("bridge.ros.actions.CANCEL_AGAIN_S", 0.1)
     lost = Answers(site.counter.server._handle)
     monkeypatch.setattr(site.counter.server, "_handle", lost)
-    goal = await site.five.client.send_goal(7, site.goal(1, 3600))
+    goal = await site.five.client.send_goal(7, site.goal(1, 3600.0))
     await goal.cancel()
     assert lost.count == 1
 
