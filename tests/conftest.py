@@ -36,7 +36,6 @@ SOAK = (
     "tests/attack/",
     "tests/network/",
     "tests/integration/test_deploy_doc.py",
-    "tests/integration/test_door.py::test_ten_thousand_attempts_leave_nothing_behind",
     "tests/integration/test_limits.py::test_a_thousand_headsets",
     "tests/integration/test_wheel.py::test_a_shipped_interface_package_builds",
     "tests/ros/test_awareness_robots.py",
