@@ -14,8 +14,8 @@ from tests.support.waiting import PATIENCE_S, until
 async def test_what_says_who_is_there_says_where_to_send(router: str) -> None:
     """A type is taken as AgentInfo has it, a number, and as Message has it, a text; by send, call and join alike."""
     async with (
-        macs_zenoh.join(1, id=7, connect=[router]) as robot,
-        macs_zenoh.join("2", id=300, connect=[router]) as headset,
+        macs_zenoh.join(1, id=7, settings=patient(router)) as robot,
+        macs_zenoh.join("2", id=300, settings=patient(router)) as headset,
     ):
         assert (robot.type, headset.type) == ("ros", "unity")
         await until(lambda: len(headset.online()) == 2)
@@ -34,9 +34,9 @@ async def test_what_says_who_is_there_says_where_to_send(router: str) -> None:
 async def test_a_reply_goes_to_who_asked_with_its_number(router: str) -> None:
     """What answers a message carries its request id, and goes to its sender alone."""
     async with (
-        macs_zenoh.join("ros", id=7, connect=[router]) as robot,
-        macs_zenoh.join("unity", id=300, connect=[router]) as headset,
-        macs_zenoh.join("unity", id=301, connect=[router]) as other,
+        macs_zenoh.join("ros", id=7, settings=patient(router)) as robot,
+        macs_zenoh.join("unity", id=300, settings=patient(router)) as headset,
+        macs_zenoh.join("unity", id=301, settings=patient(router)) as other,
     ):
         await until(lambda: len(headset.online()) == len(robot.online()) == 3)
         headset.send(b"?", to="ros", ids=[7], metadata=macs_zenoh.Metadata(request_id=41))
@@ -50,7 +50,7 @@ async def test_a_reply_goes_to_who_asked_with_its_number(router: str) -> None:
 @pytest.mark.parametrize("data", ["text", ["a list"], 7, None])
 async def test_data_that_is_no_bytes_is_refused_by_name(router: str, data: object) -> None:
     """Every way to send says that data is bytes, and what to do with text."""
-    async with macs_zenoh.join("unity", id=300, connect=[router]) as agent:
+    async with macs_zenoh.join("unity", id=300, settings=patient(router)) as agent:
         said = r"text\.encode" if isinstance(data, str) else rf"bytes, not {type(data).__name__}"
         with pytest.raises(macs_zenoh.UsageError, match=said):
             agent.send(data, to="ros", ids=[7])  # type: ignore[arg-type]
@@ -97,7 +97,7 @@ async def test_drain_waits_for_what_was_sent_before(router: str) -> None:
 
 async def test_every_callback_ends_with_its_handle(router: str) -> None:
     """on_presence, on_id, on_message and serve give a handle; closed, nothing is called any more."""
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as robot:
         first: list[int] = []
         second: list[int] = []
         ended = robot.on_presence(lambda agent, online: first.append(agent.id))
@@ -108,7 +108,7 @@ async def test_every_callback_ends_with_its_handle(router: str) -> None:
         assert not ended.is_open
 
         heard: list[bytes] = []
-        async with macs_zenoh.join("unity", id=300, connect=[router]) as headset:
+        async with macs_zenoh.join("unity", id=300, settings=patient(router)) as headset:
             await until(lambda: 300 in second)
             assert first == [7]
 
@@ -131,7 +131,7 @@ async def test_every_callback_ends_with_its_handle(router: str) -> None:
 
 async def test_another_handler_is_not_ended_by_the_first_ones_handle(router: str) -> None:
     """A handler that was replaced ends nothing but itself."""
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as robot:
         old = robot.on_message(lambda message: None)
         heard: list[bytes] = []
         robot.on_message(lambda message: heard.append(message.data))
@@ -142,7 +142,7 @@ async def test_another_handler_is_not_ended_by_the_first_ones_handle(router: str
 
 async def test_a_callback_may_end_callbacks(router: str) -> None:
     """Who is told may end the others' handles and its own."""
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as robot:
         told: list[str] = []
         handles: list[macs_zenoh.Handle] = []
 
@@ -154,14 +154,14 @@ async def test_a_callback_may_end_callbacks(router: str) -> None:
 
         handles.append(robot.on_presence(tell))
         handles.append(robot.on_presence(lambda agent, online: told.append(f"second {agent.id}")))
-        async with macs_zenoh.join("unity", id=300, connect=[router]):
+        async with macs_zenoh.join("unity", id=300, settings=patient(router)):
             await until(lambda: "first" in told)
         assert told == ["second 7", "first"]
 
 
 async def test_what_is_done_after_the_end_says_so(router: str) -> None:
     """After it has left, receive, send, call and serve say that the agent is closed, and iteration ends."""
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as robot:
         waiting = asyncio.ensure_future(robot.receive())
         await asyncio.sleep(0)
 
@@ -180,7 +180,7 @@ async def test_what_is_done_after_the_end_says_so(router: str) -> None:
 
 async def test_an_answer_that_does_not_come_is_a_timeout(router: str) -> None:
     """Who waits for a call as asyncio's users do catches it as a TimeoutError."""
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as robot:
 
         async def sleep(call: macs_zenoh.Call) -> bytes:
             await asyncio.sleep(60)
@@ -199,8 +199,11 @@ async def test_a_callback_that_fails_keeps_nobody_from_hearing(router: str) -> N
         if agent.id in (6, 7):
             raise RuntimeError("a fault of ours")
 
-    async with macs_zenoh.join("unity", id=5, connect=[router]) as one:
+    async with macs_zenoh.join("unity", id=5, settings=patient(router)) as one:
         one.on_presence(failing)
         one.on_presence(lambda agent, online: heard.append(agent.id))
-        async with macs_zenoh.join("unity", id=6, connect=[router]), macs_zenoh.join("unity", id=7, connect=[router]):
+        async with (
+            macs_zenoh.join("unity", id=6, settings=patient(router)),
+            macs_zenoh.join("unity", id=7, settings=patient(router)),
+        ):
             await until(lambda: {6, 7} <= set(heard))

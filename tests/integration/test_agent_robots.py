@@ -22,6 +22,7 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
+from tests.support.local import patient
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
 
@@ -66,7 +67,7 @@ class Robot:
 
 @contextlib.asynccontextmanager
 async def robot(router: str, number: int, group: int = 3, refusal: str = "") -> AsyncIterator[Robot]:
-    async with macs_zenoh.join("ros", id=number, group=group, connect=[router]) as agent:
+    async with macs_zenoh.join("ros", id=number, group=group, settings=patient(router)) as agent:
         robot = Robot(agent, refusal)
         talking = asyncio.create_task(robot.chatter())
         try:
@@ -93,7 +94,7 @@ async def test_some_may_refuse_and_all_may_not(router: str) -> None:
     async with (
         robot(router, 1),
         robot(router, 2, refusal="not this one") as second,
-        macs_zenoh.join("unity", id=300, connect=[router]) as agent,
+        macs_zenoh.join("unity", id=300, settings=patient(router)) as agent,
     ):
         await knows(agent, 1, 2)
         some = await agent.subscribe(TOPIC, group=3, type=STRING)
@@ -121,7 +122,7 @@ async def test_a_refusal_concerns_whom_it_is_about(router: str, caplog: pytest.L
     async with (
         robot(router, 1) as first,
         robot(router, 2) as second,
-        macs_zenoh.join("unity", id=300, connect=[router]) as agent,
+        macs_zenoh.join("unity", id=300, settings=patient(router)) as agent,
     ):
         await knows(agent, 1, 2)
         one, two = [await agent.subscribe(TOPIC, robot=number, type=STRING) for number in (1, 2)]
@@ -149,7 +150,7 @@ async def test_reasons_are_told_by_robot(router: str) -> None:
     async with (
         robot(router, 1, refusal="too full"),
         robot(router, 2, refusal="not this one"),
-        macs_zenoh.join("unity", id=300, connect=[router]) as agent,
+        macs_zenoh.join("unity", id=300, settings=patient(router)) as agent,
     ):
         await knows(agent, 1, 2)
         with pytest.raises(macs_zenoh.Refused, match=r"^ros/1: too full; ros/2: not this one$"):
@@ -159,8 +160,8 @@ async def test_reasons_are_told_by_robot(router: str) -> None:
 async def test_a_silent_robot_is_a_timeout_and_leaves_nothing(router: str) -> None:
     """A robot that does not answer costs the time that was given, and is asked no more after that."""
     async with (
-        macs_zenoh.join("ros", id=1, connect=[router]),
-        macs_zenoh.join("unity", id=300, connect=[router]) as agent,
+        macs_zenoh.join("ros", id=1, settings=patient(router)),
+        macs_zenoh.join("unity", id=300, settings=patient(router)) as agent,
     ):
         await knows(agent, 1)
         with pytest.raises(TimeoutError, match="registration of /chatter on ros/1"):
@@ -174,7 +175,7 @@ async def test_one_of_several_users_leaves(router: str) -> None:
     async with (
         robot(router, 1) as first,
         robot(router, 2) as second,
-        macs_zenoh.join("unity", id=300, connect=[router]) as agent,
+        macs_zenoh.join("unity", id=300, settings=patient(router)) as agent,
     ):
         await knows(agent, 1, 2)
         one = await agent.subscribe(TOPIC, robot=1, type=STRING)
@@ -194,7 +195,7 @@ async def test_one_of_several_users_leaves(router: str) -> None:
 
 async def test_many_subscribe_at_once(router: str) -> None:
     """Users that come at the same moment share the node as well, also where it has to be asked for its type first."""
-    async with robot(router, 1) as first, macs_zenoh.join("unity", id=300, connect=[router]) as agent:
+    async with robot(router, 1) as first, macs_zenoh.join("unity", id=300, settings=patient(router)) as agent:
 
         async def offers(call: macs_zenoh.Call) -> bytes:
             await asyncio.sleep(0.05)
@@ -233,7 +234,7 @@ async def test_registrations_survive_the_router() -> None:
 
 async def test_what_is_given_is_checked(router: str) -> None:
     """What cannot be sent is refused here, by name, before anything goes out."""
-    async with robot(router, 1) as first, macs_zenoh.join("unity", id=300, connect=[router]) as agent:
+    async with robot(router, 1) as first, macs_zenoh.join("unity", id=300, settings=patient(router)) as agent:
         await knows(agent, 1)
         drive = await agent.advertise("/cmd_vel", robot=1, type="geometry_msgs/Twist")
         with pytest.raises(macs_zenoh.UsageError, match=r"bytes .*or a value with its fields, not str"):

@@ -14,6 +14,7 @@ from macs_zenoh.awareness import Awareness, Received
 from macs_zenoh.errors import Unreachable, UsageError
 from macs_zenoh.protocol.keyexpr import NAME, NAMED, NAMED_ALL
 from macs_zenoh.protocol.named import Outcome
+from tests.support.local import patient
 from tests.support.programs import Program, free_port, macs
 from tests.support.waiting import PATIENCE_S, until
 
@@ -26,7 +27,7 @@ async def meet(router: str) -> AsyncIterator[Meet]:
     async with AsyncExitStack() as stack:
 
         async def meet(name: str, **options: object) -> Awareness:
-            agent = await stack.enter_async_context(macs_zenoh.join("ros", connect=[router]))
+            agent = await stack.enter_async_context(macs_zenoh.join("ros", settings=patient(router)))
             return await stack.enter_async_context(awareness.join(agent, name, **options))  # type: ignore[arg-type]
 
         yield meet
@@ -185,7 +186,8 @@ async def test_ten_megabytes_arrive_whole(meet: Meet, how: str) -> None:
     """10 MB to one and to all arrive byte for byte, with small messages in between; above the limit is refused."""
     a, b = await meet("a"), await meet("b", max_bytes=20)
     module, small = Module(b, "t"), Module(b, "small")
-    await a.wait_for("b", "small", timeout_s=PATIENCE_S)
+    for message_type in ("t", "small"):
+        await a.wait_for("b", message_type, timeout_s=PATIENCE_S)
     data = bytes(range(256)) * 40_000
     if how == "send":
         assert a.send("b", "t", data) is Outcome.SENT
@@ -263,12 +265,12 @@ async def test_a_closed_registration_is_known(meet: Meet) -> None:
 async def test_names_are_listed() -> None:
     """`macs ls` shows the name beside type and id, and others see it come and go."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    async with Program("router", "-l", endpoint), macs_zenoh.join("ros", id=3, connect=[endpoint]) as robot:
+    async with Program("router", "-l", endpoint), macs_zenoh.join("ros", id=3, settings=patient(endpoint)) as robot:
         seen: list[str] = []
         async with awareness.join(robot, "drone0") as drone:
             drone.on_change(seen.append)
             async with (
-                macs_zenoh.join("unity", id=300, connect=[endpoint]) as headset,
+                macs_zenoh.join("unity", id=300, settings=patient(endpoint)) as headset,
                 awareness.join(headset, "ground"),
             ):
                 await drone.wait_for("ground", timeout_s=PATIENCE_S)
@@ -292,8 +294,8 @@ async def test_nothing_is_lost_for_ever_with_a_router(tmp_path: object) -> None:
     await router.start()
     try:
         async with (
-            macs_zenoh.join("ros", id=1, connect=[endpoint]) as one,
-            macs_zenoh.join("ros", id=2, connect=[endpoint]) as two,
+            macs_zenoh.join("ros", id=1, settings=patient(endpoint)) as one,
+            macs_zenoh.join("ros", id=2, settings=patient(endpoint)) as two,
             awareness.join(one, "a") as a,
             awareness.join(two, "b") as b,
         ):

@@ -27,6 +27,7 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, split_message
 from tests.integration.test_limits import answers, memory_bytes, site
 from tests.support.given import Connect, StartGateway
+from tests.support.local import patient
 from tests.support.waiting import PATIENCE_S, until
 
 
@@ -117,7 +118,7 @@ async def test_names_that_no_key_can_have(start_gateway: StartGateway, connect: 
         await attacker.send(registration(name, group=200, robots=(1,)))
     await until(lambda: len(attacker.refusals()) == 4)
     assert all(refused.reason for refused in attacker.refusals())
-    async with macs_zenoh.join("ros", id=1, group=200, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=1, group=200, settings=patient(router)) as robot:
 
         async def accept(call: macs_zenoh.Call) -> bytes:
             return b""

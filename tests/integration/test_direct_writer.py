@@ -28,6 +28,7 @@ from macs_zenoh.protocol.tcp_agent import TcpAgent
 from macs_zenoh.protocol.wire import encode_frame, encode_message, split_message
 from macs_zenoh.streams import Streams
 from tests.support.given import StartGateway
+from tests.support.local import patient
 from tests.support.matching import matched
 from tests.support.waiting import PATIENCE_S, until
 
@@ -93,7 +94,7 @@ def sent_now(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 @pytest.fixture
 async def robot(router: str) -> AsyncIterator[Agent]:
     """Robot 7, which lets anybody register."""
-    async with join("ros", id=7, connect=[router]) as agent:
+    async with join("ros", id=7, settings=patient(router)) as agent:
 
         async def add(_call: object) -> bytes:
             return b""

@@ -17,7 +17,6 @@ import pytest
 import macs_zenoh
 from bridge.gateway import Gateway
 from macs_zenoh.agent import Agent
-from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM
@@ -35,6 +34,7 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.routing import call, unicast_key
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.support.given import Connect, StartGateway
+from tests.support.local import patient
 from tests.support.matching import matched
 from tests.support.waiting import PATIENCE_S, until
 
@@ -381,7 +381,7 @@ async def test_a_program_on_the_mesh_deafens_nobody(
 ) -> None:
     """Whatever a Zenoh session puts, also in the name of the robot and on its topics, harms neither."""
     _, headset, robot = stage
-    async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
+    async with await Mesh.open(patient(router)) as mesh:
         for agent in (900, robot.id if kind == ROS else headset.id):
 
             def send(
@@ -408,7 +408,7 @@ async def test_a_program_on_the_mesh_deafens_nobody(
 async def test_a_python_agent_deafens_nobody(router: str, stage: tuple[Gateway, Headset, Robot]) -> None:
     """What README shows, and the rest that the API can say, harms neither; questions to the robot are answered."""
     _, headset, robot = stage
-    async with macs_zenoh.join("ros", id=900, connect=[router]) as agent:
+    async with macs_zenoh.join("ros", id=900, settings=patient(router)) as agent:
         agent.broadcast(b"robot 900 is here")
         agent.send(b"got it", to="ros", ids=[robot.id])
         agent.send(b"got it", to="unity", ids=[headset.id])
@@ -435,7 +435,7 @@ async def test_a_python_agent_deafens_nobody(router: str, stage: tuple[Gateway, 
 @asynccontextmanager
 async def lenient_robot(router: str) -> AsyncIterator[Agent]:
     """A robot on the mesh that lets anybody register."""
-    async with macs_zenoh.join("ros", id=901, connect=[router]) as agent:
+    async with macs_zenoh.join("ros", id=901, settings=patient(router)) as agent:
 
         async def add(_call: object) -> bytes:
             return b""
@@ -457,7 +457,7 @@ async def test_what_its_own_robot_says_is_of_its_type(
     gateway, headset, robot = stage
     connection = gateway.agents.find(UNITY, headset.id)
     assert connection is not None
-    async with await Mesh.open(MeshSettings(connect=[router])) as mesh, lenient_robot(router) as agent:
+    async with await Mesh.open(patient(router)) as mesh, lenient_robot(router) as agent:
         if way == "agent":
             await until(lambda: (ROS, agent.id) in gateway.directory)
             headset.register(agent.id)

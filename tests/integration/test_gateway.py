@@ -25,6 +25,7 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.wire import encode_frame, encode_message, split_message
 from macs_zenoh.streams import Streams
 from tests.support.given import Connect, StartGateway
+from tests.support.local import patient
 from tests.support.sockets import socket
 from tests.support.waiting import PATIENCE_S, until
 
@@ -195,7 +196,7 @@ async def test_registrations_reach_robots_that_come_later(
             wanted.put_nowait(decode_data(AddNode, call.data))
             return b""
 
-        async with macs_zenoh.join("ros", id=9, group=5, connect=[router]) as robot:
+        async with macs_zenoh.join("ros", id=9, group=5, settings=patient(router)) as robot:
             robot.serve("add_node", add)
             topics = {(await asyncio.wait_for(wanted.get(), PATIENCE_S)).tos_name for _ in range(2)}
             assert topics == {"/pose", "/scan"}
@@ -206,7 +207,7 @@ async def test_a_stalled_headset_is_let_go(router: str, start_gateway: StartGate
     gateway = await start_gateway(write_timeout_s=0.5, outbox_bytes=1 << 20)
     neighbour, stalled = await connect(gateway), await connect(gateway)
     stalled.pause()
-    async with macs_zenoh.join("ros", id=1, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=1, settings=patient(router)) as robot:
         metadata = Metadata(1, 1, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__image", "sensor_msgs/Image")
         management = encode_management(StreamData({"2": [neighbour.id, stalled.id]}))
         image = encode_frame(1, management=management, message=encode_message(metadata.encode(), bytes(200_000)))
@@ -261,7 +262,7 @@ async def test_who_drives_is_not_held_for_what_else_he_sends(
     connection = gateway.agents.find(2, sender.id)
     mail = encode_frame(2, (slow.id,), message=encode_message(METADATA, bytes(1_000_000)))
     driving = Metadata(node_type=2, node_name="nd__cmd_vel", data_exchange_type="geometry_msgs/Twist").encode()
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as robot:
         await until(lambda: (1, 7) in gateway.directory)
         command = encode_frame(1, (robot.id,), message=encode_message(driving, b"on"))
         receiver = gateway.agents.find(2, slow.id)

@@ -16,6 +16,7 @@ from macs_zenoh.protocol.rate_limit import Flow, Pace, Passing
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.support.given import Connect, StartGateway
+from tests.support.local import patient
 from tests.support.sockets import Socket, socket
 from tests.support.waiting import until
 
@@ -24,7 +25,7 @@ MOVE, STOP = ("nd__cmd_vel", "geometry_msgs/Twist"), ("nd__emergency_stop", "std
 
 @pytest.fixture
 async def robot(router: str) -> AsyncIterator[Agent]:
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as robot:
         yield robot
 
 

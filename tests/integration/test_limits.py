@@ -28,6 +28,7 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
 from tests.support.given import Connect, StartGateway
+from tests.support.local import patient
 from tests.support.programs import Program, free_port
 from tests.support.waiting import PATIENCE_S, until
 
@@ -81,7 +82,7 @@ async def test_a_stalled_headset_costs_its_limit() -> None:
         neighbour = await stack.enter_async_context(await Headset.connect("127.0.0.1", gateway.port))
         stalled = socket.create_connection(("127.0.0.1", gateway.port))
         stack.callback(stalled.close)
-        sender = await stack.enter_async_context(macs_zenoh.join("ros", id=1, connect=[endpoint]))
+        sender = await stack.enter_async_context(macs_zenoh.join("ros", id=1, settings=patient(endpoint)))
 
         async def accept(call: macs_zenoh.Call) -> bytes:
             return b""
@@ -209,7 +210,7 @@ async def test_a_refusal_is_told(router: str, start_gateway: StartGateway, caplo
     async def refuse(call: macs_zenoh.Call) -> bytes:
         raise Refused("no such type here")
 
-    async with macs_zenoh.join("ros", id=1, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=1, settings=patient(router)) as robot:
         robot.serve("add_node", refuse)
         async with await Headset.connect("127.0.0.1", gateway.port) as headset:
             await headset.subscribe("/secret", "my_msgs/Secret", agents=[1])
@@ -229,7 +230,7 @@ async def test_a_node_name_of_another_topic_is_refused(router: str, start_gatewa
         asked.append(call)
         return b""
 
-    async with macs_zenoh.join("ros", id=1, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=1, settings=patient(router)) as robot:
         robot.serve("add_node", accept)
         async with await Headset.connect("127.0.0.1", gateway.port) as headset:
             evil = NodeSpec(NodeType.PUBLISHER, "/evil_cmd", "geometry_msgs/Twist")
@@ -245,7 +246,7 @@ async def test_a_name_with_another_type_is_kept_away(
 ) -> None:
     """A message under the name of a headset's node with another node type, which would deafen it, is not sent."""
     gateway = await start_gateway()
-    async with macs_zenoh.join("ros", id=1, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=1, settings=patient(router)) as robot:
 
         async def accept(call: macs_zenoh.Call) -> bytes:
             return b""
@@ -310,7 +311,7 @@ async def test_those_that_do_not_read_have_a_limit_together() -> None:
             sock.sendall(encode_frame(management=management))
         while len((await neighbour.online()).unity_agent_ids) < 11:
             await asyncio.sleep(0.05)
-        sender = await stack.enter_async_context(macs_zenoh.join("ros", id=1, connect=[endpoint]))
+        sender = await stack.enter_async_context(macs_zenoh.join("ros", id=1, settings=patient(endpoint)))
         before = memory_bytes(gateway.pid)
         for _ in range(2):
             for number in range(10):

@@ -16,6 +16,7 @@ import pytest
 import macs_zenoh
 from macs_zenoh.errors import Refused
 from tests.support.given import Connect, StartGateway
+from tests.support.local import patient
 from tests.support.programs import ROOT, ended, macs
 from tests.support.sockets import socket
 from tests.support.waiting import PATIENCE_S, until
@@ -67,7 +68,9 @@ async def start_robot(router: str) -> AsyncIterator[StartRobot]:
 
         async def start(robot_id: int, group: int = 0) -> Robot:
             robot = Robot(robot_id)
-            agent = await stack.enter_async_context(macs_zenoh.join("ros", id=robot_id, group=group, connect=[router]))
+            agent = await stack.enter_async_context(
+                macs_zenoh.join("ros", id=robot_id, group=group, settings=patient(router))
+            )
             robot.serve(agent)
             await agent.call("ros", robot_id, "status")
             robot.calls.clear()
@@ -220,7 +223,7 @@ async def test_ls_knows_robots_that_tell_nothing(router: str, start_gateway: Sta
 async def test_a_session_that_serves_no_robot_verbs_is_no_fault(router: str) -> None:
     """A program with a session of its own, which is no robot agent, is listed without a question mark; a stop says
     that it is there."""
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
         await agent.call("ros", 7, "ping")
         row, *_ = await macs("ls", "--json", "-e", router)
         assert (row["status"], row["problem"]) == (None, "")
@@ -233,7 +236,7 @@ async def test_an_answer_that_makes_no_sense_is_told(router: str) -> None:
     answers = [b"", b"[]", b"{}", b"\xff", b'{"ros_node": 1}', b"[" * 100_000]
     good = {"ros_node": "\x1b[2Jboo", "stopped": True, "stop": {"by": "\x1b]0;x\x07"}, "nodes": []}
     answers.append(json.dumps(good).encode())
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
         answer = b""
 
         async def tell(_call: macs_zenoh.Call) -> bytes:

@@ -17,6 +17,7 @@ import pytest
 import macs_zenoh
 from bridge.headset.client import Headset
 from macs_zenoh import awareness
+from tests.support.local import patient
 from tests.support.processes import finished
 from tests.support.programs import Program, free_port
 
@@ -94,7 +95,7 @@ async def test_stop_stops_all_robots_whatever_becomes_of_its_output(endpoint: st
             now = {"by": "operator/0", "seconds": 0, "times": 1}
             return json.dumps({"ros_node": "r", "stopped": True, "stop": now, "nodes": []}).encode()
 
-        robot = await stack.enter_async_context(macs_zenoh.join("ros", id=number, connect=[endpoint]))
+        robot = await stack.enter_async_context(macs_zenoh.join("ros", id=number, settings=patient(endpoint)))
         robot.serve("stop", stop)
         robot.serve("status", status)
 
@@ -108,7 +109,7 @@ async def test_stop_stops_all_robots_whatever_becomes_of_its_output(endpoint: st
 async def test_json_is_json_in_every_encoding(endpoint: str) -> None:
     """With PYTHONIOENCODING=ascii a name that is not ASCII is escaped as JSON has it, and text is not a traceback."""
     async with (
-        macs_zenoh.join("ros", id=7, connect=[endpoint]) as robot,
+        macs_zenoh.join("ros", id=7, settings=patient(endpoint)) as robot,
         awareness.join(robot, "dröhne"),
         Program("gateway", "--port", "0", "-e", endpoint) as gateway,
         await Headset.connect("127.0.0.1", gateway.port) as headset,

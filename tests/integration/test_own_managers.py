@@ -21,13 +21,13 @@ import macs_zenoh
 import macs_zenoh.managers
 from bridge.gateway import Gateway
 from bridge.settings import GatewaySettings
-from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import Refused
 from macs_zenoh.managers import Asker, Manager
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import type_number
 from macs_zenoh.protocol.messages import Metadata, decode_data, encode_data
 from macs_zenoh.protocol.wire import encode_frame, encode_message
+from tests.support.local import patient
 from tests.support.programs import ROOT, Program, ended, free_port, macs
 from tests.support.sockets import Socket, socket
 from tests.support.waiting import PATIENCE_S, until
@@ -193,7 +193,7 @@ class Moody(Manager):
 @asynccontextmanager
 async def moody_gateway(router: str) -> AsyncIterator[Gateway]:
     """A gateway in this process with the manager above."""
-    async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
+    async with await Mesh.open(patient(router)) as mesh:
         gateway = Gateway(mesh, GatewaySettings(port=0), {"Moody": Moody()})
         await gateway.start()
         try:
@@ -257,7 +257,7 @@ async def test_a_manager_in_a_program_of_ones_own(router: str, monkeypatch: pyte
     async with (
         moody_gateway(router) as gateway,
         socket(gateway) as headset,
-        macs_zenoh.join("ros", id=300, connect=[router]) as agent,
+        macs_zenoh.join("ros", id=300, settings=patient(router)) as agent,
     ):
         serving = asyncio.create_task(names["serve"](agent))
         headset.configure()

@@ -10,6 +10,7 @@ import macs_zenoh
 from bridge.gateway.server import Gateway
 from bridge.headset.client import Headset
 from tests.support.given import Connect, StartGateway
+from tests.support.local import patient
 from tests.support.waiting import PATIENCE_S
 
 
@@ -22,7 +23,7 @@ async def test_what_waits_beyond_its_limit_is_dropped_and_the_connection_stays(
     headset: Headset = await connect(gateway)
     number = headset.id
     headset.pause()
-    async with macs_zenoh.join("ros", id=1, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=1, settings=patient(router)) as robot:
         for sent in range(2000):
             robot.send(sent.to_bytes(4, "big") + bytes(50_000), to="unity", ids=[headset.id])
             await asyncio.sleep(0.002)

@@ -9,7 +9,6 @@ import time
 import pytest
 
 import macs_zenoh
-from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import NotServed, Refused
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol import ping
@@ -33,6 +32,7 @@ from macs_zenoh.protocol.routing import call, unicast_key
 from macs_zenoh.protocol.wire import PROBE, encode_frame, encode_message
 from macs_zenoh.streams import Streams
 from tests.support.given import Connect, StartGateway
+from tests.support.local import patient
 from tests.support.sockets import Socket, socket
 from tests.support.waiting import PATIENCE_S, until
 
@@ -130,7 +130,7 @@ async def test_the_sender_is_who_the_key_says(
     """Whatever metadata says, a headset is told the sender of the key, for each frame of a run, by every key."""
     gateway = await start_gateway()
     true = Metadata(ROS, 7, 5, "Greeting").encode()
-    async with socket(gateway) as headset, await Mesh.open(MeshSettings(connect=[router])) as robot:
+    async with socket(gateway) as headset, await Mesh.open(patient(router)) as robot:
         headset.configure(group=3)
         await headset.online()
         for key in (
@@ -166,8 +166,8 @@ async def test_topic_data_only_for_whom_registered_it(
         return encode_frame(ROS, management=management, message=encode_message(metadata.encode(), text))
 
     async with (
-        macs_zenoh.join("ros", id=7, connect=[router]) as seven,
-        macs_zenoh.join("ros", id=8, connect=[router]) as eight,
+        macs_zenoh.join("ros", id=7, settings=patient(router)) as seven,
+        macs_zenoh.join("ros", id=8, settings=patient(router)) as eight,
     ):
         asked = [_accepting(robot) for robot in (seven, eight)]
         chatter = await of_seven.subscribe("/chatter", "std_msgs/String", agents=[7])
@@ -196,7 +196,7 @@ async def test_topic_data_stops_when_the_registration_does(
     async with (
         socket(gateway) as left,
         socket(gateway) as stays,
-        macs_zenoh.join("ros", id=7, connect=[router]) as robot,
+        macs_zenoh.join("ros", id=7, settings=patient(router)) as robot,
     ):
         asked = _accepting(robot)
         for headset in (left, stays):
@@ -229,7 +229,7 @@ async def test_what_comes_with_the_configuration_is_by_who_the_agent_becomes(
         callers.append((call.sender_id, node.registrant_agent_id))
         return b""
 
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as other, socket(gateway) as headset:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as other, socket(gateway) as headset:
         other.serve("add_node", add)
         headset.configure()
         await until(lambda: (ROS, 7) in gateway.directory and (UNITY, headset.id) in gateway.directory)
@@ -264,7 +264,7 @@ def _accepting(robot: macs_zenoh.Agent) -> list[macs_zenoh.Call]:
 async def test_a_registration_for_somebody_else_is_refused(router: str, start_gateway: StartGateway) -> None:
     """Nobody registers another agent on an existing robot program, nor takes its registration back."""
     gateway = await start_gateway()
-    async with socket(gateway) as robot, await Mesh.open(MeshSettings(connect=[router])) as mesh:
+    async with socket(gateway) as robot, await Mesh.open(patient(router)) as mesh:
         robot.configure(agent_type=ROS)
         await robot.online()
 
@@ -297,7 +297,7 @@ async def test_a_probe_is_no_loss(router: str, start_gateway: StartGateway, conn
     nowhere."""
     gateway = await start_gateway()
     headset = await connect(gateway)
-    async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
+    async with await Mesh.open(patient(router)) as mesh:
         last = gateway.blocks[0] * 256 + 255
         for agent_id in (last, headset.id):
             mesh.put(unicast_key(UNITY, agent_id, UNITY, last), PROBE)
@@ -317,8 +317,8 @@ async def test_an_agent_is_told_the_true_sender(router: str) -> None:
         return b""
 
     async with (
-        macs_zenoh.join("ros", id=9, connect=[router]) as agent,
-        await Mesh.open(MeshSettings(connect=[router])) as robot,
+        macs_zenoh.join("ros", id=9, settings=patient(router)) as agent,
+        await Mesh.open(patient(router)) as robot,
     ):
         agent.serve("look", look)
         forged = Metadata(ROS, 8, 5, "Greeting")
@@ -339,7 +339,7 @@ async def test_a_silent_agent_is_away_and_stays(
     gateway = await start_gateway()
     assert gateway.settings.idle_timeout_s == 60
     lively = await connect(gateway, heartbeat_s=0.05)
-    async with socket(gateway) as taken_off, await Mesh.open(MeshSettings(connect=[router])) as mesh:
+    async with socket(gateway) as taken_off, await Mesh.open(patient(router)) as mesh:
         taken_off.configure()
         away = [(UNITY, taken_off.id)]
 
@@ -389,7 +389,11 @@ async def test_robots_come_over_tcp_only_under_ids_set_aside(
         with pytest.raises(ConnectionError):
             await thief.message()
         assert closed.drops["robot_not_allowed"] == 1
-    async with macs_zenoh.join("ros", id=1, connect=[router]), socket(opened) as first, socket(opened) as second:
+    async with (
+        macs_zenoh.join("ros", id=1, settings=patient(router)),
+        socket(opened) as first,
+        socket(opened) as second,
+    ):
         await until(lambda: (ROS, 1) in opened.directory)
         first.configure(agent_type=ROS)
         await until(lambda: opened.agents.find(ROS, 9))

@@ -31,6 +31,7 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.wire import encode_frame, split_message
 from tests.support.given import Connect, StartGateway
+from tests.support.local import patient
 from tests.support.waiting import until
 
 
@@ -172,7 +173,7 @@ async def test_who_holds_a_service_keeps_it_when_the_robot_restarts(
             holders[:] = [who]
             return b""
 
-        async with macs_zenoh.join("ros", id=9, connect=[router]) as robot:
+        async with macs_zenoh.join("ros", id=9, settings=patient(router)) as robot:
             robot.on_presence(lambda agent, online: holders.clear() if not online and agent.key in holders else None)
             robot.serve("add_node", add)
             yield holders
