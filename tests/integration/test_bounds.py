@@ -25,7 +25,7 @@ from macs_zenoh.protocol.messages import (
     encode_management,
 )
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, split_message
-from tests.integration.test_limits import answers, memory_bytes, site
+from tests.support.gateways import answers, memory_bytes, site
 from tests.support.given import Connect, StartGateway
 from tests.support.local import patient
 from tests.support.waiting import PATIENCE_S, until

@@ -6,9 +6,7 @@ import asyncio
 import resource
 import socket
 import struct
-from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
-from pathlib import Path
+from contextlib import AsyncExitStack, suppress
 
 import pytest
 
@@ -27,36 +25,15 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
+from tests.support.gateways import answers, memory_bytes, site
 from tests.support.given import Connect, StartGateway
 from tests.support.local import patient
-from tests.support.programs import Program, free_port
 from tests.support.waiting import PATIENCE_S, until
 
 CONFIGURATION = encode_frame(
     management=b'{"agentType":2,"agentId":2,"groupId":0,"requestId":1,"messageManager":"AgentclientConfigurer"}'
 )
 GREETING = Metadata(message_manager="Greeting").encode()
-
-
-def memory_bytes(pid: int) -> int:
-    """Resident memory of a process."""
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
-
-
-@asynccontextmanager
-async def site(*options: str) -> AsyncIterator[tuple[str, Program]]:
-    """A router and a gateway as processes."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    async with (
-        Program("router", "-l", endpoint),
-        Program("gateway", "--port", "0", "-e", endpoint, *options) as gateway,
-    ):
-        yield endpoint, gateway
-
-
-async def answers(headset: Headset, timeout_s: float = PATIENCE_S) -> None:
-    """The gateway still answers this headset."""
-    assert headset.id in (await headset.online(timeout_s)).unity_agent_ids
 
 
 async def test_declared_sizes_cost_nothing() -> None:

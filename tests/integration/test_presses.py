@@ -19,6 +19,7 @@ from macs_zenoh.protocol.messages import Metadata, NodeType
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.serving import Call
 from tests.support.given import Connect, StartGateway
+from tests.support.local import patient
 from tests.support.waiting import PATIENCE_S, until
 
 STOP = Metadata(node_type=NodeType.PUBLISHER, node_name="nd__emergency_stop", data_exchange_type="std_msgs/Bool")
@@ -73,7 +74,7 @@ async def test_a_press_is_asked_for_as_well(
 ) -> None:
     """To robots by id, by group or to all: each is asked for the stop, by the headset; the data goes to it too."""
     gateway = await start_gateway()
-    async with macs_zenoh.join("ros", id=7, group=3, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=7, group=3, settings=patient(router)) as robot:
         asked = Asked(robot)
         headset = await connect(gateway)
         await can_be_asked(gateway, 7)
@@ -95,7 +96,7 @@ async def test_a_press_is_asked_for_as_well(
 async def test_nothing_else_is_asked_for(router: str, start_gateway: StartGateway, connect: Connect) -> None:
     """A release, another Bool and a message to a headset ask no robot for a stop; a press after them does, once."""
     gateway = await start_gateway()
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as robot:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as robot:
         asked = Asked(robot)
         headset = await connect(gateway)
         await can_be_asked(gateway, 7)
@@ -136,7 +137,7 @@ async def test_a_release_does_not_overtake_the_question_for_its_stop(
 ) -> None:
     """It waits until the robot has answered, and then it comes; what else the headset sends does not wait for it."""
     gateway = await start_gateway()
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
         robot = Slow(agent)
         headset = await connect(gateway)
         await can_be_asked(gateway, 7)
@@ -158,7 +159,7 @@ async def test_a_press_takes_the_place_of_a_release_that_waits(
 ) -> None:
     """Who has released and stops again wants it stopped: the release is not sent any more, and that is counted."""
     gateway = await start_gateway()
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
         robot = Slow(agent)
         headset = await connect(gateway)
         await can_be_asked(gateway, 7)
@@ -183,7 +184,7 @@ async def test_what_a_headset_released_counts_when_it_has_left(
 ) -> None:
     """Its release does not wait any longer than the headset is there."""
     gateway = await start_gateway()
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
         robot = Slow(agent)
         headset = await connect(gateway)
         await can_be_asked(gateway, 7)
@@ -201,7 +202,7 @@ async def test_a_question_that_is_lost_keeps_no_other_from_being_asked(
     """Who presses again is asked for again, though the first question has no answer yet; not for every press."""
     monkeypatch.setattr(presses, "ANSWER_S", 60.0)
     gateway = await start_gateway()
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
         robot = Slow(agent)
         headset = await connect(gateway)
         await can_be_asked(gateway, 7)
@@ -215,9 +216,9 @@ async def test_a_question_that_is_lost_keeps_no_other_from_being_asked(
 
 async def test_an_agent_asks_for_its_own_stop(router: str) -> None:
     """What a program on the mesh sends on the topic of the stop is asked for as well, and its release waits."""
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
         robot = Slow(agent)
-        async with macs_zenoh.join("unity", id=300, connect=[router]) as presser:
+        async with macs_zenoh.join("unity", id=300, settings=patient(router)) as presser:
             await until(lambda: (1, 7) in presser.directory)
             for data in (PRESS, RELEASE):
                 presser.send(data, to="ros", ids=[7], metadata=STOP)
@@ -233,8 +234,8 @@ async def test_a_press_drops_releases_of_the_same_robots_only(
     """A release for one robot waits for the question to it, and is not lost when the other one is stopped."""
     gateway = await start_gateway()
     async with (
-        macs_zenoh.join("ros", id=7, connect=[router]) as seven,
-        macs_zenoh.join("ros", id=8, connect=[router]) as eight,
+        macs_zenoh.join("ros", id=7, settings=patient(router)) as seven,
+        macs_zenoh.join("ros", id=8, settings=patient(router)) as eight,
     ):
         robots = Slow(seven), Slow(eight)
         headset = await connect(gateway)
@@ -251,9 +252,9 @@ async def test_a_press_drops_releases_of_the_same_robots_only(
 
 async def test_what_an_agent_released_is_sent_before_it_leaves(router: str) -> None:
     """The last thing that a program says is not lost."""
-    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
         robot = Slow(agent)
-        async with macs_zenoh.join("unity", id=300, connect=[router]) as presser:
+        async with macs_zenoh.join("unity", id=300, settings=patient(router)) as presser:
             await until(lambda: (1, 7) in presser.directory)
             for data in (PRESS, RELEASE):
                 presser.send(data, to="ros", ids=[7], metadata=STOP)

@@ -7,8 +7,8 @@ import itertools
 import logging
 import signal
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from bridge.settings import GatewaySettings
 from macs_zenoh import awareness
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings, TrafficRule
-from macs_zenoh.mesh import Mesh, Sample, Traffic
+from macs_zenoh.mesh import Mesh, Traffic
 from macs_zenoh.mesh import reliable as recovered
 from macs_zenoh.mesh.arrivals import Arrivals
 from macs_zenoh.mesh.declared import OnBatch
@@ -34,13 +34,13 @@ from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.serving import Call
 from macs_zenoh.streams import Streams
 from tests.support.matching import matched
+from tests.support.numbers import HZ, Numbers, Stream
 from tests.support.programs import free_port
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
 
 RULES = Path(__file__).parents[2] / "config" / "router-access.json5"
 
-HZ = 200
 KEPT = "macs/from/ros/7/nd__log"
 PLAIN = "macs/from/ros/7/nd__pose"
 KEEP_ALL = [TrafficRule(match="macs/from/ros/*/nd__log", cache=5000)]
@@ -80,46 +80,6 @@ async def routers() -> AsyncIterator[Routers]:
         yield routers
     finally:
         await routers.stop()
-
-
-class Numbers:
-    """The numbers that a subscription received."""
-
-    def __init__(self) -> None:
-        self.heard: list[int] = []
-        self.missed: list[tuple[str, int]] = []
-
-    def take(self, batch: Iterator[Sample]) -> None:
-        self.heard += [int.from_bytes(payload, "big") for _, payload in batch]
-
-    def miss(self, key: str, count: int) -> None:
-        self.missed.append((key, count))
-
-
-class Stream:
-    """Puts numbers on keys 200 times a second, until the block is left; ``sent`` counts."""
-
-    def __init__(self, mesh: Mesh, *keys: str, traffic: Traffic = Traffic.STREAM, size: int = 8) -> None:
-        self.sent = 0
-        self._mesh, self._keys, self._traffic, self._size = mesh, keys, traffic, size
-
-    async def __aenter__(self) -> Stream:
-        self._task = asyncio.create_task(self._run())
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        self._task.cancel()
-        with suppress(asyncio.CancelledError):
-            await self._task
-
-    async def _run(self) -> None:
-        due = time.monotonic()
-        while True:
-            due += 1 / HZ
-            for key in self._keys:
-                self._mesh.put(key, self.sent.to_bytes(self._size, "big"), self._traffic)
-            self.sent += 1
-            await asyncio.sleep(max(0.0, due - time.monotonic()))
 
 
 @asynccontextmanager

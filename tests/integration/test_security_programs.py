@@ -23,7 +23,7 @@ from macs_zenoh.protocol.named import Outcome
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.sections import changed
 from macs_zenoh.streams import Streams
-from tests.integration.test_reliable import Numbers, Stream
+from tests.support.numbers import Numbers, Stream
 from tests.support.programs import ROOT, Program, ended, macs
 from tests.support.routers import Router
 from tests.support.secured import CLIENTS, Site, made

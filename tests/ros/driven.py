@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import time
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
@@ -127,3 +128,8 @@ def stop_cdr() -> bytes:
     twist = Twist()
     twist.linear.z = STOPPED
     return bytes(serialize_message(twist))
+
+
+async def told(agent: Agent, robot: int) -> Any:
+    """What a robot answers when it is asked for its state."""
+    return json.loads(await agent.call("ros", robot, "status"))

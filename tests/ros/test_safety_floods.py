@@ -22,8 +22,7 @@ from macs_zenoh.protocol.keyexpr import CALL, GROUP
 from macs_zenoh.protocol.messages import Metadata, NodeType
 from macs_zenoh.protocol.routing import unicast_key
 from macs_zenoh.protocol.wire import encode_frame, encode_message
-from tests.ros.driven import SETTINGS, STOPPED, Heard, driving, hear, may_command, send_bool, site
-from tests.ros.test_safety_shared import told
+from tests.ros.driven import SETTINGS, STOPPED, Heard, driving, hear, may_command, send_bool, site, told
 from tests.support.ros_peer import Peer
 from tests.support.waiting import PATIENCE_S, until
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from collections import deque
 from pathlib import Path
@@ -21,7 +20,7 @@ from bridge.ros.shared_stop import A_NODE
 from macs_zenoh import join
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Refused
-from tests.ros.driven import STOPPED, driving, hear, may_command, send_bool, site
+from tests.ros.driven import STOPPED, driving, hear, may_command, send_bool, site, told
 from tests.support.ros_peer import Peer
 from tests.support.waiting import PATIENCE_S, until
 
@@ -193,10 +192,6 @@ def test_agents_that_lose_what_others_said_agree_in_the_end(steps: list[tuple[st
 
 
 # -- with processes --------------------------------------------------------------------------------------------------
-
-
-async def told(agent: Agent, robot: int) -> Any:
-    return json.loads(await agent.call("ros", robot, "status"))
 
 
 async def stopped(agent: Agent, robot: int, wanted: bool = True) -> None:

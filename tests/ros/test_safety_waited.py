@@ -6,8 +6,7 @@ import asyncio
 import signal
 from pathlib import Path
 
-from tests.ros.driven import STOPPED, driving, hear, may_command, send, send_bool, site
-from tests.ros.test_safety_shared import told
+from tests.ros.driven import STOPPED, driving, hear, may_command, send, send_bool, site, told
 from tests.support.links import counted
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until

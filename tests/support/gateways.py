@@ -1,0 +1,33 @@
+"""A gateway as a process, what it takes of memory, and whether it still answers."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from bridge.headset.client import Headset
+from tests.support.programs import Program, free_port
+from tests.support.waiting import PATIENCE_S
+
+
+def memory_bytes(pid: int) -> int:
+    """Resident memory of a process."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+@asynccontextmanager
+async def site(*options: str) -> AsyncIterator[tuple[str, Program]]:
+    """A router and a gateway as processes."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    async with (
+        Program("router", "-l", endpoint),
+        Program("gateway", "--port", "0", "-e", endpoint, *options) as gateway,
+    ):
+        yield endpoint, gateway
+
+
+async def answers(headset: Headset, timeout_s: float = PATIENCE_S) -> None:
+    """The gateway still answers this headset."""
+    assert headset.id in (await headset.online(timeout_s)).unity_agent_ids
