@@ -64,6 +64,7 @@ JUDGED_S = 1.0
 """How long the registration of an agent that is not seen yet waits for its presence, where that decides."""
 SESSIONS = 8192
 """Of so many agents the robot remembers who had their ids last."""
+NO_STOP = "this robot has no emergency stop yet, and nobody can act on it until it has"
 STOP_AGAIN_S = 2.0
 """Pause between attempts to have an emergency stop, where its topic has another type."""
 STOP_MESSAGES_S = 0.1
@@ -128,6 +129,8 @@ class RobotAgent:
     async def start(self) -> None:
         """Serve from now on."""
         settings = self.nodes.robot.rules.settings
+        if settings.stop_topic:
+            self.nodes.robot.no_stop = NO_STOP
         if settings.stop_topic and not await self._open_stop(settings.stop_topic, logging.ERROR):
             self._stop_later = asyncio.create_task(self._until_stop(settings.stop_topic))
         self.agent.on_presence(self._presence)
@@ -155,8 +158,10 @@ class RobotAgent:
         try:
             await self.nodes.open_stop(topic)
         except Refused as refusal:
-            log.log(level, "there is no emergency stop: %s", refusal.reason)
+            self.nodes.robot.no_stop = f"{NO_STOP}: {refusal.reason}"
+            log.log(level, "there is no emergency stop, and nobody can act on this robot: %s", refusal.reason)
             return False
+        self.nodes.robot.no_stop = ""
         return True
 
     async def _until_stop(self, topic: str) -> None:
@@ -323,7 +328,7 @@ class RobotAgent:
             call.metadata.node_name,
         )
         if stop is None:
-            raise Refused("this robot has no emergency stop")
+            raise Refused(self.nodes.robot.no_stop or "this robot has no emergency stop")
         if topic and topic != stop.key.node_name:  # a gateway asks, as what a headset sent may be a stop
             raise Refused(f"{topic[:80]} is not the emergency stop of this robot, which is {stop.topic}")
         presses = call.data != b"false"

@@ -84,6 +84,7 @@ class Robot:
         is_online: whether an agent has been seen: what it sends can come before its presence, on which its rights
             may depend.
         stop: the emergency stop.
+        no_stop: why there is none, though the settings want one. Until there is, nobody acts on the robot.
         alarms: calls back at a time, whatever the loop is busy with.
         refusals: who was told lately why what he sent was not taken.
         audit: the record of who did what.
@@ -99,6 +100,7 @@ class Robot:
     group_of: Callable[[Registrant], int] = lambda agent: 0
     is_online: Callable[[Registrant], bool] = lambda agent: True
     stop: EmergencyStop = field(default_factory=EmergencyStop)
+    no_stop: str = ""
     prioritise_stream: Callable[[str, Priority | None], None] = lambda node, priority: None
     keep_stream: Callable[[str, int | None], bool] = lambda node, frames: False
     alarms: Alarms = field(default_factory=Alarms)
@@ -164,17 +166,20 @@ class InterfaceNode(ABC):
 
     @property
     def held(self) -> bool:
-        """Whether the emergency stop keeps agents from acting through this node now."""
-        return self.robot.stop.stopped and not self.rule.allow_while_stopped
+        """Whether the emergency stop, or that there is none, keeps agents from acting through this node now."""
+        held = self.robot.stop.stopped or bool(self.robot.no_stop)
+        return held and not self.rule.allow_while_stopped
 
     def held_since(self, stops: int) -> bool:
         """The same, or whether it did meanwhile: ``stops`` is how often there had been one."""
         stop = self.robot.stop
-        return (stop.stopped or stop.times != stops) and not self.rule.allow_while_stopped
+        return self.held or (stop.times != stops and not self.rule.allow_while_stopped)
 
     def stop_reason(self) -> str:
         """Why nothing is done that waited."""
         stop = self.robot.stop
+        if self.robot.no_stop:
+            return self.robot.no_stop
         return f"the emergency stop by {stop.by} holds" if stop.stopped else "the robot was stopped meanwhile"
 
     @property

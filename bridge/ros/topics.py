@@ -175,7 +175,8 @@ class PublisherNode(TopicNode):
         if problem is not None:
             return "bad_cdr", f"refused {len(message.data)} bytes for {self.interface}: {problem}"
         if self.held:
-            return "stopped", "the emergency stop holds"
+            no_stop = self.robot.no_stop
+            return ("no_stop", no_stop) if no_stop else ("stopped", "the emergency stop holds")
         if self.control is not None and not self.control.take(Registrant.of(message), time.monotonic()):
             return "not_in_control", f"{self.control.holder(time.monotonic())} has control"
         return None

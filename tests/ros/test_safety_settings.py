@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from geometry_msgs.msg import Twist
 from std_msgs.msg import String
 
@@ -12,7 +13,8 @@ from bridge.ros.checked import CheckedSettings
 from bridge.ros.interface import Drops
 from bridge.ros.rules import Rules
 from bridge.settings import RobotSettings, TopicRule
-from tests.ros.driven import site
+from macs_zenoh.errors import Refused
+from tests.ros.driven import driving, hear, may_command, site
 from tests.support.programs import ended
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
@@ -41,7 +43,10 @@ async def test_a_dead_man_that_does_not_fit_its_type_is_told_at_the_start(
 async def test_a_robot_without_its_emergency_stop_is_found_and_gets_it(
     domain: int, peer: Peer, tmp_path: Path
 ) -> None:
-    """While its topic has another type `macs doctor` names that; when that is gone, the robot can be stopped."""
+    """While its topic has another type `macs doctor` names that and no command is carried out; when that is gone, the
+    robot can be stopped, and driven."""
+    wheels = Peer(domain, "wheels")
+    heard = await hear(wheels)
     await peer.subscription(String, "/emergency_stop")
     async with site(domain, tmp_path) as place, place.robot() as robot, place.headset() as driver:
 
@@ -50,17 +55,30 @@ async def test_a_robot_without_its_emergency_stop_is_found_and_gets_it(
                 await robot.stop()
                 robot.log.clear()
                 await robot.start()
-            return any("there is no emergency stop" in line for line in robot.log)
+            return any("there is no emergency stop," in line for line in robot.log)
 
         await until(has_none, every_s=0.2)
         code, out, errors = await ended("doctor", "--json", "--quick", "-e", place.router.endpoint)
         found = [finding for finding in json.loads(out)["findings"] if finding["id"] == "no_stop"]
         assert [finding["severity"] for finding in found] == ["error"], errors
         assert code == 1
-        peer.session.close()
+        await may_command(driver, 1)
+        async with driving(driver, 1):
+
+            async def refused() -> bool:
+                status = json.loads(await driver.call("ros", 1, "status"))
+                return bool(status["drops"].get("no_stop", 0) >= 5)
+
+            await until(refused)
+            with pytest.raises(Refused, match=r"no emergency stop yet.*String"):
+                await driver.call("ros", 1, "stop", b"true")
+            assert not heard.values
+            peer.session.close()
+            await until(lambda: heard.last == 0.5)
         await until(lambda: any("there is an emergency stop now" in line for line in robot.log))
         await driver.call("ros", 1, "stop", b"true")
         assert json.loads(await driver.call("ros", 1, "status"))["stopped"]
+    wheels.session.close()
 
 
 async def test_two_agents_on_one_graph_are_found(domain: int, tmp_path: Path) -> None:
