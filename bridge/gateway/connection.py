@@ -51,6 +51,9 @@ DRIVES_S = 1.0
 
 READ_S = 0.02
 """How long what waits in a socket has before the agent's time is looked at again."""
+READ_WITHIN_S = 5.0
+"""So long at most, while it is read from at all: TLS and WebSocket make less of what has come, so nobody can count how
+much of it is left."""
 
 TURN_S = 0.003
 """Work for one agent that takes longer lets all others have their turn before it goes on: an event loop may read from
@@ -131,6 +134,7 @@ class Connection(asyncio.BufferedProtocol):
         self._unread = 0
         """Of what waited in the socket when the agent's time had run out: how much is still to be read."""
         self._looked = False
+        self._read_by = math.inf
         self.congested = False
         """Whether so much waits for this agent that its senders should slow down."""
         self.backpressure = Backpressure()
@@ -496,10 +500,20 @@ class Connection(asyncio.BufferedProtocol):
     def _must_be_read(self) -> bool:
         """Whether the agent's time has run out, but not all of what it had sent by then was looked at: the loop may
         have been held up, or reading paused. What comes later does not count, so that nobody can put that off."""
+        waiting, now = waiting_bytes(self._transport.get_extra_info("socket")), time.monotonic()
         if not self._looked:
-            self._looked = True
-            self._unread = waiting_bytes(self._transport.get_extra_info("socket"))
+            self._looked, self._unread, self._read_by = True, waiting + self._keeps_some, now + READ_WITHIN_S
+        elif self._pauses:
+            self._read_by = now + READ_WITHIN_S
+        elif not waiting or now >= self._read_by:
+            self._unread = 0
         if self._unread > 0:
             return True
         self._looked = False
         return False
+
+    @property
+    def _keeps_some(self) -> bool:
+        """Whether some of what has come may be beyond the socket: in TLS, in a WebSocket, or with who is paused."""
+        info = self._transport.get_extra_info
+        return bool(self._pauses or info("ssl_object") or info("websocket"))

@@ -49,8 +49,11 @@ def read(path: Path) -> Tokens:
     except BaseException:
         os.close(descriptor)
         raise
-    with os.fdopen(descriptor, "rb") as file:
-        content = file.read(MOST_BYTES + 1)
+    try:
+        with os.fdopen(descriptor, "rb") as file:
+            content = file.read(MOST_BYTES + 1)
+    except OSError as error:  # of a disk, or of a file system that is not there any more
+        raise ConfigError(str(path), error.strerror or str(error)) from error
     if len(content) > MOST_BYTES:
         raise ConfigError(str(path), f"has more than {MOST_BYTES} bytes: it is no file of tokens")
     return parse(content, str(path))

@@ -64,8 +64,10 @@ class Watch:
 
     def _look(self) -> None:
         self.start()
-        self.read_again()
-        self._on_look()
+        try:
+            self.read_again()
+        finally:  # tokens end with time, whatever becomes of their file
+            self._on_look()
 
 
 def _seen(path: Path) -> Seen:

@@ -774,3 +774,38 @@ async def test_a_connection_that_ends_leaves_no_circle(start_door: StartDoor, po
         await until(lambda: peer() is None)
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize("port", PORTS)
+async def test_silence_is_judged_by_what_was_read(start_door: StartDoor, port: str) -> None:
+    """Whom the gateway does not read from is not silent, however long; one that then says nothing more is, although
+    less came out of TLS or a WebSocket than had waited in the socket."""
+    door = await start_door(idle_timeout_s=1.0, web_without_token="everybody")
+    gateway = door.other if port == "web_tls" else door.gateway
+    async with await door.come(port, heartbeat_s=1000.0) as headset:
+        await until(lambda: gateway.agents.find(UNITY, headset.id))
+        connection = gateway.agents.find(UNITY, headset.id)
+        assert connection is not None
+        connection.pause()
+        beat = encode_frame(management=b'{"messageManager":"HeartbeatHandler"}')
+
+        async def say_much() -> None:
+            with contextlib.suppress(Unreachable):
+                for _ in range(2000):
+                    await headset.send_frame(beat * 20)
+
+        saying = asyncio.create_task(say_much())
+        paused_at, looked = time.monotonic(), []
+
+        async def looks() -> bool:
+            looked.append(connection._looked)
+            return time.monotonic() > max(paused_at, connection.peer.heard_at) + 2.0
+
+        await until(looks)
+        assert headset.connected, headset.why_ended
+        assert any(looked), "its time has run out meanwhile"
+        before = connection.peer.heard_at
+        connection.resume()
+        await until(lambda: connection.peer.heard_at > before)
+        saying.cancel()
+        await until(lambda: not headset.connected)
