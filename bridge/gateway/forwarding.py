@@ -26,6 +26,7 @@ from .backpressure import Backpressure
 from .connection import Connection
 from .judged import JudgedFrames, Read
 from .latest import Latest
+from .questions import Questions
 from .routes import Route, Routes
 
 PUBLISHER = int(NodeType.PUBLISHER)
@@ -63,6 +64,7 @@ class Forwarding:
         """Whether no two of them can have a receiver in common, so that their order does not matter."""
         self._latest = Latest(lambda route, newest: self._put(route.keys, newest.frame.data, COMMAND))
         self._presses = Presses(mesh, directory)
+        self._questions = Questions()
         self._flooding: dict[Connection, float] = {}
         """Who is not read from for having flooded, and until when."""
         self._backpressure = Backpressure()
@@ -76,6 +78,7 @@ class Forwarding:
         """It has ended."""
         self._latest.go(connection)
         self._presses.leave(connection.key)
+        self._questions.leave(connection)
         self._flooding.pop(connection, None)
         self._routes.pop(connection, None)
         self.afar.leave(connection)
@@ -83,6 +86,7 @@ class Forwarding:
     def close(self) -> None:
         """Nothing is forwarded any more."""
         self._latest.close()
+        self._questions.close()
         self._presses.close()
 
     def forget(self, connection: Connection) -> None:
@@ -127,6 +131,10 @@ class Forwarding:
             self._put_singly([key], sent, STREAM)
         else:
             self._gather(connection, key, [key], sent, STREAM, apart=False)
+
+    def answered(self, connection: Connection, number: int) -> None:
+        """What comes from now on was said after this question."""
+        self._questions.answered(connection, number)
 
     def finish(self, connection: Connection) -> None:
         """All that one read of a socket brought is forwarded."""
@@ -199,6 +207,7 @@ class Forwarding:
             self._slow_down(connection, now)
         elif traffic is COMMAND:
             connection.drove_at = now
+            self._questions.drives(connection)
             self._keep_latest(connection, sent, route, passing)
         return passing is Passing.NOW
 
@@ -207,6 +216,9 @@ class Forwarding:
         kind = sent.frame.destination, sent.metadata.node_name
         if passing is Passing.NOW:
             self._latest.follow(connection, kind)
+            return
+        if passing is Passing.TOO_OLD:
+            connection.complain("too_old", "commands that may have waited in its connection", sent.frame.count)
             return
         *_, newest = sent.frame.each()
         older = sent.frame.count - 1

@@ -60,6 +60,7 @@ from macs_zenoh.protocol.recipient import Recipient, to_agent
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.rights import Grant
 from macs_zenoh.protocol.tcp_agent import (
+    Answered,
     Asked,
     AskedOnline,
     Event,
@@ -425,7 +426,9 @@ class Gateway:
             self._forwarding.stream(connection, event)
             return
         self._forwarding.flush()
-        if isinstance(event, Joined):
+        if isinstance(event, Answered):
+            self._forwarding.answered(connection, event.number)
+        elif isinstance(event, Joined):
             self._joined(connection, event)
             connection.charge()
         elif isinstance(event, Registering):

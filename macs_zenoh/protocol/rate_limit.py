@@ -2,9 +2,10 @@
 
 A robot drops what is too much for it, but on the way there it would fill the links that others' stops go over. And
 only the gateway can see that commands waited in the agent's own connection: a headset whose Wi-Fi stood still for a
-minute sends all that it said meanwhile at once, and no stamp tells how old it is. So after a gap in a flow of
-commands, while they come faster than they were ever said, only the newest of each kind goes on, when no newer one has
-come for `TOGETHER_S`.
+minute sends all that it said meanwhile at once, and no stamp tells how old it is. So after a gap none goes on that is
+not known to be recent, by what the agent answered (`recency`). Of one that does not answer, or late, there is only the
+pace to go by: while commands come faster than they were ever said, only the newest of each kind goes on, when no newer
+one has come for `TOGETHER_S`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Hashable
 from enum import Enum
 
 from .credit import Credit
+from .recency import Recency
 
 
 class Passing(Enum):
@@ -24,9 +26,11 @@ class Passing(Enum):
     """More than the agent may send."""
     WAITED = "waited"
     """It has waited, or may have: only the newest of its kind goes on, when none has come for `TOGETHER_S`."""
+    TOO_OLD = "too old"
+    """It may have been said long ago, and soon it will be known which is not."""
 
 
-NOW, FLOODED, WAITED = Passing.NOW, Passing.FLOODED, Passing.WAITED
+NOW, FLOODED, WAITED, TOO_OLD = Passing.NOW, Passing.FLOODED, Passing.WAITED, Passing.TOO_OLD
 
 
 TOGETHER_S = 0.05
@@ -43,8 +47,8 @@ class Flow:
     flow."""
     GAP_S = 1.0
     """A flow that has a gap of so long has stood still, or somebody has stopped driving for a moment."""
-    LATE_S = 3.0
-    """For so long at most commands count as having waited, whatever still comes."""
+    PAUSED_S = 3.0
+    """Who has gone on for so long as before the gap had merely paused."""
     PACED = 3
     """So many in a row that come like the flow before the gap have not waited."""
     MEAN_OF = 16
@@ -58,7 +62,7 @@ class Flow:
         self._late = 0
         """How many came since."""
         self._most_late = 0.0
-        """How many there can be that were said in the gap."""
+        """How many there can be that were said in the gap; since then more are said."""
         self._paced = 0
 
     @property
@@ -69,9 +73,8 @@ class Flow:
     def has_waited(self, count: int, now: float) -> bool:
         """Whether commands that come at this time may be older than that."""
         gap, self._last = now - self._last, now
-        if self._late_since is not None and now - self._late_since < self.LATE_S:
+        if self._late_since is not None:
             return self._still_late(count, gap, now - self._late_since)
-        self._late_since = None
         if gap > self.GAP_S and self._length >= self.LENGTH:
             self._length, self._late_since, self._late, self._paced = 0, now, count, 0
             self._most_late = gap / max(self._usual_s, 1e-9) + 2
@@ -88,10 +91,13 @@ class Flow:
     def _still_late(self, count: int, gap: float, late_s: float) -> bool:
         """A flow that has merely paused goes on as it was; what has waited comes as fast as the network takes it."""
         self._late += count
-        if self._late <= 1 + 2 * late_s / max(self._usual_s, 1e-9):
+        said_since = late_s / max(self._usual_s, 1e-9)
+        if self._late <= 1 + 2 * said_since:
+            if late_s > self.PAUSED_S:
+                self._late_since = None
             return False
         self._paced = self._paced + 1 if count == 1 and gap >= self._usual_s / 2 else 0
-        if self._paced < self.PACED and self._late <= self._most_late:
+        if self._paced < self.PACED and self._late <= self._most_late + said_since:
             return True
         self._late_since = None
         return False
@@ -110,6 +116,9 @@ class Pace:
     KINDS = 256
     """So many flows are known; of more than these the one that began first is forgotten."""
 
+    DOUBT_S = 10.0
+    """Who sends commands for so long, and no answer that proves any recent, is judged by its pace from then on."""
+
     def __init__(
         self, commands_per_s: float, requests_per_s: float, now: float, together: Credit | None = None
     ) -> None:
@@ -121,6 +130,13 @@ class Pace:
         self._last = -math.inf
         self._late_until = -math.inf
         """So long what is no flow counts as having waited, too: it came with what has."""
+        self.recency = Recency()
+        self._steady_since = -math.inf
+        """Since when commands have come without a gap."""
+        self._in_doubt = False
+        self._doubted_s = 0.0
+        """For how long commands have come that may be old."""
+        self._answers_count = True
 
     def request(self, count: int, now: float) -> Passing:
         """Of so many messages that are no commands."""
@@ -140,10 +156,43 @@ class Pace:
                 del self._flows[next(iter(self._flows))]
             flow = self._flows[kind] = Flow()
         gap, self._last = now - self._last, now
-        if gap > Flow.GAP_S and any(each.drives for each in self._flows.values()):
-            self._late_until = now + TOGETHER_S
+        if gap > Flow.GAP_S:
+            self._steady_since = now
+            if self.drives:
+                self._late_until = now + TOGETHER_S
         drives = flow.drives
         waited = flow.has_waited(count, now)
         if waited:
             self._late_until = now + TOGETHER_S
+        if self._answers_count and self.recency.is_quick:
+            return TOO_OLD if self._may_be_old(gap, now) else NOW
         return WAITED if waited or (not drives and now < self._late_until) else NOW
+
+    @property
+    def drives(self) -> bool:
+        """Whether any of its commands are a flow. Then it should be asked, every `Recency.EVERY_S`."""
+        return any(flow.drives for flow in self._flows.values())
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether its commands do not go on until it has answered."""
+        return self._in_doubt
+
+    def answered(self, number: int, now: float) -> None:
+        """It has answered a question; what comes from now on was said after that."""
+        steady_since = math.inf if self._in_doubt or now - self._last > Flow.GAP_S else self._steady_since
+        self.recency.answered(number, now, steady_since)
+        if self.recency.age_at_most(now) <= self.recency.RECENT_S:
+            self._in_doubt = False
+
+    def _may_be_old(self, gap: float, now: float) -> bool:
+        """Whether commands that come after such a gap may have been said long before. With the gap doubt begins,
+        unless they are known to be recent; it ends with an answer."""
+        if not self._in_doubt:
+            self._in_doubt = gap > Flow.GAP_S and self.recency.age_at_most(now) > self.recency.RECENT_S
+            self._doubted_s = 0.0
+            return self._in_doubt
+        self._doubted_s += min(gap, Flow.GAP_S)
+        if self._doubted_s > self.DOUBT_S:
+            self._answers_count = self._in_doubt = False
+        return self._in_doubt

@@ -58,6 +58,7 @@ from .messages import (
     decode_data,
     decode_management,
 )
+from .recency import QUESTIONS
 from .recipient import Recipient, to_agent
 from .rights import OPEN, Grant, Rights
 from .wire import MACS, MAX_FRAME_BYTES, Frame, Frames, Header, Layout
@@ -129,6 +130,12 @@ class Registering(NamedTuple):
     groups: list[int]
 
 
+class Answered(NamedTuple):
+    """The agent has answered a later welcome: whatever comes behind this it said after that was sent."""
+
+    number: int
+
+
 class AskedOnline(NamedTuple):
     """The agent asks who is online; the answer carries this request id."""
 
@@ -186,6 +193,7 @@ Event = (
     | Sent
     | Streamed
     | Registering
+    | Answered
     | AskedOnline
     | Asked
     | RegistrationRefused
@@ -285,10 +293,10 @@ class TcpAgent:
 
     # -- out -----------------------------------------------------------------------------------------------------
 
-    def welcome(self) -> bytes:
+    def welcome(self, number: int = 0) -> bytes:
         """The first message on every connection; agents give up when anything else comes before it. A headset takes a
-        later one as its new id, and answers again."""
-        return to_agent(Welcome(agent_id=self.agent_id), request_id=self.connection_number)
+        later one as its new id, and answers again; with a ``number`` (`recency`) it is `Answered`."""
+        return to_agent(Welcome(agent_id=self.agent_id), request_id=number or self.connection_number)
 
     @property
     def dials_a_router(self) -> bool:
@@ -522,6 +530,8 @@ class TcpAgent:
             group = 0
         self.extensions = configuration.extensions
         self.functionality = configuration.functionality or self.functionality
+        if self.state is ONLINE and configuration.request_id > QUESTIONS:
+            events.append(Answered(configuration.request_id))
         if self.state is ONLINE and group == self.group and same:
             return
         self.state = ONLINE

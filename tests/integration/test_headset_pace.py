@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Hashable
 
 import pytest
@@ -11,7 +12,7 @@ import macs_zenoh
 from bridge.gateway import Gateway
 from bridge.headset.client import Headset
 from macs_zenoh.agent import Agent
-from macs_zenoh.protocol.messages import Metadata
+from macs_zenoh.protocol.messages import Configuration, Metadata, Welcome, encode_management
 from macs_zenoh.protocol.rate_limit import Flow, Pace, Passing
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import encode_frame, encode_message
@@ -194,3 +195,85 @@ async def test_a_flood_is_held_to_its_share_and_a_stop_is_not(
         await until(lambda: taken(robot, STOP) == [1] and len(taken(robot, ("nd__arm", ""))) == 10)
         await until(lambda: drops(gateway, headset).get("flooded", 0) > 10_000)
         assert len(taken(robot)) < 5000
+
+
+class Answering:
+    """A headset that speaks as existing programs do, through a connection that can stand still: what it says waits
+    there, an answer to its gateway behind the commands that it has said before."""
+
+    SAYS_S, CARRIES_S = 0.02, 0.015
+    """It says a command so often, and its connection carries a frame so often: what has waited takes three times as
+    long as it waited."""
+
+    def __init__(self, link: Socket) -> None:
+        self.link = link
+        self.moves = asyncio.Event()
+        self.moves.set()
+        self.said = 0
+        self._says = asyncio.Event()
+        self._says.set()
+        self._waiting: asyncio.Queue[bytes] = asyncio.Queue()
+        self._tasks = [asyncio.create_task(job) for job in (self._say(), self._carry(), self._answer())]
+
+    async def _say(self) -> None:
+        while True:
+            await self._says.wait()
+            self._waiting.put_nowait(frame(self.said))
+            self.said += 1
+            await asyncio.sleep(self.SAYS_S)
+
+    async def _carry(self) -> None:
+        while True:
+            said = await self._waiting.get()
+            await self.moves.wait()
+            self.link.writer.write(said)
+            await asyncio.sleep(self.CARRIES_S)
+
+    async def _answer(self) -> None:
+        while True:
+            metadata, _ = await self.link.message()
+            await self.moves.wait()
+            if metadata.message_manager == Welcome.manager:
+                answer = Configuration(agent_type=2, agent_id=self.link.id, request_id=metadata.request_id)
+                self._waiting.put_nowait(encode_frame(management=encode_management(answer)))
+
+    def pause(self) -> None:
+        """Nobody drives."""
+        self._says.clear()
+
+    def drive(self) -> None:
+        """Somebody does again."""
+        self._says.set()
+
+    def close(self) -> None:
+        for task in self._tasks:
+            task.cancel()
+
+
+async def test_what_waited_is_not_carried_out_however_slowly_it_comes(
+    start_gateway: StartGateway, robot: Agent
+) -> None:
+    """A connection stands still for two seconds and then carries little more than is said: for seconds what comes is
+    from then, and nothing of it is carried out. What is said later is, also a single command after a pause."""
+    gateway = await start_gateway()
+    async with socket(gateway) as link:
+        await ready(gateway, link)
+        connection = gateway.agents.find(2, link.id)
+        headset = Answering(link)
+        try:
+            await until(lambda: connection.pace.recency.is_quick)
+            headset.moves.clear()
+            await until(lambda: taken(robot) and taken(robot)[-1] <= headset.said - 100)
+            behind, before, since = headset.said, len(taken(robot)), time.monotonic()
+            headset.moves.set()
+            await until(lambda: taken(robot)[-1] >= behind)
+            assert taken(robot)[before] >= behind, taken(robot)[before - 3 : before + 3]
+            assert drops(gateway, link)["too_old"] >= 90, f"after {time.monotonic() - since} s"
+            headset.pause()
+            await until(lambda: taken(robot)[-1] == headset.said - 1)
+            await asyncio.sleep(1.5)
+            await until(lambda: connection.pace.recency.age_at_most(time.monotonic()) < 0.3)
+            link.writer.write(frame(1_000_000))
+            await until(lambda: taken(robot)[-1] == 1_000_000)
+        finally:
+            headset.close()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from macs_zenoh.protocol.credit import Credit
-from macs_zenoh.protocol.rate_limit import FLOODED, NOW, TOGETHER, WAITED, Pace, Passing
+from macs_zenoh.protocol.rate_limit import FLOODED, NOW, TOGETHER, TOO_OLD, WAITED, Pace, Passing
+from macs_zenoh.protocol.recency import Recency
 
 MOVE, ARM = "move", "arm"
 
@@ -111,3 +112,86 @@ def test_no_limit_is_none() -> None:
     pace = Pace(0, 0, 0.0)
     assert pace.command(MOVE, 1_000_000, 0.0) is NOW
     assert pace.request(1_000_000, 0.0) is NOW
+
+
+def answers(pace: Pace, asked: float, now: float) -> None:
+    """It is asked, and answers."""
+    number = pace.recency.ask(asked)
+    assert number is not None
+    pace.answered(number, now)
+
+
+def driving(*, until: float, hz: float = 50) -> Pace:
+    """Of somebody who has driven up to then, and answers at once."""
+    pace = Pace(0, 0, 0.0)
+    for number in range(int(until * hz) + 1):
+        assert pace.command(MOVE, 1, number / hz) is NOW
+        if number % 20 == 0:
+            answers(pace, number / hz, number / hz)
+    assert pace.drives
+    return pace
+
+
+@pytest.mark.parametrize("gap_s", [1.5, 60.0])
+@pytest.mark.parametrize("times", [0.5, 1.0, 1.5, 2.5, 1000.0])
+def test_of_who_answers_nothing_that_waited_goes_on_however_fast_it_comes(gap_s: float, times: float) -> None:
+    """What was said in the gap comes at half the pace or at a thousand times that, and nothing else of it goes on; the
+    answer to a question of now is behind it, and from then on everything passes."""
+    pace = driving(until=4.0)
+    begin = 4.0 + gap_s
+    waited = [pace.command(MOVE, 1, begin + number / (50 * times)) for number in range(int(gap_s * 50))]
+    came = min(len(waited), int(Pace.DOUBT_S * 50 * times))  # who answers nothing for so long is no longer believed
+    assert set(waited[:came]) == {TOO_OLD}
+    assert pace.in_doubt is (came == len(waited))
+    end = begin + len(waited) / (50 * times)
+    answers(pace, end - 0.01, end)
+    assert not pace.in_doubt
+    if came == len(waited):
+        assert {pace.command(MOVE, 1, end + number / 50) for number in range(100)} == {NOW}
+
+
+def test_an_answer_to_an_old_question_ends_no_doubt() -> None:
+    """It was asked before the network stood still, or while it did."""
+    pace = driving(until=4.0)
+    old = pace.recency.ask(4.1)
+    assert old is not None
+    assert pace.command(MOVE, 1, 9.0) is TOO_OLD
+    pace.answered(old, 9.0)
+    assert pace.command(MOVE, 1, 9.01) is TOO_OLD
+    answers(pace, 9.02, 9.05)
+    assert pace.command(MOVE, 1, 9.06) is NOW
+
+
+def test_of_who_answers_a_pause_costs_nothing() -> None:
+    """Nothing said for ten seconds, all questions answered: what comes then is recent, also a single command."""
+    pace = driving(until=4.0)
+    for number in range(25):
+        answers(pace, 4.1 + 0.4 * number, 4.15 + 0.4 * number)
+    assert pace.command("gripper", 1, 14.0) is NOW
+    assert {pace.command(MOVE, 1, 14.0 + number / 50) for number in range(100)} == {NOW}
+
+
+def test_who_stops_answering_is_judged_by_its_pace_after_a_while() -> None:
+    """It drives on: for some seconds nothing passes, then everything, and later pauses cost no more than of others."""
+    pace = driving(until=4.0)
+    taken = drive(pace, 10.0, 1000, 50)
+    held = taken.index(NOW)
+    assert set(taken[:held]) == {TOO_OLD}
+    assert abs(held / 50 - Pace.DOUBT_S) < 0.1
+    assert set(taken[held:]) == {NOW}
+    assert drive(pace, 100.0, 100, 50) == [WAITED] + [NOW] * 99
+
+
+def test_what_waits_longer_than_seconds_has_waited_all_the_same() -> None:
+    """Of one that answers nothing: a minute's commands that come for twenty seconds, and those said meanwhile."""
+    pace = Pace(0, 0, 0.0)
+    drive(pace, 0.0, 100, 50)
+    late = [pace.command(MOVE, 1, 62.0 + number / 200) for number in range(4400)]
+    late_s = late.index(NOW) / 200
+    assert abs(late_s - 60 / 3) < 0.5, "200 a second come, 50 a second are said"
+
+
+def test_no_more_questions_are_open_than_an_agent_may_leave_unanswered() -> None:
+    """What it does not take does not pile up."""
+    pace = driving(until=1.0)
+    assert [pace.recency.ask(2.0 + n) is None for n in range(10)].count(False) == Recency.OPEN
