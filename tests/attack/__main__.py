@@ -1,4 +1,4 @@
-"""Attack, and print a table: ``python -m tests.attack [--list] [--section N] [--stops N] [--seconds S] [NAME ...]``.
+"""Attack, and print a table: ``python -m tests.attack [OPTIONS] [NAME ...]``.
 
 Exit code 0: everything held; 1: something did not; 2: wrong usage.
 """
@@ -18,6 +18,7 @@ from pathlib import Path
 
 from tests.attack import judge, table
 from tests.attack.scene import scene
+from tests.attack.ways import WAYS
 
 
 async def run(rows: list[table.Attack], options: argparse.Namespace) -> list[judge.Report]:
@@ -27,7 +28,8 @@ async def run(rows: list[table.Attack], options: argparse.Namespace) -> list[jud
     while waiting:
         with tempfile.TemporaryDirectory() as directory:
             certified = waiting[0].certified
-            async with scene(Path(directory), random.randint(1, 100), certified=certified) as stage:
+            made = scene(Path(directory), random.randint(1, 100), certified=certified, way=options.way)
+            async with made as stage:
                 while waiting and waiting[0].certified == certified:
                     row = waiting.pop(0)
                     began = time.monotonic()
@@ -56,6 +58,7 @@ def main() -> int:
     parser.add_argument("--seen", action="store_true", help="those with which something was once brought down")
     parser.add_argument("--seconds", type=float, default=4.0, help="how long each lasts (default: 4)")
     parser.add_argument("--stops", type=int, help="go on until so many stops were pressed")
+    parser.add_argument("--way", choices=WAYS, default="tcp", help="how TCP agents that attack come in (default: tcp)")
     parser.add_argument("--json", type=Path, help="write the figures to this file as well")
     options = parser.parse_args()
     rows = [

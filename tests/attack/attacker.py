@@ -1,4 +1,5 @@
-"""The process that makes one attack: ``python -m tests.attack.attacker NAME PORT ENDPOINT SECONDS [CERTIFICATES]``.
+"""The process that makes one attack:
+``python -m tests.attack.attacker NAME PORT ENDPOINT SECONDS [CERTIFICATES [WAY]]``.
 
 It says ``begins`` on stdout when it has started and ``ended`` when it is over; whoever started it kills it if need be.
 """
@@ -10,11 +11,13 @@ import resource
 import sys
 from pathlib import Path
 
-from tests.attack import table
+from tests.attack import raw, table
+from tests.attack.ways import Way
 
 
-def main(name: str, port: str, endpoint: str, seconds: str, pki: str = "") -> int:
+def main(name: str, port: str, endpoint: str, seconds: str, pki: str = "", way: Way = "tcp") -> int:
     """Attack for so long."""
+    raw.Agent.way = way
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
     row = table.every()[name]

@@ -25,9 +25,11 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from tests.attack import table
-from tests.attack.scene import BEGIN_S, MIB, ROBOT, descriptors, status_bytes, threads  # sets ROS's environment first
+from tests.attack.scene import BEGIN_S  # sets ROS's environment first
+from tests.attack.site import MIB, ROBOT, descriptors, status_bytes, threads
 
 from std_msgs.msg import String  # isort: skip
 
@@ -78,6 +80,30 @@ class Person:
 
 
 @dataclass
+class Counting:
+    """What the robot's topic comes from."""
+
+    session: RosSession
+    publisher: Any
+    number: int = 0
+
+    async def count(self) -> None:
+        """Publish, until cancelled."""
+        while True:
+            self.number += 1
+            self.publisher.publish(String(data=str(self.number)))
+            await asyncio.sleep(COUNT_EVERY_S)
+
+    async def sees(self) -> str:
+        """Who takes it, as far as ROS tells its publisher: nobody there, or nobody in the graph, is a fault of DDS."""
+        node = self.session.node
+        known = await self.session.run(lambda: node.get_subscriptions_info_by_topic(TOPIC))
+        takers = [f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in known]
+        matched = self.publisher.get_subscription_count()
+        return f"its publisher is at {self.number}, has {matched} subscriptions, and knows of {takers}"
+
+
+@dataclass
 class Size:
     """What a program took when it was first left in peace after its start."""
 
@@ -96,6 +122,7 @@ class Site:
     links: dict[str, Link]
     ports: list[int]
     random: random.Random
+    counting: Counting
     people: list[Person] = field(default_factory=list)
     steps: Counter[str] = field(default_factory=Counter)
     sizes: dict[str, Size] = field(default_factory=dict)
@@ -248,7 +275,7 @@ class Site:
             if (online.ros_agent_ids, online.unity_agent_ids) != ([ROBOT], sorted(ids)):
                 return f"gateway {person.gateway} says {online}, here are {sorted(ids)}"
         if deaf := [person.headset.id for person in self.people if person.heard_at < since]:
-            return f"headsets {deaf} do not hear the topic"
+            return f"headsets {deaf} do not hear the topic; {await self.counting.sees()}"
         return await self._mesh_problem(sorted(ids))
 
     async def _mesh_problem(self, ids: list[int]) -> str:
@@ -305,35 +332,28 @@ async def site(seed: int) -> AsyncIterator[Site]:
         for program in programs.values():
             await program.start()
             stack.push_async_callback(_kill, program)
-        running = Site(router, programs, links, ports, random.Random(seed))
         counting = await stack.enter_async_context(_counting(int(domain)))
+        running = Site(router, programs, links, ports, random.Random(seed), counting)
         for n in range(HEADSETS):
             await running.join(n % len(ports))
         try:
             yield running
         finally:
-            for job in (*running.jobs, counting):
+            for job in running.jobs:
                 job.cancel()
             for person in running.people:
                 await person.headset.abort()
 
 
 @asynccontextmanager
-async def _counting(domain: int) -> AsyncIterator[asyncio.Task[None]]:
+async def _counting(domain: int) -> AsyncIterator[Counting]:
     """A ROS node on the robot that publishes numbers."""
     with RosSession("counter", domain_id=domain) as session:
         publisher = await session.run(lambda: session.node.create_publisher(String, TOPIC, 10))
-
-        async def count() -> None:
-            number = 0
-            while True:
-                number += 1
-                publisher.publish(String(data=str(number)))
-                await asyncio.sleep(COUNT_EVERY_S)
-
-        task = asyncio.create_task(count())
+        counting = Counting(session, publisher)
+        task = asyncio.create_task(counting.count())
         try:
-            yield task
+            yield counting
         finally:
             task.cancel()
 

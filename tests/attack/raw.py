@@ -12,6 +12,8 @@ import threading
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 
+from tests.attack.ways import Stream, Way, opened
+
 FROM = "127.0.0.2"
 """Where attackers come from, so that what is counted per address is not the neighbours'."""
 ROS, UNITY = 1, 2
@@ -101,16 +103,21 @@ def node_data(name: str, data: bytes, *, node_type: int = 2, robot: int = 1, kin
 class Agent:
     """A TCP agent of any type, configured unless asked not to be; what it is sent is read and dropped."""
 
+    way: Way = "tcp"
+    """How all of them come in."""
+
     def __init__(
         self, port: int, *, agent_type: int = UNITY, group: int = 0, configure: bool = True, read: bool = True
     ) -> None:
-        self.socket = socket.socket()
-        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connected = socket.socket()
+        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if not read:  # what the kernel would hold for it is not the gateway's
-            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        self.socket.bind((FROM, 0))
+            connected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        connected.bind((FROM, 0))
+        connected.settimeout(5)
+        connected.connect(("127.0.0.1", port))
+        self.socket: Stream = opened(self.way, connected)
         self.socket.settimeout(5)
-        self.socket.connect(("127.0.0.1", port))
         self.id = 0
         self.agent_type = agent_type
         greeting = self._read_message()

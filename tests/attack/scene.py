@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import math
 import os
-import signal
 import struct
 import sys
 import tempfile
@@ -32,21 +31,26 @@ from bridge.cli.robots import Operator
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Publisher
 from bridge.ros.session import RosSession
-from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.protocol.agent_id import AgentId
-from macs_zenoh.protocol.limits import UNFINISHED_IN_ALL_BYTES, WAITING_IN_ALL_BYTES
 from macs_zenoh.protocol.messages import OPERATOR
 from macs_zenoh.protocol.robot_state import RobotStatus
-from tests.attack import secured
 from tests.attack.judge import Memory, Report, Window
+from tests.attack.site import (
+    DEADMAN_S,
+    MEMORY_LIMITS,
+    MIB,
+    ROBOT,
+    SETTINGS,
+    SLACK_BYTES,
+    Site,
+    forget_peak,
+    status_bytes,
+)
 from tests.attack.table import Attack
-from tests.support.programs import ROOT, Program, free_port
-from tests.support.routers import Router
+from tests.attack.ways import Way
+from tests.support.programs import ROOT
 
-MIB = 1 << 20
-ROBOT = 1
-DEADMAN_S = 0.3
 TALK_EVERY_S = 0.01
 DRIVE_EVERY_S = 0.02
 NO_EFFECT_S = 4.0
@@ -58,89 +62,6 @@ RECOVERY_S = 60.0
 own kernel, and is worked off at the pace that a gateway allows: so long it is online."""
 BEGIN_S = 60.0
 """By when an attacker has made its frames and begins."""
-
-SLACK_BYTES = 64 * MIB
-"""A frame of 32 MiB is there twice in the moment in which it is whole."""
-MEMORY_LIMITS = {
-    "gateway": max(WAITING_IN_ALL_BYTES, UNFINISHED_IN_ALL_BYTES) + SLACK_BYTES,
-    "robot": 2 * SLACK_BYTES,
-}
-"""What an attack may cost our programs at most. The router is Zenoh's, and its queues are per link."""
-
-SETTINGS = f"""
-[[robot.rules]]
-match = "/cmd_vel"
-exclusive = true
-deadman_s = {DEADMAN_S}
-deadman_message = {{ linear = {{ z = -1 }} }}
-"""
-
-
-# -- programs --------------------------------------------------------------------------------------------------------
-
-
-class Site:
-    """A router, a gateway and a robot agent; with certificates where there is a directory for them."""
-
-    def __init__(self, settings: Path, domain: int, pki: Path | None = None) -> None:
-        self.pki = pki
-        env = {"ROS_DOMAIN_ID": str(domain)}
-        if pki is not None:
-            self.endpoint = secured.made(pki)
-            self.mesh = secured.mesh_of(pki, secured.OPERATED)
-            mine = {name: pki / name / "macs.toml" for name in (secured.GATEWAY, secured.ROBOT)}
-            with mine[secured.ROBOT].open("a") as robots:
-                robots.write(settings.read_text())
-            self.router = Router(pki / "site" / "router.json5")
-            self.gateway = Program("gateway", "--port", "0", "--settings", str(mine[secured.GATEWAY]))
-            self.robot = Program("agent", "--settings", str(mine[secured.ROBOT]), env=env)
-            return
-        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
-        self.mesh = MeshSettings(connect=[self.endpoint])
-        common = ("-e", self.endpoint, "--settings", str(settings))
-        self.router = Router(listen=[self.endpoint])
-        self.gateway = Program("gateway", "--port", "0", "--robots", "any", *common)
-        self.robot = Program("agent", "--id", str(ROBOT), *common, env=env)
-
-    @property
-    def programs(self) -> dict[str, Router | Program]:
-        """Each by what it is."""
-        return {"router": self.router, "gateway": self.gateway, "robot": self.robot}
-
-    async def start(self, stack: AsyncExitStack) -> None:
-        """Start all three; they are killed in the end, as an attack may have left them in any state."""
-        for program in self.programs.values():
-            await program.start()
-            stack.push_async_callback(_kill, program)
-
-
-async def _kill(program: Router | Program) -> None:
-    with suppress(AssertionError, ProcessLookupError):
-        await program.stop(signal.SIGKILL)
-
-
-def status_bytes(pid: int, field: str) -> int:
-    """A size from /proc/PID/status: VmRSS, or VmHWM for the highest since `forget_peak`."""
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith(f"{field}:"):
-            return int(line.split()[1]) * 1024
-    return 0
-
-
-def forget_peak(pid: int) -> None:
-    """Let VmHWM begin anew."""
-    with suppress(OSError):
-        Path(f"/proc/{pid}/clear_refs").write_text("5")
-
-
-def threads(pid: int) -> int:
-    """How many threads a process has."""
-    return len(list(Path(f"/proc/{pid}/task").iterdir()))
-
-
-def descriptors(pid: int) -> int:
-    """How many descriptors a process has open."""
-    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
 
 # -- people ----------------------------------------------------------------------------------------------------------
@@ -362,7 +283,10 @@ class Scene:
     async def _attacked(self, attack: Attack, site: Site, seconds: float, stops: int | None) -> AsyncIterator[None]:
         """While the block runs this site is attacked."""
         length = seconds if stops is None else 3600.0
-        words = (attack.name, str(site.gateway.port), site.endpoint, str(length), str(site.pki or ""))
+        words = (
+            *(attack.name, str(site.attacked_port), site.endpoint, str(length)),
+            *(str(site.pki or ""), site.attacked_by),
+        )
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "tests.attack.attacker", *words), cwd=ROOT, stdout=asyncio.subprocess.PIPE
         )
@@ -554,13 +478,14 @@ async def until(
 
 
 @asynccontextmanager
-async def scene(directory: Path, domain: int, *, certified: bool = False) -> AsyncIterator[Scene]:
-    """Everything started, the robot driving; ``certified``: on sites that let in nobody without a certificate."""
+async def scene(directory: Path, domain: int, *, certified: bool = False, way: Way = "tcp") -> AsyncIterator[Scene]:
+    """Everything started, the robot driving; ``certified``: on sites that let in nobody without a certificate. TCP
+    agents that attack come in by this ``way``."""
     settings = directory / "macs.toml"
     settings.write_text(SETTINGS)
     pki = [Path(tempfile.mkdtemp(dir=directory)) / "pki" if certified else None for _ in range(2)]
     async with AsyncExitStack() as stack:
-        site, other = Site(settings, domain, pki[0]), Site(settings, domain % 100 + 1, pki[1])
+        site, other = Site(settings, domain, pki[0], way), Site(settings, domain % 100 + 1, pki[1], way)
         await asyncio.gather(site.start(stack), other.start(stack))
         wheels = Wheels(domain)
         stack.callback(wheels.close)
