@@ -28,7 +28,7 @@ from .protocol.reading import Message, Reader
 from .protocol.routing import call, inbox, keys_of
 from .protocol.wire import Layout, encode_frame, encode_message
 from .serving import Call, CallFirst, CallHandler, Served
-from .topics import DEPTH, Chosen, TopicPublisher, TopicSubscription, Value
+from .topics import DEPTH, Chosen, NodeUser, TopicPublisher, TopicSubscription, Value
 
 log = logging.getLogger("macs.agent")
 
@@ -379,6 +379,21 @@ class Agent:
         """
         answer: bytes | dict[str, Any] = await self._robot_nodes().call(service, request, robot, type, timeout_s)
         return answer
+
+    async def use_action(
+        self,
+        action: str,
+        *,
+        robot: int,
+        type: str,  # noqa: A002
+        timeout_s: float = ANSWER_S,
+    ) -> NodeUser:
+        """Have a robot take goals for an action, until what is returned is closed. Goals and what is told of them are
+        messages (docs/actions.md): `send` and `on_message`.
+
+        Raises Refused with the robot's reason, CallTimeout, UsageError, Closed.
+        """
+        return await self._robot_nodes().use_action(action, type, robot, timeout_s)
 
     def _robot_nodes(self) -> Nodes:
         self._check_open()

@@ -59,11 +59,27 @@ async def join(
     settings = settings or MeshSettings()
     if connect:
         settings = changed(settings, connect=list(connect))
-    async with await Mesh.open(settings, traffic=traffic, on_waiting=on_waiting) as mesh:
-        agent = Agent(mesh, kind, group, guard)
-        try:
-            await agent._join(id)
-            log.info("joined as %s/%d%s", agent.type, agent.id, f" in group {group}" if group else "")
-            yield agent
-        finally:
-            agent.close()
+    async with (
+        await Mesh.open(settings, traffic=traffic, on_waiting=on_waiting) as mesh,
+        joined(mesh, kind, id=id, group=group, guard=guard) as agent,
+    ):
+        yield agent
+
+
+@asynccontextmanager
+async def joined(
+    mesh: Mesh,
+    kind: int,
+    *,
+    id: int | None = None,  # noqa: A002
+    group: int = 0,
+    guard: Guard | None = None,
+) -> AsyncIterator[Agent]:
+    """The same on a session that is open already. Raises UsageError."""
+    agent = Agent(mesh, kind, group, guard)
+    try:
+        await agent._join(id)
+        log.info("joined as %s/%d%s", agent.type, agent.id, f" in group {group}" if group else "")
+        yield agent
+    finally:
+        agent.close()

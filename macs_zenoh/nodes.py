@@ -165,6 +165,12 @@ class Nodes:
         answer = await self._ask(user, robot, cdr, deadline - time.monotonic(), timeout_s)
         return self.types().deserialize(response_of(user.type), answer)
 
+    async def use_action(self, action: str, of_type: str, robot: int, timeout_s: float) -> NodeUser:
+        """See `Agent.use_action`."""
+        robots, groups = chosen(robot, ())
+        node = await self._node(NodeType.ACTION, action, of_type, robots, groups, timeout_s)
+        return await self._use(NodeUser(self, node, robots, groups), node, timeout_s)
+
     async def _ask(self, user: ServiceUser, robot: int, request: bytes, left_s: float, timeout_s: float) -> bytes:
         name = node_name(user.topic)
         number = self._next_request() % REQUEST_IDS
@@ -317,9 +323,8 @@ class Nodes:
             data = self._reader.read(key, name, payload, self.agent.key)
             if node is None or not data:
                 continue
-            messages = [
-                TopicMessage(robot, node.topic, node.wanted.data_exchange_type, cdr, self.types) for cdr in data
-            ]
+            of_type, now = node.wanted.data_exchange_type, time.monotonic()
+            messages = [TopicMessage(robot, node.topic, of_type, cdr, self.types, now) for cdr in data]
             for user in list(node.users):
                 if self.means(user, robot):
                     self._give(user, messages)

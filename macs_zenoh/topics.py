@@ -39,13 +39,17 @@ Self = TypeVar("Self", bound="NodeUser")
 class TopicMessage:
     """A message of a robot's topic: who sent it, and its CDR; `value` is what it says."""
 
-    __slots__ = ("_types", "data", "robot", "topic", "type")
+    __slots__ = ("_types", "data", "received_s", "robot", "topic", "type")
 
-    def __init__(self, robot: int, topic: str, of_type: str, data: bytes, types: Callable[[], Types]) -> None:
+    def __init__(
+        self, robot: int, topic: str, of_type: str, data: bytes, types: Callable[[], Types], received_s: float = 0.0
+    ) -> None:
         self.robot = robot
         self.topic = topic
         self.type = of_type
         self.data = data
+        self.received_s = received_s
+        """When it came, by the monotonic clock."""
         self._types = types
 
     def __repr__(self) -> str:
