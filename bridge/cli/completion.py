@@ -101,7 +101,7 @@ def _robots_in_list(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> l
 
 def _topics(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
     """What a robot publishes for who subscribes, what it takes for who publishes."""
-    publishes = getattr(parsed_args, "headset_verb", "") == "pub"
+    publishes = "pub" in (getattr(parsed_args, "headset_verb", ""), getattr(parsed_args, "topic_verb", ""))
     return _offered(parsed_args, "subscribers" if publishes else "publishers")
 
 

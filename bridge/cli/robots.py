@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import time
 from collections import Counter
 from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager, suppress
@@ -39,6 +40,9 @@ _T = TypeVar("_T")
 
 USUALLY_S = 0.4
 """Within so long a router has let us in, if one does."""
+
+CLOCK_PINGS = 5
+"""Of so many comparisons of two clocks the closest one counts."""
 
 WITHOUT_A_ROUTER = "(start one with `macs router`, or name it with -e; `macs doctor` looks closer)"
 
@@ -101,6 +105,20 @@ class Operator:
         except MacsError:
             return None
 
+    async def clock(self, zid: str) -> tuple[float, float] | None:
+        """How far the clock of a program is ahead of ours in seconds, and within what that is known; None: it does not
+        answer."""
+        best: tuple[float, float] | None = None
+        for _ in range(CLOCK_PINGS):
+            sent_s = time.time()
+            said = await self._pong(zid, self._timeout_s)
+            heard_s = time.time()
+            if said is None:
+                return best
+            clock = (said.time_s - (sent_s + heard_s) / 2, (heard_s - sent_s) / 2)
+            best = clock if best is None or clock[1] < best[1] else best
+        return best
+
     async def routers(self, *, timeout_s: float) -> list[Router]:
         """The routers that let themselves be seen, or at least those that we are linked with."""
         linked = [Router(zid) for zid in self._mesh.routers]
@@ -157,7 +175,14 @@ class Operator:
 
 @asynccontextmanager
 async def operator(settings: MeshSettings, caller: AgentId, *, timeout_s: float) -> AsyncIterator[Operator]:
-    """An operator's session until the end of the block. Of several routers each but the last one may take its time
+    """An operator's session until the end of the block. Raises Unreachable when no router answers in time."""
+    async with session(settings, timeout_s=timeout_s) as mesh:
+        yield Operator(mesh, caller, timeout_s)
+
+
+@asynccontextmanager
+async def session(settings: MeshSettings, *, timeout_s: float) -> AsyncIterator[Mesh]:
+    """A session until the end of the block. Of several routers each but the last one may take its time
     (``open_limit_ms``) beside ``timeout_s``, as when its host is off.
 
     Raises Unreachable when no router answers in time.
@@ -171,7 +196,7 @@ async def operator(settings: MeshSettings, caller: AgentId, *, timeout_s: float)
     finally:
         opening.cancel()
     async with mesh:
-        yield Operator(mesh, caller, timeout_s)
+        yield mesh
 
 
 async def _opened(opening: asyncio.Task[Mesh], settings: MeshSettings, patience_s: float) -> Mesh:

@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import islice
+
 import msgspec
 
 from ..config import MeshSettings
-from ..errors import BadJson
+from ..errors import BadJson, TooLong
 from .limits import REQUEST_BYTES
 from .wire import Buffer, encode_message, split_message
 
 MOST_AWAY = 1000
 """So many agents that are away are named: an answer has a size."""
+
+
+AGENTS = b"macs: which agents are yours?"
+"""Sent with a ping it is answered by a gateway with its agents, in the place of the same bytes."""
+MOST_AGENTS = 2000
+AGENTS_BYTES = 512 << 10
+
+
+class GatewayAgent(msgspec.Struct, frozen=True, array_like=True):
+    """An agent as its gateway knows it: where it comes from, and by which token."""
+
+    type: int
+    id: int
+    address: str = ""
+    token: str = ""
+    age_s: float = 0.0
+    """For how long it has been connected."""
 
 
 class Pong(msgspec.Struct, frozen=True, kw_only=True):
@@ -69,6 +89,23 @@ def pong(
 def encode(said: Pong, echo: Buffer = b"") -> bytes:
     """The answer to a ping: one message, what is said and the bytes that came with the ping."""
     return encode_message(msgspec.json.encode(said), echo)
+
+
+def encode_agents(agents: Iterable[GatewayAgent]) -> bytes:
+    """What a gateway answers to `AGENTS`."""
+    return msgspec.json.encode(list(islice(agents, MOST_AGENTS)))
+
+
+def decode_agents(told: bytes) -> list[GatewayAgent]:
+    """The agents that a gateway told; none of one that has only sent the question back. Raises TooLong, BadJson."""
+    if told == AGENTS or not told:
+        return []
+    if len(told) > AGENTS_BYTES:
+        raise TooLong("what a gateway tells of its agents", len(told), AGENTS_BYTES)
+    try:
+        return msgspec.json.decode(told, type=list[GatewayAgent])
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise BadJson("what a gateway tells of its agents", str(error)) from None
 
 
 def decode(answer: bytes) -> tuple[Pong, bytes]:

@@ -1,0 +1,232 @@
+"""A mesh as it is now: robots, headsets, gateways, routers, topics with their rates. Pure; the time is passed in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from msgspec import UNSET
+
+from macs_zenoh.protocol.directory import AgentInfo, Change
+from macs_zenoh.protocol.messages import ROS
+from macs_zenoh.protocol.ping import GatewayAgent, Pong
+from macs_zenoh.protocol.robot_state import CarriedStatus, NodeStatus, RobotStatus
+
+from .events import Event, of_presence, of_program, of_robot
+
+MOST_TOPICS = 2000
+"""Rows of topics that are kept: what others choose must not decide how much is."""
+SILENT_AFTER = 3
+"""So many questions without an answer until a robot counts as silent."""
+
+
+@dataclass
+class TopicRow:
+    """A topic of a robot that somebody has registered, with its rate since the last look."""
+
+    robot: int
+    name: str
+    type: str
+    role: str
+    registrants: list[str]
+    messages: int = 0
+    bytes: int = 0
+    age_s: float | None = None
+    rate_hz: float | None = None
+    rate_bytes: float | None = None
+    holder: str | None = None
+
+
+@dataclass
+class RobotRow:
+    """A robot with what it told last."""
+
+    info: AgentInfo
+    status: RobotStatus | None = None
+    told_s: float = 0.0
+    """When, by the monotonic clock."""
+    round_trip_s: float | None = None
+    unanswered: int = 0
+    problem: str = ""
+    lost_per_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class HeadsetRow:
+    """An agent that is no robot, as far as its gateway tells of it."""
+
+    info: AgentInfo
+    address: str = ""
+    token: str = ""
+    age_s: float | None = None
+    away: bool = False
+
+
+@dataclass
+class ProgramRow:
+    """A gateway or a router."""
+
+    kind: str
+    zid: str
+    address: str = ""
+    versions: str = ""
+    round_trip_s: float | None = None
+    answers: bool = True
+    lost: int = 0
+    links: list[str] = field(default_factory=list)
+    """Of a router: those that it is linked with."""
+
+
+class Picture:
+    """What is known of a mesh. What it is told returns the events that follow from it."""
+
+    def __init__(self) -> None:
+        self.robots: dict[int, RobotRow] = {}
+        self.others: dict[tuple[int, int], AgentInfo] = {}
+        self.programs: dict[str, ProgramRow] = {}
+        """Gateways and routers by their session's id."""
+        self.topics: dict[tuple[int, str, str], TopicRow] = {}
+        """By robot, role and name."""
+        self.away: set[tuple[int, int]] = set()
+        self._fresh: set[str] = set()
+        """Sessions of gateways that have not answered yet, and were not asked before."""
+        self.known: dict[tuple[int, int], GatewayAgent] = {}
+        """Agents of gateways that tell of them."""
+
+    # -- what is told --------------------------------------------------------------------------------------------
+
+    def presence(self, change: Change, at_s: float) -> list[Event]:
+        """Somebody came, changed or left."""
+        agent, online = change
+        before = self.robots[agent.id].info if agent.type == ROS and agent.id in self.robots else None
+        if agent.type != ROS:
+            before = self.others.get(agent.key)
+        events = list(of_presence(before, agent if online else None, at_s))
+        if agent.type != ROS:
+            if online:
+                self.others[agent.key] = agent
+            else:
+                self.others.pop(agent.key, None)
+                self.known.pop(agent.key, None)
+        elif online:
+            row = self.robots.setdefault(agent.id, RobotRow(agent))
+            if row.info.session != agent.session:  # it started again, and counts from nothing
+                row.status = None
+            row.info = agent
+        else:
+            self.robots.pop(agent.id, None)
+            for key in [key for key in self.topics if key[0] == agent.id]:
+                del self.topics[key]
+        return events
+
+    def told(self, robot: int, status: RobotStatus, round_trip_s: float, now: float, at_s: float) -> list[Event]:
+        """A robot has told its state."""
+        row = self.robots.get(robot)
+        if row is None:
+            return []
+        before, since_s = row.status, now - row.told_s
+        events = list(of_robot(robot, before, status, at_s)) if before is not None else []
+        if row.unanswered >= SILENT_AFTER:
+            events.append(Event(at_s, "came", str(row.info.key), f"{row.info.key} answers again"))
+        if before is not None and since_s > 0:
+            row.lost_per_s = max(0, sum(status.drops.values()) - sum(before.drops.values())) / since_s
+        row.status, row.told_s, row.round_trip_s, row.unanswered, row.problem = status, now, round_trip_s, 0, ""
+        self._topics_of(robot, status, before is not None, since_s)
+        return events
+
+    def silent(self, robot: int, problem: str, at_s: float) -> list[Event]:
+        """A robot did not answer."""
+        row = self.robots.get(robot)
+        if row is None:
+            return []
+        row.unanswered += 1
+        row.problem = problem
+        if row.unanswered == SILENT_AFTER:
+            return [Event(at_s, "silent", str(row.info.key), f"{row.info.key} does not answer: {problem}")]
+        return []
+
+    def gateways(self, pongs: Mapping[str, tuple[Pong, float] | None], at_s: float) -> list[Event]:
+        """What gateways said, by session, with the time that it took; None: nothing."""
+        rows = {}
+        self.away = {agent for told in pongs.values() if told is not None for agent in told[0].away}
+        fresh, self._fresh = self._fresh, set()
+        for zid, told in pongs.items():
+            if told is None and zid not in self.programs and zid not in fresh:
+                self._fresh.add(zid)  # it has just come: a moment later it has an address
+                continue
+            row = self.programs.get(zid) or ProgramRow("gateway", zid)
+            row.answers = told is not None
+            if told is not None:
+                pong, row.round_trip_s = told
+                row.address, row.lost = pong.address, sum(pong.drops.values())
+                row.versions = f"macs {pong.macs}, Zenoh {pong.zenoh}"
+            rows[zid] = row
+        return self._programs("gateway", rows, at_s)
+
+    def routers(
+        self, found: Mapping[str, tuple[str, str, list[str]]], round_trip_s: float, at_s: float
+    ) -> list[Event]:
+        """Routers by their id: address, version, and those that they are linked with."""
+        rows = {}
+        for zid, (address, version, links) in found.items():
+            rows[zid] = ProgramRow("router", zid, address, f"Zenoh {version}", round_trip_s, links=links)
+        return self._programs("router", rows, at_s)
+
+    def _programs(self, kind: str, rows: Mapping[str, ProgramRow], at_s: float) -> list[Event]:
+        before = {zid for zid, row in self.programs.items() if row.kind == kind}
+        events = [of_program(kind, rows[zid].address or zid[:8], True, at_s) for zid in rows.keys() - before]
+        for zid in before - rows.keys():
+            row = self.programs.pop(zid)
+            events.append(of_program(kind, row.address or zid[:8], False, at_s))
+        self.programs.update(rows)
+        return events
+
+    def _topics_of(self, robot: int, status: RobotStatus, told_before: bool, since_s: float) -> None:
+        seen = set()
+        for node in status.nodes:
+            if node.carried is UNSET:
+                continue
+            key = (robot, node.role, node.name)
+            seen.add(key)
+            row = self.topics.get(key)
+            if row is None and len(self.topics) >= MOST_TOPICS:
+                continue
+            self.topics[key] = _topic(robot, node, node.carried, row if told_before else None, since_s)
+        for key in [key for key in self.topics if key[0] == robot and key not in seen]:
+            del self.topics[key]
+
+    # -- what is so ----------------------------------------------------------------------------------------------
+
+    def headsets(self) -> Iterator[HeadsetRow]:
+        """Agents that are no robots, by type and id."""
+        for key in sorted(self.others):
+            told = self.known.get(key)
+            if told is None:
+                yield HeadsetRow(self.others[key])
+            else:
+                yield HeadsetRow(self.others[key], told.address, told.token, told.age_s, key in self.away)
+
+    def state_of(self, robot: RobotRow) -> str:
+        """What somebody has to know before commanding it."""
+        if robot.unanswered >= SILENT_AFTER:
+            return "does not answer"
+        status = robot.status
+        if status is None:
+            return "" if not robot.problem else "?"
+        stopped = [f"STOPPED by {status.stop.by}"] if status.stopped else []
+        held = [
+            f"{node.name}: {node.control.holder}"
+            for node in status.nodes
+            if node.control is not UNSET and node.control.holder
+        ]
+        return ", ".join(stopped + held)
+
+
+def _topic(robot: int, node: NodeStatus, now: CarriedStatus, before: TopicRow | None, since_s: float) -> TopicRow:
+    row = TopicRow(robot, node.name, node.type, node.role, node.registrants, now.messages, now.bytes, now.age_s)
+    if before is not None and since_s > 0 and now.messages >= before.messages:
+        row.rate_hz = (now.messages - before.messages) / since_s
+        row.rate_bytes = (now.bytes - before.bytes) / since_s
+    if node.control is not UNSET:
+        row.holder = node.control.holder
+    return row

@@ -1,0 +1,205 @@
+"""`macs top`, `macs watch`, `macs ping` and `macs bench` on a real mesh, without ROS."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import json
+import os
+import pty
+import struct
+import sys
+import termios
+from typing import Any
+
+import macs_zenoh
+from bridge.headset.client import Headset
+from tests.support.processes import ROOT
+from tests.support.programs import Program, ended, free_port, macs
+from tests.support.waiting import PATIENCE_S, until
+
+STATE: dict[str, Any] = {
+    "ros_node": "/rosagent",
+    "stopped": False,
+    "stop": {"by": "", "pressed": [], "seconds": 0, "times": 0, "history": []},
+    "nodes": [
+        {
+            "role": "subscriber",
+            "name": "/pose",
+            "type": "geometry_msgs/msg/PoseStamped",
+            "registrants": ["unity/2"],
+            "carried": {"messages": 10, "bytes": 800, "age_s": 0.1},
+        }
+    ],
+    "drops": {},
+}
+
+
+class Told:
+    """A robot that tells a state, which the test changes."""
+
+    def __init__(self, agent: macs_zenoh.Agent) -> None:
+        self.state = json.loads(json.dumps(STATE))
+        self.asked = 0
+        agent.serve("status", self._answer)
+
+    async def _answer(self, call: macs_zenoh.Call) -> bytes:
+        self.asked += 1
+        self.state["nodes"][0]["carried"]["messages"] += 5
+        return json.dumps(self.state).encode()
+
+
+async def test_watch_tells_what_changes(router: str) -> None:
+    """A line for each: who comes and leaves, a stop and its release, what was refused, a gateway."""
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+        robot = Told(agent)
+        watching = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "bridge", "watch", "--json", "--count", "6", "-e", router),
+            cwd=ROOT,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        assert watching.stdout is not None
+        assert watching.stderr is not None
+
+        async def event() -> dict[str, Any]:
+            said: dict[str, Any] = json.loads(await asyncio.wait_for(watching.stdout.readline(), PATIENCE_S))
+            return said
+
+        while b"watching" not in (line := await asyncio.wait_for(watching.stderr.readline(), PATIENCE_S)):
+            assert line
+        async with macs_zenoh.join("unity", id=300, group=3, connect=[router]):
+            assert (await event()) | {"time": 0} == {
+                "time": 0,
+                "event": "came",
+                "who": "unity/300",
+                "text": f"unity/300 is online in group 3 (session {_short(agent, 300)})",
+            }
+            robot.state["stopped"], robot.state["stop"]["by"], robot.state["stop"]["times"] = True, "unity/300", 1
+            said = await event()
+            assert (said["event"], said["who"], said["by"]) == ("stopped", "ros/7", "unity/300")
+            robot.state["drops"]["stopped"] = 2
+            assert (await event())["text"] == "ros/7 refused 2 messages: the emergency stop holds (stopped)"
+            robot.state["stopped"] = False
+            assert (await event())["event"] == "released"
+        assert (await event())["event"] == "left"
+        endpoint = router
+        async with Program("gateway", "--port", "0", "-e", endpoint) as gateway:
+            assert (await event())["who"] == gateway.ready.replace("gateway on", "gateway")
+        assert await asyncio.wait_for(watching.wait(), PATIENCE_S) == 0
+
+
+def _short(agent: macs_zenoh.Agent, number: int) -> str:
+    found = agent.directory.get(2, number)
+    assert found is not None
+    return found.zid[:8]
+
+
+async def test_watch_ends_as_it_was_told(router: str) -> None:
+    """Too few events in time are exit code 1; an event that there is not is wrong usage."""
+    code, out, _ = await ended("watch", "-e", router, "--count", "1", "--timeout", "0.3")
+    assert (code, out) == (1, "")
+    code, _, log = await ended("watch", "-e", router, "--only", "stoped")
+    assert (code, "'stoped' is no event" in log) == (2, True)
+
+
+async def test_top_shows_all_of_a_mesh(router: str) -> None:
+    """For programs and as a page: robots, topics with rates, headsets with address and age, gateways and routers."""
+    async with (
+        macs_zenoh.join("ros", id=7, group=3, connect=[router]) as agent,
+        Program("gateway", "--port", "0", "-e", router) as gateway,
+        await Headset.connect("127.0.0.1", gateway.port) as headset,
+    ):
+        robot = Told(agent)
+        await until(lambda: agent.directory.get(2, headset.id))
+        said = await macs("top", "--json", "-e", router)
+        (row,) = said["robots"]
+        assert (row["id"], row["group"], row["stopped"], row["state"]) == (7, 3, False, "")
+        (topic,) = said["topics"]
+        assert (topic["robot"], topic["topic"], topic["way"], topic["registrants"]) == (7, "/pose", "out", ["unity/2"])
+        assert topic["rate_hz"] > 0
+        (worn,) = [row for row in said["headsets"] if row["id"] == headset.id]
+        assert worn["address"].startswith("127.0.0.1:")
+        assert worn["age_s"] >= 0
+        kinds = {row["kind"]: row for row in said["programs"]}
+        assert kinds["gateway"]["address"] == f"127.0.0.1:{gateway.port}"
+        assert kinds["router"]["round_trip_ms"] > 0
+        assert robot.asked <= 5
+
+        code, page, _ = await ended("top", "--once", "--view", "headsets", "-e", router)
+        assert code == 0
+        assert page.splitlines()[0].startswith(f"macs top {router}  1 robots")
+        assert f"127.0.0.1:{worn['address'].rpartition(':')[2]}" in page
+
+
+async def test_top_fills_a_terminal_of_80_by_24(router: str) -> None:
+    """It draws, follows keys, and leaves the terminal as it was."""
+    async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
+        Told(agent)
+        master, slave = pty.openpty()
+        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+        before = termios.tcgetattr(slave)
+        seen = bytearray()
+        loop = asyncio.get_running_loop()
+        loop.add_reader(master, lambda: seen.extend(os.read(master, 65536)))
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "bridge", "top", "-e", router),
+            cwd=ROOT,
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            env={**os.environ, "TERM": "xterm"},
+        )
+        try:
+            await until(lambda: b"1 robots 2 topics" in seen and b"ROBOT" in seen)
+            os.write(master, b"2")
+            await until(lambda: b"/pose" in seen and b"CONTROL" in seen)
+            os.write(master, b"q")
+            assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
+            await until(lambda: b"\x1b[?1049l" in seen)
+            assert termios.tcgetattr(slave) == before
+        finally:
+            loop.remove_reader(master)
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+            os.close(master)
+            os.close(slave)
+
+
+async def test_ping_says_how_long_a_robot_takes(router: str) -> None:
+    """Times, losses and the clock; a robot that is not online is exit code 1."""
+    async with macs_zenoh.join("ros", id=7, connect=[router]):
+        said = await macs("ping", "7", "--count", "3", "--interval", "0.01", "--json", "-e", router)
+        assert (said["robot"], said["sent"], said["answered"]) == (7, 3, 3)
+        assert 0 < said["min_ms"] <= said["p50_ms"] <= said["p99_ms"] <= said["max_ms"]
+        assert abs(said["clock_ahead_ms"]) <= said["clock_within_ms"]
+        code, out, _ = await ended("ping", "7", "--count", "1", "-e", router)
+        assert code == 0
+        assert out.startswith("56 bytes from robot 7: seq=1 time=")
+        assert "1 sent, 1 answered, 0% lost\nrtt min/avg/max/mdev = " in out
+    code, _, log = await ended("ping", "9", "-e", router)
+    assert (code, "robot 9 cannot be reached: it is not online" in log) == (1, True)
+
+
+async def test_bench_measures_and_is_bounded(router: str) -> None:
+    """Through the router and to a robot's agent; more than a mesh should be asked for is refused."""
+    said = await macs("bench", "--seconds", "0.5", "--rate", "100", "--json", "-e", router)
+    assert (said["sent"], said["lost"]) == (50, 0)
+    assert 0 < said["p50_ms"] <= said["p99_ms"]
+    async with macs_zenoh.join("ros", id=7, connect=[router]):
+        bench = ("bench", "--robot", "7", "--seconds", "0.3", "--rate", "50", "-e", router)
+        code, out, _ = await ended(*bench)
+        assert code == 0
+        assert out.startswith("robot 7, there and back: 15 messages of 1000 bytes")
+        assert (await ended(*bench, "--most-ms", "0.000001"))[0] == 1
+    for wrong, why in (
+        (("--rate", "1e6"), "rate"),
+        (("--seconds", "3600"), "seconds"),
+        (("--rate", "2000", "--size", "100000"), "at most 10 MB/s"),
+    ):
+        code, _, log = await ended("bench", "-e", router, *wrong)
+        assert code == 2
+        assert why in log.splitlines()[-1]
+    code, _, log = await ended("bench", "-e", f"tcp/127.0.0.1:{free_port()}", "--wait", "0.3")
+    assert code == 1
