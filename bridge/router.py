@@ -5,8 +5,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 
+from bridge.metrics.endpoint import watched_at
+from bridge.metrics.families import Family, by_type
+from bridge.metrics.watched import Watched
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import Mesh, configuration
@@ -43,17 +46,32 @@ def open_to_anybody(settings: MeshSettings) -> list[str]:
     return found
 
 
-async def serve(settings: MeshSettings, *, on_ready: Callable[[], None]) -> None:
-    """Be a router until cancelled. Raises what `Mesh.open` raises, at the start."""
+async def serve(settings: MeshSettings, *, on_ready: Callable[[], None], metrics: str | None = None) -> None:
+    """Be a router until cancelled. At ``metrics``, HOST:PORT, it tells who watches it. Raises what `Mesh.open` raises,
+    at the start."""
+    now: list[Mesh] = []
+    async with watched_at(metrics, Watched("router", lambda: now[-1] if now else None, figures=lambda: _figures(now))):
+        await _serve(settings, now, on_ready)
+
+
+def _figures(now: Sequence[Mesh]) -> Iterator[Family]:
+    for mesh in now:
+        yield by_type("macs_sessions", "sessions with this router", mesh.neighbours.values())
+
+
+async def _serve(settings: MeshSettings, now: list[Mesh], on_ready: Callable[[], None]) -> None:
+    """`serve`; ``now`` has the router's session as long as there is one."""
     known: set[str] = set()
     mesh, ready = await Mesh.open(settings), False
     while True:
         async with mesh:
+            now[:] = [mesh]
             if not ready:
                 on_ready()
                 ready = True
             router = await _dead_link(mesh, known)
             log.warning("the link with router %s is back and carries nothing; starting again", router[:8])
+            now.clear()
         await asyncio.sleep(FORGOTTEN_S)
         mesh = await _opened_again(settings)
 

@@ -13,17 +13,21 @@ import json
 import logging
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 from bridge.awareness.link import MeshLink
 from bridge.awareness.node import NODE_NAME, SUCCESS, GatewayNode, Parameters
+from bridge.metrics.endpoint import watched_at
+from bridge.metrics.families import Family, counter
+from bridge.metrics.watched import Watched
 from bridge.ros.session import RosSession
 from bridge.settings import Settings
 from macs_zenoh.awareness import Received
 from macs_zenoh.errors import ConfigError, MacsError
 from macs_zenoh.losses import Losses
+from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.named import Copies, Outcome
 
 log = logging.getLogger("macs.awareness")
@@ -63,6 +67,11 @@ class Gateway:
     def counters(self) -> dict[str, int]:
         """Everything that is counted, by name."""
         return dict(self._link.counters + Counter(dict(self._counters)))  # dict: at once, the ROS thread counts too
+
+    @property
+    def mesh(self) -> Mesh | None:
+        """Its session, once it is on the mesh."""
+        return self._link.mesh
 
     @property
     def on_mesh(self) -> bool:
@@ -247,6 +256,23 @@ class Gateway:
                 self.node.say_counters(counters)
 
 
+def _watched(gateway: Gateway) -> Watched:
+    """A gateway as who watches it sees it."""
+
+    def figures() -> Iterator[Family]:
+        counted = counter("macs_awareness", "messages between named agents, by what became of them")
+        for name, count in gateway.counters.items():
+            counted.add(count, counter=name)
+        yield counted
+
+    return Watched(
+        "awareness",
+        lambda: gateway.mesh,
+        figures=figures,
+        facts=lambda: {"name": gateway.parameters.agent_id, "state": gateway.node.state, "counters": gateway.counters},
+    )
+
+
 @asynccontextmanager
 async def open_gateway(
     settings: Settings,
@@ -288,9 +314,14 @@ async def run(
     autostart: bool = True,
     on_ready: Callable[[str], None] | None = None,
     on_waiting: Callable[[str], None] | None = None,
+    metrics: str | None = None,
 ) -> None:
-    """Be a gateway until the task is cancelled. See `open_gateway`; raises UsageError when the name is taken."""
-    async with open_gateway(settings, ros_args=ros_args, on_waiting=on_waiting) as gateway:
+    """Be a gateway until the task is cancelled. See `open_gateway`; raises UsageError when the name is taken. At
+    ``metrics``, HOST:PORT, it tells who watches it."""
+    async with (
+        open_gateway(settings, ros_args=ros_args, on_waiting=on_waiting) as gateway,
+        watched_at(metrics, _watched(gateway)),
+    ):
         if autostart:
             await gateway.autostart()
         if on_ready is not None:

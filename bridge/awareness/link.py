@@ -135,6 +135,12 @@ class MeshLink:
         self._wanted = dict.fromkeys(self._wanted)
 
     @property
+    def mesh(self) -> Mesh | None:
+        """The session, once there is one."""
+        opened = self._mesh
+        return opened.result() if opened.done() and not opened.cancelled() and opened.exception() is None else None
+
+    @property
     def counters(self) -> Counter[str]:
         """What was sent and what arrived, by name."""
         before, awareness = Counter(dict(self._before)), self.awareness  # dict: at once, other threads count too

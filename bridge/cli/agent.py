@@ -27,6 +27,7 @@ SUMMARY = "a robot: this machine's ROS 2 graph"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--id", type=int, help="id of this robot, 1 to 65535 (default: the first free one)")
     parser.add_argument("--group", type=int, help="group of this robot, 1 to 255 (default: 0, none)")
+    options.add_metrics_option(parser)
     options.add_mesh_options(parser)
     parser.add_argument(
         "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help="ROS arguments, to the end of the line"
@@ -37,10 +38,10 @@ def run(args: argparse.Namespace) -> int:
     settings = options.settings(args)
     settings = changed(settings, robot=changed(settings.robot, id=args.id, group=args.group))
     ros_args = ["--ros-args", *args.ros_args] if args.ros_args else []
-    return running.until_stopped(lambda: _serve(settings, ros_args))
+    return running.until_stopped(lambda: _serve(settings, ros_args, args.metrics))
 
 
-async def _serve(settings: Settings, ros_args: list[str]) -> int:
+async def _serve(settings: Settings, ros_args: list[str], metrics: str | None) -> int:
     from bridge.doctor.first import told_while_waiting
     from bridge.ros import agent
 
@@ -50,5 +51,6 @@ async def _serve(settings: Settings, ros_args: list[str]) -> int:
         ros_args=ros_args,
         on_waiting=told_while_waiting(settings.mesh),
         on_ready=lambda robot: running.say_ready(f"robot {robot.id}"),
+        metrics=metrics,
     )
     return 0

@@ -33,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--transport", choices=["mesh", "topic", "both"], help="how robots are reached (default: mesh)"
     )
     parser.add_argument("--no-autostart", action="store_true", help="wait to be configured and activated")
+    options.add_metrics_option(parser)
     options.add_mesh_options(parser)
     parser.add_argument(
         "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help="ROS arguments, to the end of the line"
@@ -50,10 +51,12 @@ def run(args: argparse.Namespace) -> int:
     )
     settings = changed(settings, awareness=awareness)
     ros_args = ["--ros-args", *args.ros_args] if args.ros_args else []
-    return running.until_stopped(lambda: _serve(settings, ros_args, autostart=not args.no_autostart))
+    return running.until_stopped(
+        lambda: _serve(settings, ros_args, autostart=not args.no_autostart, metrics=args.metrics)
+    )
 
 
-async def _serve(settings: Settings, ros_args: list[str], *, autostart: bool) -> int:
+async def _serve(settings: Settings, ros_args: list[str], *, autostart: bool, metrics: str | None) -> int:
     from bridge.awareness import gateway
     from bridge.doctor.first import told_while_waiting
 
@@ -61,6 +64,7 @@ async def _serve(settings: Settings, ros_args: list[str], *, autostart: bool) ->
         settings,
         ros_args=ros_args,
         autostart=autostart,
+        metrics=metrics,
         on_waiting=told_while_waiting(settings.mesh),
         on_ready=running.say_ready,
     )

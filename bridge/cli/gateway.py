@@ -22,6 +22,7 @@ import logging
 import resource
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
 
 from bridge import memory
 from bridge.cli import options, running
@@ -33,6 +34,9 @@ from macs_zenoh.errors import ConfigError, UsageError
 from macs_zenoh.protocol import endpoints
 from macs_zenoh.protocol.addresses import is_local, joined
 from macs_zenoh.sections import changed
+
+if TYPE_CHECKING:
+    from bridge.gateway import Gateway
 
 log = logging.getLogger("macs.gateway")
 
@@ -73,6 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers", type=int, default=1, metavar="N", help="processes that share the port (default: 1)"
     )
     parser.add_argument(WORKER_ON, type=int, metavar="PORT", help=argparse.SUPPRESS)
+    options.add_metrics_option(parser)
     options.add_mesh_options(parser, modes=("client", "peer", "router"))
 
 
@@ -108,13 +113,15 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--workers is {args.workers}, at least 1 is needed")
     if settings.mesh.mode == "router" and (args.workers > 1 or args.be_worker_on_port is not None):
         raise UsageError("a gateway that is the router is one process: leave out --workers, or run macs router")
+    if args.workers > 1 and args.metrics is not None:
+        raise UsageError("--workers share no port for figures: leave out --metrics, or run a gateway for each")
     if args.workers > 1 and args.be_worker_on_port is None:
         if 0 in (listen_on.tls_port, listen_on.web_port):
             raise UsageError("--workers share their ports: say which, and not 0, for --tls-port and --web-port")
         if listen_on.block is not None:
             raise UsageError("--block and --workers exclude each other: every worker leases a block of its own")
         return running.until_stopped(lambda: _supervise(args.workers, listen_on, args.words))
-    return running.until_stopped(lambda: _serve(changed(settings, gateway=listen_on)))
+    return running.until_stopped(lambda: _serve(changed(settings, gateway=listen_on), args.metrics))
 
 
 async def _supervise(workers: int, settings: GatewaySettings, words: Sequence[str]) -> int:
@@ -173,7 +180,19 @@ def _judge_router(settings: MeshSettings) -> None:
         log.warning("%s is open: whoever reaches it sees all and drives robots; %s", endpoint, KEPT_IN)
 
 
-async def _serve(settings: Settings) -> int:
+async def _serve(settings: Settings, metrics: str | None) -> int:
+    """Be a gateway, and tell who watches it at ``metrics``."""
+    now: list[Gateway] = []
+    if metrics is None:
+        return await _be_gateway(settings, now)
+    from bridge.gateway.figures import watched_now
+    from bridge.metrics.endpoint import watched_at
+
+    async with watched_at(metrics, watched_now(lambda: now[-1] if now else None)):
+        return await _be_gateway(settings, now)
+
+
+async def _be_gateway(settings: Settings, now: list[Gateway]) -> int:
     from bridge.doctor.first import told_while_waiting
     from bridge.gateway import Gateway
     from macs_zenoh import managers
@@ -191,6 +210,7 @@ async def _serve(settings: Settings) -> int:
     while True:
         async with await Mesh.open(settings.mesh, traffic=settings.traffic, on_waiting=waiting) as mesh:
             gateway = Gateway(mesh, listening, own)
+            now[:] = [gateway]
             try:
                 await gateway.start()
                 open_to_all = listening.plain_without_token == "everybody"  # noqa: S105 - no password
@@ -209,4 +229,5 @@ async def _serve(settings: Settings) -> int:
                     web_port=gateway.listeners.web_port or None,
                 )
             finally:
+                now.clear()
                 await gateway.close()

@@ -11,7 +11,7 @@ import argparse
 import logging
 import os
 
-from bridge.logs import log_to_stderr
+from bridge.logs import FORMAT, FORMATS, JSON, TEXT, log_to_stderr
 from bridge.principal import GRAMMAR, Principal
 from bridge.settings import Settings, load
 from macs_zenoh.config import MeshSettings
@@ -22,6 +22,11 @@ from macs_zenoh.sections import changed
 
 def add_log_options(parser: argparse.ArgumentParser, verbose: str = "log more") -> None:
     parser.add_argument("-v", "--verbose", action="store_true", help=verbose)
+    parser.add_argument(
+        "--log-format",
+        choices=(TEXT, JSON),
+        help=f"of the log on stderr: for people (with dates where it is no terminal), or JSON; default: ${FORMAT}",
+    )
 
 
 CONNECT = "MACS_CONNECT"
@@ -34,6 +39,14 @@ def add_settings_option(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         action="append",
         help="our settings file (TOML), see config/macs.toml; repeat: a later one wins",
+    )
+
+
+def add_metrics_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--metrics",
+        metavar="HOST:PORT",
+        help="tell who watches: /metrics for Prometheus, /healthz, /readyz, /diagnostics (a port alone: this machine)",
     )
 
 
@@ -117,5 +130,10 @@ def _routers_of_environment() -> list[str] | None:
 
 def start_logging(args: argparse.Namespace) -> None:
     """Log ``macs.*`` to stderr, one short line each; other libraries only from WARNING on."""
-    log_to_stderr()
+    form = getattr(args, "log_format", None)
+    if form is None and os.environ.get(FORMAT, TEXT) not in FORMATS:
+        raise UsageError(f"{FORMAT} is {os.environ[FORMAT]!r}: say {TEXT} or {JSON}")
+    if form is not None:
+        os.environ[FORMAT] = form  # for the programs that this one starts
+    log_to_stderr(form)
     logging.getLogger("macs").setLevel(logging.DEBUG if args.verbose else logging.INFO)

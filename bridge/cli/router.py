@@ -32,6 +32,7 @@ SUMMARY = "a Zenoh router, where robots and gateways meet"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    options.add_metrics_option(parser)
     options.add_mesh_options(parser, modes=(), dials=False)
 
 
@@ -39,10 +40,10 @@ def run(args: argparse.Namespace) -> int:
     mesh = changed(options.settings(args).mesh, mode="router")
     # what passes has its namespace already; the router's own questions are about routers, which have none
     mesh = msgspec.structs.replace(mesh, namespace=None, overrides=[*mesh.overrides, "namespace:null"])
-    return running.until_stopped(lambda: _serve(mesh))
+    return running.until_stopped(lambda: _serve(mesh, args.metrics))
 
 
-async def _serve(settings: MeshSettings) -> int:
+async def _serve(settings: MeshSettings, metrics: str | None) -> int:
     from bridge.router import KEPT_IN, open_to_anybody, serve
 
     memory.give_back()
@@ -53,5 +54,5 @@ async def _serve(settings: MeshSettings) -> int:
         of_file = f"the endpoints of {settings.config_file}" if settings.config_file else EVERY_INTERFACE
         running.say_ready("router on " + (", ".join(settings.listen) or of_file))
 
-    await serve(settings, on_ready=ready)
+    await serve(settings, on_ready=ready, metrics=metrics)
     return 0

@@ -12,6 +12,7 @@ from contextlib import suppress
 
 from bridge.cli import output
 from bridge.cli.running import READY, STOP_WITH_STDIN
+from bridge.logs import FORMAT, SHORT, TEXT
 from macs_zenoh.errors import MacsError
 from macs_zenoh.timeouts import within
 
@@ -107,6 +108,7 @@ class Child:
             start_new_session=True,
             limit=LONGEST_LINE,
             env={
+                FORMAT: SHORT if sys.stderr.isatty() else TEXT,  # unless something is said
                 **environment,
                 STOP_WITH_STDIN: "1",
                 "PYTHONUNBUFFERED": "1",

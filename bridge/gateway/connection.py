@@ -127,6 +127,7 @@ class Connection(asyncio.BufferedProtocol):
         self._refused = False
         self._pauses = 0
         self._spent_s = 0.0
+        self.received_bytes = 0
         self._unfinished = 0
         """What is counted for it of a frame that has begun."""
         self._read_bytes = FIRST_READ_BYTES
@@ -145,6 +146,11 @@ class Connection(asyncio.BufferedProtocol):
         self.grouped_at = -math.inf
         """When it came into the group that others see it in, by the loop's clock."""
         self.regrouping: asyncio.TimerHandle | None = None
+
+    @property
+    def sent_bytes(self) -> int:
+        """How much was written for the agent."""
+        return self._writer.written_bytes
 
     @property
     def agent_id(self) -> int:
@@ -199,6 +205,7 @@ class Connection(asyncio.BufferedProtocol):
     def buffer_updated(self, nbytes: int) -> None:
         began = time.monotonic()
         self._unread -= nbytes
+        self.received_bytes += nbytes
         if events := self.peer.advance(nbytes, began):
             self._events(events)
         unfinished = self.peer.partial_bytes

@@ -11,6 +11,7 @@ import asyncio
 import logging
 import time
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 
@@ -55,6 +56,7 @@ from macs_zenoh.protocol.messages import (
     RemoveNode,
     encode_data,
 )
+from macs_zenoh.protocol.ping import GatewayAgent
 from macs_zenoh.protocol.rate_limit import TOGETHER, Pace
 from macs_zenoh.protocol.recipient import Recipient, to_agent
 from macs_zenoh.protocol.registrations import AgentKey
@@ -140,6 +142,8 @@ class Gateway:
         """Who is online, as the answer to whoever asks; empty when that has changed."""
         self._memory = Memory(settings.outbox_bytes, settings.max_frame_bytes)
         self._numbers = 0
+        self._received_bytes = self._sent_bytes = 0
+        """Of connections that have ended."""
         self._requests = Credit(TOGETHER * settings.max_requests_per_s, time.monotonic())
         """Of all who send robots much."""
         self._churn = Churn()
@@ -196,6 +200,22 @@ class Gateway:
         """What was lost, by name: here, and for connections that have ended; ``wrong_sender`` was only put right."""
         return self._drops + self._delivery.drops
 
+    def amounts(self) -> list[tuple[str, str, int]]:
+        """What all connections together have of what is limited: name, what it is, how much."""
+        return [
+            ("outbox_bytes", "bytes that wait for agents that read slowly", self._memory.waiting.used),
+            ("unfinished_bytes", "bytes of frames that have begun", self._memory.unfinished.used),
+            ("registered_nodes", "interface nodes that agents have registered", self._nodes.used),
+            ("streams", "topics of robots that somebody here receives", len(self._delivery.streams)),
+            ("waiting_connections", "connections that wait for an id", len(self._waiting) + len(self._coming)),
+        ]
+
+    def carried(self) -> tuple[int, int]:
+        """Bytes that were received from and sent to agents, with those that have left."""
+        connections = self.agents.connections()
+        received = sum(each.received_bytes for each in connections)
+        return self._received_bytes + received, self._sent_bytes + sum(each.sent_bytes for each in connections)
+
     # -- life ----------------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
@@ -208,7 +228,7 @@ class Gateway:
         self._audit = open_audit(
             settings.audit_file, name, settings.audit_max_bytes, settings.audit_files, self._audit_lost
         )
-        self.mesh.tells, self.mesh.away = self._now, self._away
+        self.mesh.tells, self.mesh.away, self.mesh.agents = self._now, self._away, self._agents
         await self._presence.start()
         self.mesh.on_link(lambda up: self._robots.repeat_all() if up else None)
         await self._leases.take()
@@ -230,6 +250,13 @@ class Gateway:
         """Agents of which nothing was heard for a while."""
         now = time.monotonic()
         return sorted(connection.key for connection in self.agents.online() if connection.is_away(now))
+
+    def _agents(self) -> Iterator[GatewayAgent]:
+        """Its agents, for who asks by a ping."""
+        now = time.monotonic()
+        for connection in self.agents.online():
+            age_s = round(now - connection.greeted_at, 1)
+            yield GatewayAgent(*connection.key, connection.address, connection.peer.grant.name, age_s)
 
     def _now(self) -> dict[str, int]:
         """What `macs doctor` is told besides losses."""
@@ -373,6 +400,8 @@ class Gateway:
         self._forwarding.leave(connection)
         self._online_reply = b""
         self._drops += connection.all_drops()
+        self._received_bytes += connection.received_bytes
+        self._sent_bytes += connection.sent_bytes
         self._delivery.forget()
         was_online, empty_group = self.agents.leave(connection)
         self._leases.give_back(connection.agent_id)

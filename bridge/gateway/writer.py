@@ -30,6 +30,8 @@ class Writer:
         """Since when the transport takes nothing more."""
         self.resumed = 0
         """How often it has taken something again."""
+        self.written_bytes = 0
+        """Of everything."""
         self._outbox = outbox
         self._transport: asyncio.Transport
         self._gathered: list[Chunk] = []
@@ -81,6 +83,7 @@ class Writer:
         """Write past the loop. False when something is left, for the loop to `flush` soon."""
         with self._lock:
             sent = self._direct.send(message) if self.free and self._direct is not None else 0
+            self.written_bytes += sent
             if sent == len(message):
                 return True
             self._rest += message[sent:]
@@ -115,6 +118,7 @@ class Writer:
             if rest:
                 chunks = [rest, *chunks]
             if chunks and not self._transport.is_closing():
+                self.written_bytes += sum(map(len, chunks))
                 self._transport.writelines(chunks)
 
     def pause(self) -> None:

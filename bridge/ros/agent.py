@@ -18,9 +18,11 @@ from typing import TypeVar
 
 import macs_zenoh
 from bridge.audit import open_audit, who
+from bridge.metrics.endpoint import watched_at
 from bridge.ros import parameters
 from bridge.ros.checked import CheckedSettings
 from bridge.ros.definitions import Definitions, offered_types
+from bridge.ros.figures import watched
 from bridge.ros.graph import NamesAndTypes, Offers
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
@@ -228,7 +230,7 @@ class RobotAgent:
             data = encode_data(await self.offers.now())
             self.offers.follow(sender, message)
         elif manager == STATUS:
-            data = self._state()
+            data = self.state()
         else:
             data = encode_data(self._controlled(sender, message.data))
         self._send(sender, Metadata(request_id=message.metadata.request_id), data)
@@ -255,7 +257,8 @@ class RobotAgent:
             troubles["shared_graph"] = len(self.nodes.stop.shared_with)
         return {name: count for name, count in (troubles | self._audit.troubles()).items() if count}
 
-    def _state(self) -> bytes:
+    def state(self) -> bytes:
+        """All about the robot as JSON (`RobotStatus`)."""
         return status(self.nodes, self.session.full_name, self.agent.drops + self.agent.mesh.drops)
 
     def _controlled(self, sender: Registrant, data: bytes) -> ControlReply:
@@ -312,7 +315,7 @@ class RobotAgent:
         return encode_data(await asyncio.to_thread(self._definitions.tell, types))
 
     async def _status(self, _call: Call) -> bytes:
-        return self._state()
+        return self.state()
 
     async def _control(self, call: Call) -> bytes:
         return encode_data(self._controlled(Registrant(type_number(call.sender_type), call.sender_id), call.data))
@@ -338,7 +341,7 @@ class RobotAgent:
         stop.set(sender, presses)
 
     async def _stopped(self, _call: Call) -> bytes:
-        return self._state()
+        return self.state()
 
     # -- the mesh ------------------------------------------------------------------------------------------------
 
@@ -474,10 +477,25 @@ async def run(
     on_waiting: Callable[[str], None] | None = None,
     on_ready: Callable[[Agent], None] | None = None,
     stop: asyncio.Event | None = None,
+    metrics: str | None = None,
 ) -> None:
     """Be a robot until ``stop`` is set or the task is cancelled; with another session when routers do not let this one
-    in any more (`macs_zenoh.locked_out`). See `open_robot`."""
-    stopping = asyncio.ensure_future((stop or asyncio.Event()).wait())
+    in any more (`macs_zenoh.locked_out`). See `open_robot`. At ``metrics``, HOST:PORT, it tells who watches it."""
+    now: list[RobotAgent] = []
+    async with watched_at(metrics, watched(lambda: now[-1] if now else None)):
+        await _run(now, settings, ros_args, on_waiting, on_ready, stop or asyncio.Event())
+
+
+async def _run(
+    now: list[RobotAgent],
+    settings: Settings,
+    ros_args: Sequence[str],
+    on_waiting: Callable[[str], None] | None,
+    on_ready: Callable[[Agent], None] | None,
+    stop: asyncio.Event,
+) -> None:
+    """`run`; ``now`` has the robot as long as it is on the mesh."""
+    stopping = asyncio.ensure_future(stop.wait())
     emergency_stop = EmergencyStop()
     try:
         while not stopping.done():
@@ -487,9 +505,11 @@ async def run(
                 if on_ready is not None:
                     on_ready(robot.agent)
                 leaving = asyncio.ensure_future(locked_out(robot.agent.mesh))
+                now[:] = [robot]
                 try:
                     await asyncio.wait([stopping, leaving], return_when=asyncio.FIRST_COMPLETED)
                 finally:
+                    now.clear()
                     leaving.cancel()
     finally:
         stopping.cancel()

@@ -193,6 +193,7 @@ class SubscriberNode(TopicNode):
                 self._put(latest)
 
     def _put(self, cdr: bytes, fanout: Fanout | None = None) -> None:
+        self.carried.count(len(cdr))
         try:
             for frame in (fanout or self._fanout)(cdr):
                 if len(frame) > self._max_frame_bytes:

@@ -22,6 +22,7 @@ from rclpy.serialization import serialize_message
 from bridge.audit import who
 from bridge.ros import fields, qos
 from bridge.ros.alarms import Alarm
+from bridge.ros.carried import Carried
 from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
 from bridge.ros.rules import DEFAULT_HOLD_S
 from bridge.ros.safety import Control, DeadMan
@@ -42,6 +43,13 @@ TOO_LARGE = "too_large"
 
 class TopicNode(InterfaceNode):
     """What both kinds of topic nodes have in common."""
+
+    def __init__(self, robot: Robot, request: AddNode) -> None:
+        super().__init__(robot, request)
+        self.carried = Carried()
+
+    def status(self) -> NodeStatus:
+        return structs.replace(super().status(), carried=self.carried.status())
 
     def _others(self, *, publishers_first: bool) -> set[str]:
         """The types at the other end of the topic, or without one at ours; none when ours is among them."""
@@ -153,10 +161,12 @@ class PublisherNode(TopicNode):
         with self.lock:
             refusal = self._refusal(message)
             if refusal is None:
-                if self._publish(cdr) and self.deadman is not None:
-                    self.deadman.command(Registrant.of(message), time.monotonic() - message.age_s)
-                    if self._watch is None:
-                        self._watch_silence()
+                if self._publish(cdr):
+                    self.carried.count(len(cdr))
+                    if self.deadman is not None:
+                        self.deadman.command(Registrant.of(message), time.monotonic() - message.age_s)
+                        if self._watch is None:
+                            self._watch_silence()
                 return
         self._refuse(message, *refusal)
 

@@ -41,6 +41,14 @@ class GoalStatus(Struct, frozen=True):
     finished: bool = False
 
 
+class CarriedStatus(Struct, frozen=True):
+    """Messages of a topic since somebody registered it, their bytes of CDR, and how long ago the last one was."""
+
+    messages: int = 0
+    bytes: int = 0
+    age_s: float | None = None
+
+
 class NodeStatus(Struct, frozen=True):
     """An interface node and what is going on there: what it has none of is left out."""
 
@@ -52,6 +60,7 @@ class NodeStatus(Struct, frozen=True):
     deadman: DeadManStatus | UnsetType = UNSET
     open_calls: int | UnsetType = UNSET
     goals: list[GoalStatus] | UnsetType = UNSET
+    carried: CarriedStatus | UnsetType = UNSET
     shared_with: list[int] | UnsetType = UNSET
     """Ids of other robots of the ROS graph, whose emergency stop this is as well."""
 

@@ -9,6 +9,7 @@ from pathlib import Path
 PACKAGES = {
     "ip": "iproute2",
     "nft": "nftables",
+    "promtool": "prometheus",
     "mcs": "mono-mcs mono-runtime libmono-system-runtime-serialization4.0-cil",
 }
 """What apt calls the packages with the tools that a whole run uses."""

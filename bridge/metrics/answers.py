@@ -1,0 +1,57 @@
+"""What is answered to ``/metrics``, ``/healthz``, ``/readyz`` and ``/diagnostics``, by whichever server."""
+
+from __future__ import annotations
+
+import json
+from typing import NamedTuple
+
+from .exposition import Exposition, MissingPrometheus
+from .watched import Watched
+
+TEXT, JSON = "text/plain; charset=utf-8", "application/json"
+
+
+class Answered(NamedTuple):
+    """A status, a body and its media type."""
+
+    status: int
+    body: bytes
+    media_type: str
+
+
+class Answers:
+    """Answers for one program. Where figures cannot be written, that is what is said of them."""
+
+    PATHS = ("/metrics", "/healthz", "/readyz", "/diagnostics")
+
+    def __init__(self, watched: Watched) -> None:
+        self._watched = watched
+        self._exposition: Exposition | None = None
+        self._missing = ""
+        try:
+            self._exposition = Exposition()
+        except MissingPrometheus as missing:
+            self._missing = str(missing)
+
+    def must_write(self) -> None:
+        """Raise MissingPrometheus where figures cannot be written."""
+        if self._exposition is None:
+            raise MissingPrometheus
+
+    def answer(self, path: str, accept: str = "") -> Answered:
+        """What this path says; 404 for others."""
+        if path == "/metrics" and self._exposition is None:
+            return Answered(501, f"{self._missing}\n".encode(), TEXT)
+        if path == "/metrics" and self._exposition is not None:
+            body, media_type = self._exposition.write(self._watched.figures(), accept)
+            return Answered(200, body, media_type)
+        if path == "/healthz":  # whoever answers this lives
+            return Answered(200, b"ok\n", TEXT)
+        if path == "/readyz":
+            problems = self._watched.problems()
+            said = "".join(f"{problem}\n" for problem in problems) or "ok\n"
+            return Answered(503 if problems else 200, said.encode(), TEXT)
+        if path == "/diagnostics":
+            said = json.dumps(self._watched.diagnostics(), indent=1, default=str)
+            return Answered(200, said.encode() + b"\n", JSON)
+        return Answered(404, f"there are {', '.join(self.PATHS)}\n".encode(), TEXT)
