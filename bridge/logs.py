@@ -6,6 +6,7 @@ in the middle of stopping a robot, so a thread writes that does nothing else.
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import select
@@ -13,21 +14,30 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from datetime import datetime, timezone
 from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import TextIO
 
-from macs_zenoh.plain import LONGEST, plain, plain_lines
+from macs_zenoh.plain import LONGEST, plain, plain_json, plain_lines
 
 LOG_FORMAT = "%(asctime)s %(levelname).1s %(name)s: %(message)s"
+TIME, DATE = "%H:%M:%S", "%Y-%m-%dT%H:%M:%S%z"
+"""On a terminal, and where a log is kept."""
+
+FORMAT = "MACS_LOG_FORMAT"
+"""Environment variable for programs that were told no ``--log-format``."""
+TEXT, JSON, SHORT = "text", "json", "short"
+"""Lines for people; one JSON object in each; lines for people without dates, wherever they go."""
+FORMATS = (TEXT, JSON, SHORT)
 
 
 class PlainFormatter(logging.Formatter):
     """One line for each record, without control characters; a traceback's lines are indented, so that none looks like
     a record."""
 
-    def __init__(self, prefix: str = "") -> None:
-        super().__init__(prefix + LOG_FORMAT, datefmt="%H:%M:%S")
+    def __init__(self, prefix: str = "", *, dates: bool = False) -> None:
+        super().__init__(prefix + LOG_FORMAT, datefmt=DATE if dates else TIME)
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
         record.message = plain(record.message[:LONGEST])
@@ -37,6 +47,29 @@ class PlainFormatter(logging.Formatter):
         self, ei: tuple[type[BaseException], BaseException, TracebackType | None] | tuple[None, None, None]
     ) -> str:
         return "\n".join(f"  {plain_lines(line)}" for line in super().formatException(ei).split("\n"))
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object in each line: time (RFC 3339, with milliseconds), level, logger, message; program and exception
+    where there are such."""
+
+    def __init__(self, program: str = "") -> None:
+        super().__init__()
+        self._program = program
+
+    def format(self, record: logging.LogRecord) -> str:
+        at = datetime.fromtimestamp(record.created, timezone.utc).astimezone()
+        said = {
+            "time": at.isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage()[:LONGEST],
+        }
+        if self._program:
+            said["program"] = self._program
+        if record.exc_info:
+            said["exception"] = self.formatException(record.exc_info)[:LONGEST]
+        return plain_json(json.dumps(said, ensure_ascii=False))
 
 
 class Written(logging.Handler):
@@ -132,17 +165,21 @@ def _lost_lines(count: int) -> logging.LogRecord:
     return logging.LogRecord("macs.log", logging.WARNING, __file__, 0, text, (count,), None)
 
 
-def log_to_stderr() -> None:
-    """Log to stderr, unless somebody has set that up before; other libraries only from WARNING on."""
+def log_to_stderr(form: str | None = None) -> None:
+    """Log to stderr, unless somebody has set that up before; other libraries only from WARNING on. ``form``: one of
+    `FORMATS`, by default what the environment says."""
     root = logging.getLogger()
     if not root.handlers:
         # no line has these, and to find them out takes longer than to write it
         logging.logThreads = logging.logProcesses = logging.logMultiprocessing = False
         root.addHandler(Written(sys.stderr))
-        prefix_logs("")
+        prefix_logs("", form)
 
 
-def prefix_logs(prefix: str) -> None:
+def prefix_logs(prefix: str, form: str | None = None) -> None:
     """Put ``prefix`` before each line of our own log, as before those of other programs on the same terminal."""
+    form = form or os.environ.get(FORMAT, TEXT)
+    dates = form != SHORT and not (sys.stderr is not None and sys.stderr.isatty())
     for handler in logging.getLogger().handlers:
-        handler.setFormatter(PlainFormatter(prefix))
+        formatter = JsonFormatter(prefix.strip(" |")) if form == JSON else PlainFormatter(prefix, dates=dates)
+        handler.setFormatter(formatter)

@@ -109,6 +109,11 @@ class Arrivals:
         """Queries on their way to the loop: an emergency stop can be among them, so no sample overtakes them."""
         self._own = loopback.own
 
+    @property
+    def waiting(self) -> int:
+        """How many samples wait for the loop."""
+        return len(self._queue) + len(self._mine)
+
     def receiver(
         self,
         on_batch: OnBatch,

@@ -173,6 +173,11 @@ class Outgoing:
         return self._sender.backlogged
 
     @property
+    def backlog_bytes(self) -> int:
+        """How much waits to be sent."""
+        return self._sender.bytes
+
+    @property
     def backlog_sent(self) -> int:
         """How many of what had to wait were sent."""
         return self._sender.sent
@@ -306,6 +311,11 @@ class Sender:
         self._wake = threading.Condition()
         self._thread: threading.Thread | None = None
         self._closing = False
+
+    @property
+    def bytes(self) -> int:
+        """How much waits."""
+        return self._bytes
 
     @property
     def idle(self) -> bool:

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from types import TracebackType
@@ -28,6 +28,7 @@ from macs_zenoh.versions import installed
 from .arrivals import Arrivals
 from .calls import Calls
 from .declared import AtOnce, Handler, OnAged, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
+from .link_log import LinkLog
 from .loopback import Loopback
 from .outgoing import Outgoing
 from .panics import call, end_on_panics, last_words, watched
@@ -97,9 +98,12 @@ class Mesh:
         """What this program tells `macs doctor` of itself, by name: what is so now and should not be."""
         self.address = ""
         """Where headsets reach this program, if it is a gateway."""
+        self.agents: Callable[[], Iterable[ping.GatewayAgent]] | None = None
+        """A gateway's agents."""
         self.away: Callable[[], list[tuple[int, int]]] = list
         """(type, id) of a gateway's agents that are silent."""
         self._linked_with: set[str] = set()
+        self._link_log = LinkLog(settings.mode)
         self._on_link: Callbacks[Callable[[bool], None]] = Callbacks()
         self._on_router: Callbacks[Callable[[str], None]] = Callbacks()
         # links, not transports, and directly: Zenoh tells of a lost link before it tells that everybody behind it
@@ -168,6 +172,16 @@ class Mesh:
         return self._arrivals.looped
 
     @property
+    def backlog_bytes(self) -> int:
+        """How much waits to be sent."""
+        return self._outgoing.backlog_bytes
+
+    @property
+    def waiting_samples(self) -> int:
+        """How many samples have come and wait for the loop."""
+        return self._arrivals.waiting
+
+    @property
     def backlog_sent(self) -> int:
         """How many of what had to wait were sent."""
         return self._outgoing.backlog_sent
@@ -219,6 +233,11 @@ class Mesh:
         """Zenoh ids of the routers connected now."""
         return sorted(str(zid) for zid in self._session.info.routers_zid())
 
+    @property
+    def neighbours(self) -> dict[str, str]:
+        """Who has a session with this one now, by Zenoh id: ``router``, ``peer`` or ``client``."""
+        return {str(each.zid): str(each.whatami) for each in self._session.info.transports()}
+
     def on_link(self, callback: Callable[[bool], None]) -> Handle:
         """Call ``callback(up)`` whenever the connection to the routers is lost or back."""
         return self._on_link.add(callback)
@@ -228,17 +247,17 @@ class Mesh:
         return self._on_router.add(callback)
 
     def _link_changed(self, event: zenoh.LinkEvent) -> None:
-        self._from_thread(self._set_link, str(event.link.zid), event.kind == zenoh.SampleKind.PUT)
+        link = event.link
+        self._from_thread(self._set_link, str(link.zid), event.kind == zenoh.SampleKind.PUT, str(link.dst))
 
-    def _set_link(self, zid: str, up: bool) -> None:
+    def _set_link(self, zid: str, up: bool, where: str) -> None:
         if up and self._on_router and zid in self.routers:
             for told in self._on_router:
                 told(zid)
         before = self.linked
         (self._linked_with.add if up else self._linked_with.discard)(zid)
         self.linked = bool(self._linked_with) or not self._needs_router
-        if before != self.linked:
-            log.info("router %s", "connected" if self.linked else "lost; reconnecting")
+        self._link_log.changed(zid, up, where, {} if self._needs_router else self.neighbours, linked=self.linked)
         self._outgoing.link_changed(self.linked)
         for recovered in list(self._recovered):
             recovered.link_changed(self.linked)
@@ -409,6 +428,8 @@ class Mesh:
                 away=self.away(),
                 address=self.address,
             )
+            if payload == ping.AGENTS and self.agents is not None:
+                payload = ping.encode_agents(self.agents())
             return ping.encode(said, payload)
 
         return self.serve(PING.of(zid=self.zid), answer)

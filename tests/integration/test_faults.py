@@ -70,7 +70,7 @@ async def test_the_router_is_killed_and_comes_back() -> None:
         online = await first.online()
         assert (online.ros_agent_ids, online.unity_agent_ids) == ([1], sorted([first.id, second.id]))
         for gateway in gateways:
-            await until(lambda gateway=gateway: sum("router lost" in line for line in gateway.log) == 1)
+            await until(lambda gateway=gateway: sum(" lost; reconnecting" in line for line in gateway.log) == 1)
 
 
 async def test_programs_start_without_a_router() -> None:

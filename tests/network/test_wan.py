@@ -137,7 +137,7 @@ async def test_a_large_message_passes_both_ways(wan: Wan) -> None:
         print(f"{message.size} bytes in {message.took_s:.1f} s")
         assert message.size >= LARGE_BYTES - 10
     for log in (wan.robot.log, wan.gateway.log):
-        assert not [line for line in log if "router lost" in line], log[-10:]
+        assert not [line for line in log if " lost; reconnecting" in line], log[-10:]
 
 
 async def test_commands_reach_ros_while_a_camera_fills_the_link(hosts: dict[str, Host], settings: Path) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
+import re
 import subprocess
 import sys
+from datetime import datetime
 
 from bridge.logs import PlainFormatter, Written
 from tests.support.processes import ROOT
@@ -57,3 +60,48 @@ def test_lost_lines_are_counted() -> None:
             assert line.endswith("." * 100 + "\n")
         assert told == log.lost
         log.flush()
+
+
+def logged(*options: str, **environment: str) -> list[str]:
+    """The lines of a program that logs a text of others and an error."""
+    program = """
+import logging, sys
+from bridge.logs import log_to_stderr, prefix_logs
+log_to_stderr(*sys.argv[1:])
+prefix_logs("gw1     | ", *sys.argv[1:])
+logging.getLogger("macs.test").warning("a %s b", "\\x1b[2J\\n")
+try:
+    raise OSError("no")
+except OSError:
+    logging.getLogger("macs.test").exception("failed")
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", program, *options],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, **environment},
+    )
+    return ended.stderr.splitlines()
+
+
+def test_lines_have_dates_where_it_is_no_terminal() -> None:
+    """A log that is kept says the day, unless another program that has a terminal passes it on."""
+    assert re.match(r"gw1     \| \d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4} W macs\.test: a ", logged()[0])
+    assert re.match(r"gw1     \| \d\d:\d\d:\d\d W macs\.test: a ", logged(MACS_LOG_FORMAT="short")[0])
+
+
+def test_a_log_can_be_json() -> None:
+    """One object in each line, with a time that others read, whatever is in it; by option or environment."""
+    for lines in (logged("json"), logged(MACS_LOG_FORMAT="json")):
+        first, second = (json.loads(line) for line in lines)
+        assert datetime.fromisoformat(first.pop("time")).tzinfo is not None
+        assert first == {
+            "level": "warning",
+            "logger": "macs.test",
+            "message": "a \x1b[2J\n b",
+            "program": "gw1",
+        }
+        assert "OSError: no" in second["exception"]
+        assert all(line.isprintable() for line in lines)
