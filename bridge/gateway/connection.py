@@ -9,7 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Hashable, Sequence
-from typing import Protocol, cast
+from typing import cast
 
 from macs_zenoh.errors import NotAdmitted
 from macs_zenoh.losses import Losses
@@ -27,6 +27,7 @@ from macs_zenoh.protocol.tcp_agent import Event, Joined, Left, Rejected, Sent, S
 from .backpressure import Backpressure
 from .door import OPEN_TO_ALL, Entrance
 from .memory import Memory
+from .owner import Owner
 from .tcp import is_gone, tune, waiting_bytes
 from .writer import BUFFER_BYTES, ENDED, Writer
 
@@ -62,28 +63,6 @@ one socket many times before it looks at the next."""
 MOST_READ_BYTES = FrameDecoder.SPACE_BYTES
 FIRST_READ_BYTES = 64 << 10
 LEAST_READ_BYTES = 1024
-
-
-class Owner(Protocol):
-    """What a connection needs of its gateway."""
-
-    def pace(self) -> Pace:
-        """What a new connection may send to robots."""
-
-    def opened(self, connection: Connection) -> bool:
-        """A socket connected: False refuses it; otherwise it is greeted, now or soon."""
-
-    def forward(self, connection: Connection, sent: Sent) -> None:
-        """The agent sent a frame to others."""
-
-    def handle(self, connection: Connection, event: Event) -> None:
-        """The agent did something else."""
-
-    def received(self, connection: Connection) -> None:
-        """All events of one read were passed on."""
-
-    def closed(self, connection: Connection) -> None:
-        """The socket is gone."""
 
 
 class Connection(asyncio.BufferedProtocol):
