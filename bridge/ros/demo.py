@@ -1,9 +1,10 @@
 """A robot to try things with: ``python -m bridge.ros.demo`` is one ROS 2 node, in a process of its own.
 
 Publishes a generated camera picture on ``/camera/image/compressed`` (sensor_msgs/CompressedImage, 10 Hz, best effort
-as cameras are) and where it is on ``/pose`` (geometry_msgs/PoseStamped, 20 Hz). Drives as ``/cmd_vel``
-(geometry_msgs/Twist) says, and stops half a second after the last command. Serves ``/set_lights`` (std_srvs/SetBool),
-which the picture shows.
+as cameras are), how far away what it shows is on ``/camera/depth`` (sensor_msgs/Image, 5 Hz), where it is on ``/pose``
+(geometry_msgs/PoseStamped, 20 Hz), a turret that swings on ``/turret/pose``, and its ``/battery``
+(sensor_msgs/BatteryState). Drives as ``/cmd_vel`` (geometry_msgs/Twist) says, and stops half a second after the last
+command. Serves ``/set_lights`` (std_srvs/SetBool), which the picture shows.
 """
 
 from __future__ import annotations
@@ -11,10 +12,8 @@ from __future__ import annotations
 import array
 import logging
 import math
-import struct
 import sys
 import time
-import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,15 +21,21 @@ import rclpy
 from geometry_msgs.msg import PoseStamped, Twist
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import BatteryState, CompressedImage, Image
 from std_srvs.srv import SetBool
 
 from bridge.logs import log_to_stderr
+from bridge.ros.demo_scene import Scene
 from bridge.ros.session import why
 
 log = logging.getLogger("macs.demo")
 
 IMAGE_HZ = 10.0
+DEPTH_HZ = 5.0
+DEPTH_EVERY = 2
+"""Of the pixels of a picture, which are those of the one of depth."""
+TURRET_HZ = 10.0
+BATTERY_HZ = 1.0
 POSE_HZ = 20.0
 COMMAND_TIMEOUT_S = 0.5
 COMMANDS = "/cmd_vel"
@@ -70,65 +75,51 @@ class Unicycle:
             self.forward = self.turn = 0.0
 
 
-class Camera:
-    """Draws what the robot "sees": a floor that scrolls as it drives, itself in the middle. Pure."""
+class Battery:
+    """It lasts two hours, one of which is driven. Pure: the time is passed in. Volts, amperes, 0 to 1."""
 
-    WIDTH, HEIGHT = 160, 120
-    TILE = 20
-    FLOOR, LINE, BODY, NOSE = range(4)
-    DAY = bytes((60, 70, 80, 110, 120, 130, 230, 120, 40, 255, 255, 255))
-    LIT = bytes((160, 160, 120, 220, 220, 180, 230, 120, 40, 255, 255, 255))
+    IDLE_A, DRIVING_A, CAPACITY_AH = 1.0, 4.0, 5.0
 
-    def png(self, robot: Unicycle, *, lights: bool) -> bytes:
-        """One picture as a PNG file of about 1 KB (8 bit palette; PNG specification, sections 5 and 11)."""
-        header = struct.pack(">IIBBBBB", self.WIDTH, self.HEIGHT, 8, 3, 0, 0, 0)
-        palette = self.LIT if lights else self.DAY
-        return b"".join(
-            (
-                b"\x89PNG\r\n\x1a\n",
-                _chunk(b"IHDR", header),
-                _chunk(b"PLTE", palette),
-                _chunk(b"IDAT", zlib.compress(self._rows(robot), 1)),
-                _chunk(b"IEND", b""),
-            )
-        )
+    def __init__(self) -> None:
+        self.charge = 0.93
+        self.current = self.IDLE_A
+        self._at: float | None = None
 
-    def _rows(self, robot: Unicycle) -> bytes:
-        """The pixels, each row after a 0 that says "no filter"."""
-        across, down = int(robot.x * 50), int(-robot.y * 50)
-        tiles = bytes(self.LINE if (column + across) % self.TILE == 0 else self.FLOOR for column in range(self.WIDTH))
-        line = bytes((self.LINE,)) * self.WIDTH
-        rows = [bytearray(line if (row + down) % self.TILE == 0 else tiles) for row in range(self.HEIGHT)]
-        self._dot(rows, 0, 0, 6, self.BODY)
-        self._dot(rows, 8 * math.cos(robot.heading), -8 * math.sin(robot.heading), 3, self.NOSE)
-        return b"".join(b"\x00" + row for row in rows)
+    @property
+    def volts(self) -> float:
+        """The less there is in it, the less."""
+        return 21.0 + 4.2 * self.charge - 0.05 * self.current
 
-    def _dot(self, rows: list[bytearray], right: float, below: float, radius: int, colour: int) -> None:
-        centre_x, centre_y = self.WIDTH // 2 + round(right), self.HEIGHT // 2 + round(below)
-        for dy in range(-radius, radius + 1):
-            half = math.isqrt(radius * radius - dy * dy)
-            rows[centre_y + dy][centre_x - half : centre_x + half + 1] = bytes((colour,)) * (2 * half + 1)
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    def drain(self, now: float, *, driving: bool) -> None:
+        """What was used since it was called last."""
+        if self._at is not None:
+            self.charge = max(0.05, self.charge - self.current * (now - self._at) / 3600 / self.CAPACITY_AH)
+        self._at = now
+        self.current = self.DRIVING_A if driving else self.IDLE_A
 
 
 class DemoRobot:
-    """The ROS node around a `Unicycle` and its `Camera`."""
+    """The ROS node around a `Unicycle`, what it sees, and its `Battery`."""
 
     def __init__(self, node: Any) -> None:
         self._node = node
         self._robot = Unicycle()
-        self._camera = Camera()
+        self._scene = Scene()
+        self._battery = Battery()
         self._lights = False
         self._driven = False
         self._pose = node.create_publisher(PoseStamped, "/pose", 10)
         self._image = node.create_publisher(CompressedImage, "/camera/image/compressed", qos_profile_sensor_data)
+        self._depth = node.create_publisher(Image, "/camera/depth", qos_profile_sensor_data)
+        self._turret = node.create_publisher(PoseStamped, "/turret/pose", 10)
+        self._power = node.create_publisher(BatteryState, "/battery", 10)
         node.create_subscription(Twist, COMMANDS, self._drive, 10)
         node.create_service(SetBool, "/set_lights", self._set_lights)
         node.create_timer(1 / POSE_HZ, self._publish_pose)
         node.create_timer(1 / IMAGE_HZ, self._publish_image)
+        node.create_timer(1 / DEPTH_HZ, self._publish_depth)
+        node.create_timer(1 / TURRET_HZ, self._publish_turret)
+        node.create_timer(1 / BATTERY_HZ, self._publish_battery)
 
     def _now_s(self) -> float:
         return float(self._node.get_clock().now().nanoseconds) / 1e9
@@ -172,8 +163,42 @@ class DemoRobot:
         message.header.frame_id = "camera"
         message.format = "png"
         # an array of bytes is taken as it is; of anything else rclpy checks every element
-        message.data = array.array("B", self._camera.png(self._robot, lights=self._lights))
+        message.data = array.array("B", self._scene.png(self._robot, lights=self._lights))
         self._image.publish(message)
+
+    def _publish_depth(self) -> None:
+        depth = self._scene.depth_mm(self._robot, DEPTH_EVERY)
+        message = Image()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.frame_id = "camera"
+        message.height, message.width = depth.shape
+        message.encoding = "16UC1"
+        message.is_bigendian = int(sys.byteorder == "big")
+        message.step = depth.shape[1] * depth.itemsize
+        message.data = array.array("B", depth.tobytes())
+        self._depth.publish(message)
+
+    def _publish_turret(self) -> None:
+        angle = math.sin(self._now_s() / 2)
+        message = PoseStamped()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.frame_id = "base_link"
+        message.pose.position.z = 0.8
+        message.pose.orientation.z = math.sin(angle / 2)
+        message.pose.orientation.w = math.cos(angle / 2)
+        self._turret.publish(message)
+
+    def _publish_battery(self) -> None:
+        self._battery.drain(self._now_s(), driving=self._robot.moving)
+        message = BatteryState()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.voltage = self._battery.volts
+        message.current = -self._battery.current
+        message.percentage = self._battery.charge
+        message.capacity = Battery.CAPACITY_AH
+        message.present = True
+        message.power_supply_status = BatteryState.POWER_SUPPLY_STATUS_DISCHARGING
+        self._power.publish(message)
 
 
 def _others(node: Any) -> int:
@@ -220,7 +245,7 @@ def _run(node: Any, *, alone: bool, on_ready: Callable[[], None]) -> int:
         log.error("another node of this ROS domain takes %s: it would drive, too", COMMANDS)
         return 1
     on_ready()
-    log.info("demo robot: picture on /camera/image/compressed, /pose; drive it on /cmd_vel; service /set_lights")
+    log.info("demo robot: pictures on /camera/…, /pose, /battery; drive it on /cmd_vel; service /set_lights")
     rclpy.spin(node)
     return 0
 

@@ -19,7 +19,8 @@ from sensor_msgs.msg import CompressedImage
 from std_srvs.srv import SetBool
 
 from bridge.ros import graph
-from bridge.ros.demo import Camera, Unicycle
+from bridge.ros.demo import Battery, Unicycle
+from bridge.ros.demo_scene import Scene
 from tests.support.ros_peer import Peer
 from tests.support.waiting import PATIENCE_S, get
 
@@ -59,13 +60,38 @@ def test_the_picture_is_a_png(lights: bool) -> None:
     """Every chunk has its checksum, and the pixels are as many as the header says."""
     robot = Unicycle()
     robot.x, robot.y, robot.heading = 3.3, -7.7, 2.0
-    chunks = dict(_chunks(Camera().png(robot, lights=lights)))
+    scene = Scene()
+    chunks = dict(_chunks(scene.png(robot, lights=lights)))
     width, height = struct.unpack(">II", chunks[b"IHDR"][:8])
     rows = zlib.decompress(chunks[b"IDAT"])
     assert list(chunks) == [b"IHDR", b"PLTE", b"IDAT", b"IEND"]
     assert len(rows) == height * (1 + width)
-    assert set(rows) == {0, 1, 2, 3}
-    assert chunks[b"PLTE"] == (Camera.LIT if lights else Camera.DAY)
+    assert max(rows) < len(chunks[b"PLTE"]) // 3 <= 256
+    assert chunks[b"PLTE"] == scene.palette(lights=lights) != scene.palette(lights=not lights)
+
+
+def test_the_picture_is_another_one_elsewhere() -> None:
+    """What it shows moves when the robot does, and what is near is nearer in the picture of depth."""
+    robot, scene = Unicycle(), Scene()
+    before, far = scene.pixels(robot), scene.depth_mm(robot, 2)
+    robot.x = 2.0  # towards the pillars
+    assert (scene.pixels(robot) != before).mean() > 0.05
+    near = scene.depth_mm(robot, 2)
+    assert near.shape == (Scene.HEIGHT // 2, Scene.WIDTH // 2)
+    assert near[near > 0].min() <= far[far > 0].min()
+
+
+def test_a_battery_drains_sooner_while_it_drives() -> None:
+    """In ten minutes a few hundredths, four times as many while driving, and never to nothing."""
+    used = []
+    for driving in (False, True):
+        battery = Battery()
+        for minute in range(11):
+            battery.drain(minute * 60.0, driving=driving)
+        used.append(0.93 - battery.charge)
+    assert 0.02 < used[0] < used[1] < 0.2
+    battery.drain(1e9, driving=True)
+    assert battery.charge == 0.05
 
 
 def _chunks(png: bytes) -> list[tuple[bytes, bytes]]:
@@ -113,8 +139,11 @@ async def test_the_demo_robot_shows_drives_and_ends(
     offered = await peer.session.run(lambda: graph.offers(peer.session.node))
     assert offered.subscribers == {"/cmd_vel": "geometry_msgs/msg/Twist"}
     assert offered.publishers == {
+        "/battery": "sensor_msgs/msg/BatteryState",
+        "/camera/depth": "sensor_msgs/msg/Image",
         "/camera/image/compressed": "sensor_msgs/msg/CompressedImage",
         "/pose": "geometry_msgs/msg/PoseStamped",
+        "/turret/pose": "geometry_msgs/msg/PoseStamped",
     }
     assert offered.services == {"/set_lights": "std_srvs/srv/SetBool"}
     demo.send_signal(end)
