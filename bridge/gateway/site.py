@@ -99,6 +99,9 @@ def _shown(request: web.Request) -> str | None:
 
 def add_routes(site: Site) -> None:
     """Let each module that has something to show add it."""
+    from bridge.page.routes import add_page
+
     from .figures import add_figures  # they take a `Site`
 
     add_figures(site)
+    add_page(site)

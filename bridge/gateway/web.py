@@ -85,7 +85,6 @@ class WebPort:
         self.scratch = memoryview(bytearray(MOST_READ_BYTES))
         """Sockets of one loop receive one after the other."""
         app = web.Application(client_max_size=BODY_BYTES, middlewares=[self._middle()])
-        app.router.add_get("/", self._hello)
         app.router.add_get(WEBSOCKET_PATH, self._websocket)
         app.router.add_post("/login", self._login)
         app.router.add_post("/pair", self._pair)
@@ -164,9 +163,6 @@ class WebPort:
             return response
 
         return middle
-
-    async def _hello(self, request: web.Request) -> web.StreamResponse:
-        return web.Response(text=f"A macs gateway. Programs open a WebSocket at {WEBSOCKET_PATH}.\n")
 
     async def _login(self, request: web.Request) -> web.StreamResponse:
         """A token for a cookie, which pages cannot read."""

@@ -89,12 +89,12 @@ class Watched:
 
 
 @asynccontextmanager
-async def browser() -> AsyncIterator[Browser]:
-    """A Chromium with nothing in its cache."""
+async def browser(*arguments: str) -> AsyncIterator[Browser]:
+    """A Chromium with nothing in its cache, started with these arguments as well."""
     from playwright.async_api import async_playwright
 
     async with async_playwright() as playwright:
-        opened = await playwright.chromium.launch(executable_path=chromium(), args=[*ARGUMENTS])
+        opened = await playwright.chromium.launch(executable_path=chromium(), args=[*ARGUMENTS, *arguments])
         try:
             yield opened
         finally:

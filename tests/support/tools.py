@@ -10,6 +10,7 @@ PACKAGES = {
     "ip": "iproute2",
     "nft": "nftables",
     "promtool": "prometheus",
+    "chromium": "chromium",
     "mcs": "mono-mcs mono-runtime libmono-system-runtime-serialization4.0-cil",
 }
 """What apt calls the packages with the tools that a whole run uses."""

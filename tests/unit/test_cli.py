@@ -461,7 +461,8 @@ def test_what_next_names_the_addresses_in_use() -> None:
     hints = up.what_next(here)
     assert f"macs ls -e tcp/127.0.0.1:{here.router_port} --namespace demo" in hints
     assert f"macs headset 127.0.0.1:{here.gateway.port} sub /pose" in hints
-    assert f"connect to ws://127.0.0.1:{here.gateway.web_port}/macs." in hints
+    web = f"127.0.0.1:{here.gateway.web_port}"
+    assert f"in a browser at http://{web} (programs: ws://{web}/macs)." in hints
     assert here.apart is not None
     assert f"ROS_DOMAIN_ID={here.apart.domain} " in hints
     here.apart.close()

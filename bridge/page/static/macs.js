@@ -50,7 +50,7 @@ const DEFAULTS = {
   group: 0,
   /** What `macs token create` printed; null: none, or the cookie of a login. */
   token: null,
-  /** Secret by which the gateway knows a headset again that has lost its connection. */
+  /** Said in the configuration, where a gateway knows sessions; null: nothing is said. */
   session: null,
   handshakeMs: 5000,
   /** So long without other output, a heartbeat is sent. */
@@ -111,11 +111,6 @@ export class Headset extends EventTarget {
 
   get group() {
     return this.#options.group;
-  }
-
-  /** The secret of this session, once the gateway has given one: keep it to come back as the same headset. */
-  get session() {
-    return this.#options.session;
   }
 
   /** Bytes that wait here, as the network does not take them. */
@@ -357,11 +352,10 @@ export class Headset extends EventTarget {
   }
 
   #takeId(message) {
-    const { agentId, session } = object(message.data);
+    const { agentId } = object(message.data);
     if (!Number.isInteger(agentId) || agentId < 0 || agentId > 0xffff) throw new WireError(`${agentId} is no id`);
     this.id = agentId;
     this.#welcome = message.requestId;
-    if (typeof session === "string") this.#options.session = session;
     const first = !this.#connected;
     this.#connected = true;
     this.#configure();

@@ -1,0 +1,166 @@
+"""The picture of the mesh that pages show: who is there, behind whom, and how long the way to each session is."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import msgspec
+
+from macs_zenoh.errors import MacsError
+from macs_zenoh.mesh import Mesh
+from macs_zenoh.protocol import keyexpr, ping
+from macs_zenoh.protocol.directory import Directory, published
+from macs_zenoh.protocol.keyexpr import LEASE, PING
+from macs_zenoh.protocol.messages import ROS, UNITY
+from macs_zenoh.protocol.rights import Grant
+
+from .fresh import Fresh
+from .robots import Robots, may_see
+
+ROUTERS_GOOD_S = 2.0
+PINGS_PER_S = 50.0
+PING_GOOD_S = 2.0
+PING_S = 2.0
+PINGS_AT_ONCE = 16
+SESSIONS = 1024
+"""More are shown without the length of the way to them."""
+
+
+class _Session(msgspec.Struct):
+    """A session of a router, as its admin space has it."""
+
+    peer: str = ""
+    whatami: str = ""
+
+
+class _Router(msgspec.Struct):
+    """A router, likewise."""
+
+    zid: str
+    version: str = ""
+    sessions: list[_Session] = []
+
+
+class Picture:
+    """Made when somebody looks, and no more often than it changes."""
+
+    def __init__(self, mesh: Mesh, directory: Directory, robots: Robots) -> None:
+        self._mesh = mesh
+        self._directory = directory
+        self._robots = robots
+        self._routers: Fresh[list[_Router]] = Fresh(self._ask_routers, ROUTERS_GOOD_S)
+        self._gateways: Fresh[set[str]] = Fresh(self._ask_gateways, ROUTERS_GOOD_S)
+        self._pings: dict[str, Fresh[dict[str, Any]]] = {}
+        self._room = asyncio.Semaphore(PINGS_AT_ONCE)
+
+    def now(self, visitor: Grant, address: str) -> dict[str, Any]:
+        """All of it, as far as it is known and the visitor may know; the rest is asked for meanwhile."""
+        agents = [agent for agent in self._directory if agent.type in (ROS, UNITY)]
+        robots = [agent for agent in agents if agent.type == ROS]
+        seen = [agent.id for agent in robots if may_see(visitor, agent.id)]
+        states = self._robots.known(seen)
+        gateways = {*(self._gateways.last() or ()), self._mesh.zid}
+        sessions = {agent.zid for agent in agents} | gateways
+        return {
+            "time": time.time(),
+            "own": self._mesh.zid,
+            "address": address,
+            "linked": self._mesh.linked,
+            "routers": self._shown_routers(sessions),
+            "gateways": sorted(gateways),
+            "sessions": self._shown_sessions(sessions),
+            "robots": [
+                {"id": agent.id, "group": agent.group, "session": agent.zid, **_state(states.get(agent.id))}
+                for agent in robots
+            ],
+            "headsets": [
+                {"id": agent.id, "group": agent.group, "session": agent.zid} for agent in agents if agent.type == UNITY
+            ],
+        }
+
+    def close(self) -> None:
+        """Ask no more."""
+        self._routers.close()
+        self._gateways.close()
+        for fresh in self._pings.values():
+            fresh.close()
+
+    def _shown_routers(self, sessions: set[str]) -> list[dict[str, Any]]:
+        routers = {router.zid: router for router in self._routers.last() or ()}
+        linked = set(self._mesh.routers)
+        shown = []
+        for zid in sorted(routers.keys() | linked):
+            router = routers.get(zid, _Router(zid))
+            peers = {session.peer for session in router.sessions}
+            shown.append(
+                {
+                    "zid": zid,
+                    "version": router.version.partition(" ")[0].partition("-")[0].removeprefix("v"),
+                    "linked": zid in linked,
+                    "sessions": sorted(sessions & ({published(peer) for peer in peers} | peers)),
+                    "routers": sorted(peers & routers.keys()),
+                }
+            )
+        return shown
+
+    def _shown_sessions(self, sessions: set[str]) -> dict[str, dict[str, Any]]:
+        for gone in self._pings.keys() - sessions:
+            self._pings.pop(gone).close()
+        good_s = max(PING_GOOD_S, len(sessions) / PINGS_PER_S)
+        shown: dict[str, dict[str, Any]] = {}
+        for zid in sorted(sessions)[:SESSIONS]:
+            if zid == self._mesh.zid:
+                continue  # it would ask itself
+            fresh = self._pings.setdefault(zid, Fresh(partial(self._ping, zid), PING_GOOD_S))
+            shown[zid] = fresh.last(good_s) or {}
+        return shown
+
+    async def _ping(self, zid: str) -> dict[str, Any]:
+        async with self._room:
+            began = time.perf_counter()
+            answer = await self._mesh.query(PING.of(zid=zid), b"", timeout_s=PING_S)
+            took_ms = (time.perf_counter() - began) * 1000
+        said, _ = ping.decode(answer)
+        lost = sum(said.drops.values())
+        return {
+            "roundTripMs": took_ms,
+            "address": said.address,
+            "version": said.macs,
+            "lost": lost,
+            "drops": said.drops,
+        }
+
+    async def _ask_gateways(self) -> set[str]:
+        leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every())]
+        return {lease.zid for lease in leases if lease is not None}
+
+    async def _ask_routers(self) -> list[_Router]:
+        found: list[_Router] = []
+        if self._mesh.settings.namespace:  # what they tell is in none
+            return found
+        with suppress(MacsError):
+            for _, answer in await self._mesh.ask_all(keyexpr.ROUTERS, timeout_s=PING_S):
+                with suppress(msgspec.MsgspecError):
+                    found.append(msgspec.json.decode(answer, type=_Router))
+        return found
+
+
+def _state(status: dict[str, Any] | None) -> dict[str, Any]:
+    """Of a robot's state what the picture shows."""
+    if status is None:
+        return {"known": False}
+    nodes = [node for node in status.get("nodes", []) if isinstance(node, dict)]
+    holders = {
+        node.get("name"): node["control"].get("holder") for node in nodes if isinstance(node.get("control"), dict)
+    }
+    return {
+        "known": True,
+        "stopped": status.get("stopped") is True,
+        "stoppedBy": str((status.get("stop") or {}).get("by", "")),
+        "control": {name: holder for name, holder in holders.items() if holder},
+        "drops": status.get("drops", {}),
+    }
