@@ -152,6 +152,8 @@ async def test_the_command_judges_a_gateway(real_gateway: int, tmp_path: Path) -
         str(report),
         "--level",
         "compatible",
+        "--patience",
+        str(PATIENCE_S),
     )
     assert code == 0, errors
     said = json.loads(out)
