@@ -46,7 +46,7 @@ class Agent:
 
     ``drops`` counts by name what was lost: ``inbox_full`` (received faster than taken; the oldest goes),
     ``bad_frame``, ``no_destination``, ``unknown_agent`` (sent to an id that is not online), ``too_old`` (a release of
-    an emergency stop that waited for the stop to be answered, and was followed by another word).
+    an emergency stop that waited until the stop was answered, and had been replaced by then).
     """
 
     INBOX = 4096
@@ -106,8 +106,8 @@ class Agent:
     ) -> None:
         """Send to agents of one type (``"ros"``, ``"unity"`` or its number), by id, by group or both.
 
-        Returns at once; `drain` waits. What is under way when a link is lost, this agent's or the receiver's, does not
-        arrive: where it must, `call` is answered. An agent named by id and by group gets one copy. Raises
+        Returns at once; `drain` waits. What is under way when a link is lost does not arrive: use `call`, which is
+        answered, where that matters. An agent named by id and by group gets one copy. Raises
         TooManyDestinations, OutOfRange, UsageError, Closed.
         """
         if not ids and not groups:
@@ -115,7 +115,7 @@ class Agent:
         self._send(type_number(to), tuple(ids), tuple(groups), data, metadata)
 
     def reply(self, message: Message, data: bytes, *, metadata: Metadata | None = None) -> None:
-        """Send to who sent ``message``, with its request id, by which the sender may know what is answered."""
+        """Send to the sender of ``message``, with its request id, so that it knows what is answered."""
         metadata = metadata or Metadata(request_id=message.metadata.request_id)
         self.send(data, to=message.sender_type, ids=[message.sender_id], metadata=metadata)
 
@@ -126,8 +126,8 @@ class Agent:
     async def drain(self) -> None:
         """Wait until all that was sent is in the hands of Zenoh, which sends it before the agent leaves the mesh.
 
-        To send much, wait after each piece: `send` returns at once, and what waits is bounded. Above that it is lost
-        and counted by the mesh as ``backlog``.
+        To send much, wait after each piece: `send` returns at once, and beyond a limit what waits is lost, and counted
+        by the mesh as ``backlog``.
         """
         self._check_open()
         await self.mesh.drain()
@@ -282,10 +282,9 @@ class Agent:
         """Answer calls of ``verb`` with ``await handler(call)``, until the handle is closed; raise Refused in it to
         refuse with a reason.
 
-        ``first(call)`` is called before that, in a thread of Zenoh's, whatever the loop is busy with; it may refuse.
-        ``mesh`` is another session that serves it for this agent; with ``stand_in`` it is served here only as long as
-        no other session does. It takes a moment until the whole mesh knows; callers who see this agent online ask
-        again meanwhile.
+        ``first(call)`` is called before that, in a thread of Zenoh's, even while the loop is busy; it may refuse. With
+        ``mesh`` another session answers for this agent; with ``stand_in`` this one answers only while no other session
+        does. The whole mesh knows of it a moment later; callers who see this agent online ask again until then.
         """
 
         self._check_open()
@@ -310,7 +309,7 @@ class Agent:
             robot: the id of a robot, or several.
             group: all robots of a group, or of several.
             type: as ``geometry_msgs/PoseStamped``; without one, what the robots that are online call it.
-            depth: how many messages the robot holds, and the subscription for who takes them too slowly.
+            depth: how many messages the robot holds, and this subscription, while they are not taken.
             timeout_s: how long the robots may take to answer.
 
         It holds for robots that come later or come back as well. Several subscriptions of one topic share what goes
@@ -417,9 +416,9 @@ class Agent:
     def on_id(self, callback: OnId) -> Handle:
         """Call ``callback(old, new)`` when the id has had to change; then ``id`` is the new one already.
 
-        That happens to agents that took a free id, when two parts of a mesh meet in which two took the same. What
-        this agent receives, serves and sends goes on under the new id. What others registered here was for the old
-        one, which is somebody else's now.
+        That happens when two parts of a mesh meet and an agent in each had taken the same free id. What this agent
+        receives, serves and sends goes on under the new id. What others registered here was for the old one, which is
+        somebody else's now.
         """
         return self._on_id.add(callback)
 

@@ -136,7 +136,7 @@ class NodeUser:
                 log.exception("a callback of %s failed", self.topic)
 
     def close(self) -> None:
-        """Not needed any more: robots are told, unless others here use it. Closing twice is allowed."""
+        """End it: robots are told, unless others in this program use the same. Closing twice is allowed."""
         if self.is_open:
             self.is_open = False
             self._nodes.leave(self._node, self)

@@ -52,7 +52,7 @@ NodeName = Annotated[str, Meta(min_length=1, max_length=NAME_BYTES, pattern=PLAI
 
 
 class NodeType(IntEnum):
-    """What an interface node is on the robot (the seed text names 3 and 4 from the headset's side)."""
+    """What an interface node is on the robot. MACS's own texts name 3 and 4 from the headset's side."""
 
     SUBSCRIBER = 1
     """A ROS subscription: a robot's topic goes to headsets."""

@@ -17,8 +17,8 @@ from .wire import Layout, parse_frame, parse_frames
 
 
 class Message(NamedTuple):
-    """What an agent receives. The sender comes from the key, which a router can hold it to, not from the JSON; in
-    ``metadata`` it is put right. ``age_s``: how long a command has waited on its way, where that was judged."""
+    """What an agent receives. The sender is taken from the key, which routers can check, and not from the JSON;
+    ``metadata`` is corrected to name the same. ``age_s``: how long a command waited on its way, if known."""
 
     sender_type: str
     sender_id: int

@@ -376,7 +376,7 @@ async def test_it_is_a_managed_node(start: StartGateway, peer: Peer, ground: Gro
 
 
 async def test_parameters_are_as2_cas(start: StartGateway, peer: Peer) -> None:
-    """The four parameters have the seed's names and defaults, readable by ROS tools, and rename what they name."""
+    """The four parameters have as2_ca's names and defaults, readable by ROS tools, and rename what they name."""
     await start("drone0", transport="topic")
     names = ["agent_id", "inter_agent_topic", "out_messages_topic", "register_module_service_name"]
     answer = await call(peer, GetParameters, "/ca_gateway_node/get_parameters", GetParameters.Request(names=names))
