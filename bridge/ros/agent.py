@@ -19,17 +19,16 @@ from typing import TypeVar
 import macs_zenoh
 from bridge.audit import open_audit, who
 from bridge.metrics.endpoint import watched_at
-from bridge.ros import parameters
 from bridge.ros.checked import CheckedSettings
 from bridge.ros.definitions import Definitions, offered_types
 from bridge.ros.figures import watched
-from bridge.ros.graph import NamesAndTypes, Offers
+from bridge.ros.graph import Offers
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.requests import control, status
 from bridge.ros.rules import Rules
 from bridge.ros.safety import EmergencyStop
-from bridge.ros.session import RosSession
+from bridge.ros.side import NamesAndTypes, Side
 from bridge.ros.stop_line import StopLine
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh import managers
@@ -79,7 +78,7 @@ class RobotAgent:
     def __init__(
         self,
         agent: Agent,
-        session: RosSession,
+        session: Side,
         settings: RobotSettings,
         managers: Managers | None = None,
         guard: Guard | None = None,
@@ -113,9 +112,9 @@ class RobotAgent:
             lambda count: robot.drops.note("audit_lost", "", "the record of who did what is not whole", count),
         )
         self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
-        self.checked = CheckedSettings(robot.rules, robot.drops)
+        self.checked = CheckedSettings(session, robot.rules, robot.drops)
         self.offers = Offers(robot, self.streams.publish, self._graph_changed)
-        self._definitions = Definitions()
+        self._definitions = Definitions(session.definition)
         self._answering: dict[asyncio.Task[None], Registrant] = {}
         self._sessions: dict[Registrant, tuple[str, int]] = {}
         """Who has an id, or had it last."""
@@ -440,34 +439,54 @@ async def open_robot(
 
     Raises Unreachable when ROS cannot start; ConfigError; what `macs_zenoh.join` raises.
     """
-    own = managers.load(settings.robot.managers)
+    import bridge.ros.installed  # noqa: F401 - says what to do where there is no rclpy
+    from bridge.ros import parameters
+    from bridge.ros.session import RosSession
+
     session = await asyncio.to_thread(RosSession, NODE_NAME, domain_id=domain_id, ros_args=ros_args)
     try:
         settings = await session.run(lambda: parameters.apply(session.node, settings))
-        robot = settings.robot
-        guard = Guard(
-            Limits(robot.max_commands_per_s, robot.max_requests_per_s, robot.max_command_age_s),
-            Layout(settings.mesh.id_slots, settings.mesh.group_slots),
-        )
-        async with macs_zenoh.join(
-            "ros",
-            id=robot.id,
-            group=robot.group,
-            settings=settings.mesh,
-            traffic=settings.traffic,
-            guard=guard,
-            on_waiting=on_waiting,
-        ) as agent:
-            ros_agent = RobotAgent(agent, session, robot, own, guard, emergency_stop)
-            await ros_agent.start()
-            log.info("robot %d serves %s", agent.id, session.full_name)
-            try:
-                yield ros_agent
-            finally:
-                await ros_agent.close()
-                await asyncio.sleep(STOP_MESSAGES_S)
+        async with joined(settings, session, on_waiting=on_waiting, emergency_stop=emergency_stop) as robot:
+            yield robot
     finally:
         await asyncio.to_thread(session.close)
+
+
+@asynccontextmanager
+async def joined(
+    settings: Settings,
+    session: Side,
+    *,
+    on_waiting: Callable[[str], None] | None = None,
+    emergency_stop: EmergencyStop | None = None,
+) -> AsyncIterator[RobotAgent]:
+    """Join the mesh as the robot whose ROS graph this is, and serve until the end of the block.
+
+    Raises ConfigError; what `macs_zenoh.join` raises.
+    """
+    robot = settings.robot
+    own = managers.load(robot.managers)
+    guard = Guard(
+        Limits(robot.max_commands_per_s, robot.max_requests_per_s, robot.max_command_age_s),
+        Layout(settings.mesh.id_slots, settings.mesh.group_slots),
+    )
+    async with macs_zenoh.join(
+        "ros",
+        id=robot.id,
+        group=robot.group,
+        settings=settings.mesh,
+        traffic=settings.traffic,
+        guard=guard,
+        on_waiting=on_waiting,
+    ) as agent:
+        ros_agent = RobotAgent(agent, session, robot, own, guard, emergency_stop)
+        await ros_agent.start()
+        log.info("robot %d serves %s", agent.id, session.full_name)
+        try:
+            yield ros_agent
+        finally:
+            await ros_agent.close()
+            await asyncio.sleep(STOP_MESSAGES_S)
 
 
 async def run(
