@@ -9,7 +9,7 @@ from typing import Any
 
 from . import definitions
 from .protocol.rmw_zenoh.type_hash import ARRAY, BOUNDED, TYPE_IDS, UNBOUNDED, Field, hash_of, hash_of_service
-from .typed import Types, UnknownType
+from .typed import PARTS, Types, UnknownType
 
 GOAL_ID = Field("goal_id", "nested", "unique_identifier_msgs/msg/UUID")
 STAMP = Field("stamp", "nested", "builtin_interfaces/msg/Time")
@@ -76,6 +76,28 @@ def _field(name: str, description: Any) -> Field:
     if base == "string" and limit:
         return Field(name, "bounded_string", "", items, capacity, limit)
     return Field(name, "uint8" if base == "char" else base, "", items, capacity)  # as rosidl has it
+
+
+def text_of(types: Types, name: str) -> str:
+    """The text of a definition, without constants and comments. Raises UnknownType."""
+    kind = name.split("/")[1]
+    parts = [f"{name}_{part}" for part in PARTS.get(kind, ())] or [name]
+    return "---\n".join("".join(f"{_line(*field)}\n" for field in types.fields(part)) for part in parts)
+
+
+def _line(name: str, description: Any) -> str:
+    kind, detail = description
+    behind = ""
+    if kind.name in ("ARRAY", "SEQUENCE"):
+        most = detail[1]
+        behind = f"[{most}]" if kind.name == "ARRAY" else f"[<={most}]" if most else "[]"
+        kind, detail = detail[0]
+    if kind.name == "NAME":
+        wide = definitions.WIDE.fullmatch(detail)
+        base, limit = ("wstring", int(wide["limit"] or 0)) if wide else (detail.replace("/msg/", "/"), 0)
+    else:
+        base, limit = detail
+    return f"{base}{f'<={limit}' if limit else ''}{behind} {name}"
 
 
 def learn(types: Types, description: Mapping[str, Any]) -> None:

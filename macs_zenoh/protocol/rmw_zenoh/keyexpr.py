@@ -193,6 +193,16 @@ def parse_token(token: str) -> Node | Endpoint:
     return Endpoint(node, int(id_), kind, full, ros_type(dds), type_hash, found, tuple(more))
 
 
+def session_keys(namespace: str) -> list[str]:
+    """All keys of ROS nodes whose sessions are in a namespace: data and services, tokens, what publishers keep."""
+    return [f"{namespace}/**", f"{namespace}/{ADMIN}/**", f"{namespace}/**/@adv/**"]
+
+
+def probe_key(namespace: str, mark: str) -> str:
+    """A key there that is no topic of any node, to try who may put it."""
+    return f"{namespace}/0/{mark}"
+
+
 def kept_by(key: str) -> str:
     """Where all that advanced publishers of a key keep, and say of themselves, can be had."""
     return f"{key}/@adv/pub/**"
