@@ -368,7 +368,7 @@ class ActionNode(InterfaceNode):
         )
 
     def _send_cancel(self, goal: Goal, times: int = 1) -> None:
-        if self._client is None:
+        if self._client is None or goal.finished_at is not None:
             self._loop.call_soon_threadsafe(self._tell, goal, ActionVerb.CANCEL, 0, b"the goal has finished")
             return
 

@@ -38,8 +38,8 @@ from bridge.ros.side import (
 )
 from bridge.ros.types import InterfaceName, resolve, shape_of
 from macs_zenoh.errors import Refused
-from macs_zenoh.protocol.schemas import Definition
 from macs_zenoh.protocol.rmw_zenoh.qos import ENDLESS_NS, Durability, History, Liveliness, Qos, Reliability
+from macs_zenoh.protocol.schemas import Definition
 
 SERVICE_DEPTH = QoSProfile(depth=1000)
 """Of our own ends of services, so that on them nothing is lost."""
