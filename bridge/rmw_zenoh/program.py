@@ -12,7 +12,7 @@ from msgspec import structs
 from bridge.rmw_zenoh.robots import nodes_of, seen
 from bridge.rmw_zenoh.session import ZenohSession
 from bridge.rmw_zenoh.types import KnownTypes
-from bridge.ros.agent import joined
+from bridge.ros.joined import joined
 from bridge.ros.safety import EmergencyStop
 from bridge.settings import Settings
 from bridge.settings.rmw_zenoh import RmwZenohRobot

@@ -16,7 +16,6 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import TypeVar
 
-import macs_zenoh
 from bridge.audit import open_audit, who
 from bridge.metrics.endpoint import watched_at
 from bridge.ros.checked import CheckedSettings
@@ -24,6 +23,7 @@ from bridge.ros.definitions import Definitions, offered_types
 from bridge.ros.figures import watched
 from bridge.ros.graph import Offers
 from bridge.ros.interface import Registrant, Robot
+from bridge.ros.mirrors import Mirrors
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.requests import control, status
 from bridge.ros.rules import Rules
@@ -31,7 +31,6 @@ from bridge.ros.safety import EmergencyStop
 from bridge.ros.side import NamesAndTypes, Side
 from bridge.ros.stop_line import StopLine
 from bridge.settings import RobotSettings, Settings
-from macs_zenoh import managers
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError, Refused, WireError
 from macs_zenoh.handles import Handle
@@ -39,7 +38,7 @@ from macs_zenoh.locked_out import locked_out
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import Mesh, now_s
 from macs_zenoh.protocol.directory import AgentInfo
-from macs_zenoh.protocol.guard import Guard, Limits
+from macs_zenoh.protocol.guard import Guard
 from macs_zenoh.protocol.keyexpr import type_name, type_number
 from macs_zenoh.protocol.messages import AddNode, FunctionalityRequest, Metadata, RemoveNode, decode_data, encode_data
 from macs_zenoh.protocol.reading import Message
@@ -121,6 +120,7 @@ class RobotAgent:
         self.stop_line: StopLine | None = None
         self._stop_later: asyncio.Task[None] | None = None
         self._last_words: Handle | None = None
+        self._mirrors: Mirrors | None = None
 
     def _graph_changed(self, topics: NamesAndTypes, services: NamesAndTypes) -> None:
         """In the ROS thread."""
@@ -150,6 +150,8 @@ class RobotAgent:
             self.agent.serve(verb, handler)
         self.agent.serve("stop", self._stopped, first=self._stop, stand_in=True)
         self.agent.on_message(self._receive)
+        if settings.mirror:
+            self._mirrors = Mirrors(self.nodes.robot, self.agent)
         self._let_stop()
         if self._guard is not None:
             self._guard.on_dropped = self.nodes.drops.note
@@ -209,6 +211,8 @@ class RobotAgent:
             self._guard.on_command = _ignore
         self.agent.on_message(_ignore)
         self.offers.close()
+        if self._mirrors is not None:
+            self._mirrors.close()
         if self._stop_later is not None:
             self._stop_later.cancel()
         for answer in self._answering:
@@ -441,6 +445,7 @@ async def open_robot(
     """
     import bridge.ros.installed  # noqa: F401 - says what to do where there is no rclpy
     from bridge.ros import parameters
+    from bridge.ros.joined import joined  # which needs this
     from bridge.ros.session import RosSession
 
     session = await asyncio.to_thread(RosSession, NODE_NAME, domain_id=domain_id, ros_args=ros_args)
@@ -450,43 +455,6 @@ async def open_robot(
             yield robot
     finally:
         await asyncio.to_thread(session.close)
-
-
-@asynccontextmanager
-async def joined(
-    settings: Settings,
-    session: Side,
-    *,
-    on_waiting: Callable[[str], None] | None = None,
-    emergency_stop: EmergencyStop | None = None,
-) -> AsyncIterator[RobotAgent]:
-    """Join the mesh as the robot whose ROS graph this is, and serve until the end of the block.
-
-    Raises ConfigError; what `macs_zenoh.join` raises.
-    """
-    robot = settings.robot
-    own = managers.load(robot.managers)
-    guard = Guard(
-        Limits(robot.max_commands_per_s, robot.max_requests_per_s, robot.max_command_age_s),
-        Layout(settings.mesh.id_slots, settings.mesh.group_slots),
-    )
-    async with macs_zenoh.join(
-        "ros",
-        id=robot.id,
-        group=robot.group,
-        settings=settings.mesh,
-        traffic=settings.traffic,
-        guard=guard,
-        on_waiting=on_waiting,
-    ) as agent:
-        ros_agent = RobotAgent(agent, session, robot, own, guard, emergency_stop)
-        await ros_agent.start()
-        log.info("robot %d serves %s", agent.id, session.full_name)
-        try:
-            yield ros_agent
-        finally:
-            await ros_agent.close()
-            await asyncio.sleep(STOP_MESSAGES_S)
 
 
 async def run(

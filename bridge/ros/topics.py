@@ -13,7 +13,6 @@ import math
 import threading
 import time
 from collections.abc import Iterable
-from typing import Any
 
 from msgspec import UNSET, UnsetType, structs
 
