@@ -72,7 +72,13 @@ class ZenohRobot:
 
     async def _be_there(self) -> None:
         types = await asyncio.to_thread(KnownTypes, self._settings.rmw_zenoh.definitions)
-        session = ZenohSession(self.network, types, domain=self.robot.domain, namespace=self.robot.node_namespace)
+        session = ZenohSession(
+            self.network,
+            types,
+            domain=self.robot.domain,
+            namespace=self.robot.node_namespace,
+            own_names=[self._settings.robot.stop_topic] if self._settings.robot.stop_topic else [],
+        )
         try:
             async with joined(self._settings, session, emergency_stop=self._stop) as agent:
                 log.info("robot %d is there: %s", self.robot.id, self.robot.place)

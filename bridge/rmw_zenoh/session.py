@@ -8,8 +8,8 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
-from concurrent.futures import Future
+from collections.abc import Callable, Collection
+from concurrent.futures import Future, wait
 from typing import Any, TypeVar
 
 from bridge.rmw_zenoh.ends import Held, Typed, ZenohClient, ZenohPublisher, ZenohServer, ZenohSubscription
@@ -58,12 +58,21 @@ class ZenohSession:
     """A node of ours on a ROS graph, until `close`. The ROS thread is one that nothing else waits for."""
 
     def __init__(
-        self, network: RosNetwork, types: KnownTypes, *, domain: int = 0, namespace: str = "/", name: str = "rosagent"
+        self,
+        network: RosNetwork,
+        types: KnownTypes,
+        *,
+        domain: int = 0,
+        namespace: str = "/",
+        name: str = "rosagent",
+        own_names: Collection[str] = (),
     ) -> None:
-        """``namespace``: of the robot's nodes; what others have beside it is no part of the robot."""
+        """``namespace``: of the robot's nodes; what others have beside it is no part of the robot. ``own_names`` are
+        in it as well, as the topic of the emergency stop: robots that share a domain have each its own."""
         self.network = network
         self.types = types
         self._namespace = namespace
+        self._remapped = {name: namespace + name for name in own_names} if namespace != "/" else {}
         self.node = network.node(domain, name, namespace)
         self.graph = self.node.graph
         self._work = Alarms()
@@ -77,6 +86,9 @@ class ZenohSession:
     def domain(self) -> int:
         """`Side.domain`."""
         return self.node.node.domain
+
+    beside = "over rmw_zenoh; when the network to the robot parts nobody stops it"
+    """`Side.beside`."""
 
     @property
     def full_name(self) -> str:
@@ -125,8 +137,7 @@ class ZenohSession:
         self._watching.close()
         with self._lock:
             waiting = [*self._jobs]
-        for future in waiting:
-            future.exception(timeout=DESCRIBE_S) if not future.cancelled() else None
+        wait(waiting, timeout=DESCRIBE_S)
         with self._lock:
             self._open = False
             unfinished = [*self._jobs]
@@ -148,7 +159,7 @@ class ZenohSession:
         else:
             full = name if name.startswith("/") else f"{own.namespace.rstrip('/')}/{name}"
         try:
-            return check_name(full)
+            return check_name(self._remapped.get(full, full))
         except BadName as error:
             raise Refused(f"{name[:80]!r} cannot be used on this robot: {error}") from error
 

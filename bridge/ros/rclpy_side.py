@@ -54,6 +54,8 @@ class RclpySide:
 
     node: Node
     intake: Intake
+    beside = ""
+    """`Side.beside`."""
 
     # -- names and graph -----------------------------------------------------------------------------------------
 

@@ -179,6 +179,10 @@ class Side(Protocol):
         """The ROS domain. From any thread."""
 
     @property
+    def beside(self) -> str:
+        """What cannot be done from here for the robot's safety; empty for a program on the robot."""
+
+    @property
     def full_name(self) -> str:
         """Namespace and name of our node. From any thread."""
 

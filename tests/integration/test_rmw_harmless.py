@@ -90,8 +90,14 @@ async def test_no_program_asks_or_puts_what_ends_a_node() -> None:
             assert code in (0, 1), (argv, errors)
         answer = await agent.call_service("/lamp", {"data": True}, robot=7)
         assert answer == {"success": True, "message": "switched"}
-        await agent.publish("/orders", {"data": "go"}, robot=7)
-        assert (await asyncio.wait_for(orders.receive(), PATIENCE_S)).value == {"data": "go"}
+        coming = asyncio.ensure_future(orders.receive())
+
+        async def comes() -> bool:
+            await agent.publish("/orders", {"data": "go"}, robot=7)
+            return coming.done()
+
+        await until(comes, PATIENCE_S, every_s=0.05)
+        assert coming.result().value == {"data": "go"}
         service = [each for each in seen if "/lamp/" in each.key]
         assert len(service) == 1
         assert [each for each in seen if "*" in each.key or not looks_like_cdr(each.payload)] == []
@@ -136,11 +142,14 @@ async def test_what_others_put_wrongly_ends_nothing(router: str) -> None:
             await asyncio.to_thread(lambda: list(session.get(f"{DOMAIN}/**", timeout=2.0)))
             talking = other.publisher("/orders", "std_msgs/String")
 
-            async def comes() -> bool:
-                talking.publish({"data": "right"})
-                return (await heard.receive()).value == {"data": "right"}
+            coming = asyncio.ensure_future(heard.receive())
 
-            await until(comes, PATIENCE_S)
+            def comes() -> bool:
+                talking.publish({"data": "right"})
+                return coming.done()
+
+            await until(comes, PATIENCE_S, every_s=0.05)
+            assert coming.result().value == {"data": "right"}
             assert (await other.call("/lamp", "std_srvs/SetBool", {"data": True}))["message"] == "switched"
             assert node.drops["bad_attachment"] >= 10
             assert node.drops["bad_cdr"] >= 6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
@@ -88,10 +89,17 @@ async def test_topics_both_ways(site: Site) -> None:
     await site.robot.ask("subscribe", topic="/orders")
     await site.there()
     heard = await site.agent.subscribe("/chatter", robot=7)
+    texts: list[str] = []
+
+    async def listen() -> None:
+        async for message in heard:
+            texts.append(message.value["data"])
+
+    listening = asyncio.create_task(listen())
 
     async def hears(text: str) -> bool:
         await site.robot.ask("publish", topic="/chatter", text=text)
-        return any(message.value["data"] == text for message in [await heard.receive()])
+        return text in texts
 
     await until(lambda: hears("again"), PATIENCE_S)
     orders = await site.agent.advertise("/orders", robot=7)
@@ -106,6 +114,7 @@ async def test_topics_both_ways(site: Site) -> None:
     await site.there(False)
     await site.robot.start()
     await until(lambda: hears("back"), PATIENCE_S)
+    listening.cancel()
 
 
 async def test_services_both_ways(site: Site) -> None:
