@@ -90,6 +90,9 @@ class MeshSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Destination id slots in the frame header. The same on the whole mesh; 10 is what existing programs use."""
     group_slots: Annotated[int, Meta(ge=1, le=255)] = 10
     """Destination group slots in the frame header, likewise."""
+    trace_every: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
+    """One in so many of a robot's topic messages is traced always, as by `macs trace`; a gateway with it notes those
+    that come. 0: only what somebody asks for."""
 
     def _check(self) -> None:
         for field in ("connect", "listen"):

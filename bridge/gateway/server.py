@@ -77,6 +77,7 @@ from macs_zenoh.protocol.tcp_agent import (
     TcpAgent,
     Withdrawn,
 )
+from macs_zenoh.protocol.trace import SOCKET
 from macs_zenoh.protocol.wire import Layout
 from macs_zenoh.registration_calls import RobotCalls, StreamChanges
 from macs_zenoh.timeouts import within
@@ -438,6 +439,8 @@ class Gateway:
 
     def forward(self, connection: Connection, sent: Sent) -> None:
         """The agent sent a frame to others."""
+        if self.mesh.tracing.marks:
+            self.mesh.tracing.note((SOCKET, time.time_ns()))
         self._forwarding.forward(connection, sent)
 
     def received(self, connection: Connection) -> None:

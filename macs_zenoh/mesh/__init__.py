@@ -7,13 +7,14 @@ Zenoh calls back in its own threads, instead of through a queue and a thread of 
 switch less is what a single message feels, and one queue of ours keeps the order between subscriptions.
 
 `session` is the mesh; `outgoing` what is put, `arrivals` what comes, `calls` what is asked and served, `reliable` what
-is asked for again; `declared` the words that all of them use, `zenoh_config` Zenoh's configuration, `threads` how
-Zenoh and Python share a processor.
+is asked for again; `tracing` what is noted of messages on their way, `link_log` what the log says of links; `declared`
+the words that all of them use, `zenoh_config` Zenoh's configuration, `threads` how Zenoh and Python share a processor.
 """
 
 from .arrivals import now_s
 from .declared import Aged, AtOnce, Handler, OnBatch, OnMiss, Payload, Sample, Subscription, Token, Traffic
 from .session import Mesh
+from .tracing import Tracing
 from .zenoh_config import configuration
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "Sample",
     "Subscription",
     "Token",
+    "Tracing",
     "Traffic",
     "configuration",
     "now_s",

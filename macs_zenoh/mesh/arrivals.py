@@ -18,6 +18,7 @@ from macs_zenoh.protocol.guard import Gate
 from .declared import Aged, AtOnce, OnAged, OnBatch, OnNumbered, Payload, Sample
 from .loopback import Loopback
 from .threads import keep_attached
+from .tracing import NotingGate, Tracing, noting, noting_aged
 
 log = logging.getLogger("macs.mesh")
 
@@ -34,6 +35,30 @@ def now_s() -> float:
 
 Queue = deque[tuple[Callable[[Iterator[Any]], None], tuple[Any, ...], bool]]
 """For whom, the sample, and whether the loop's own thread has put it."""
+
+
+class _Behind:
+    """Of each key of one subscription, how many samples wait for the loop that are large, or came after such a one:
+    nothing overtakes them."""
+
+    def __init__(self) -> None:
+        self.waiting: Counter[str] = Counter()
+        self._lock = threading.Lock()
+
+    def enter(self, key: str, large: bool) -> bool:
+        """One more waits; whether it counts."""
+        with self._lock:
+            counted = large or key in self.waiting
+            if counted:
+                self.waiting[key] += 1
+        return counted
+
+    def leave(self, key: str) -> None:
+        """One that counted was handled."""
+        with self._lock:
+            self.waiting[key] -= 1
+            if not self.waiting[key]:
+                del self.waiting[key]
 
 
 class Arrivals:
@@ -81,6 +106,7 @@ class Arrivals:
         wake: Callable[[Callable[[], None]], None],
         drops: Losses,
         loopback: Loopback,
+        tracing: Tracing,
     ) -> None:
         self._drops = drops
         self._loop = loop
@@ -108,6 +134,7 @@ class Arrivals:
         self.asked: deque[zenoh.Query] = deque()
         """Queries on their way to the loop: an emergency stop can be among them, so no sample overtakes them."""
         self._own = loopback.own
+        self._tracing = tracing
 
     @property
     def waiting(self) -> int:
@@ -120,13 +147,18 @@ class Arrivals:
         on_numbered: OnNumbered | None = None,
         *,
         at_once: AtOnce | None = None,
+        traced: bool = True,
     ) -> Callable[[zenoh.Sample], bool]:
         """What Zenoh calls, in whatever thread, for each sample of one subscription; whether there was room for it.
         Samples that their source has numbered go to ``on_numbered``, if it is given; others are offered to
-        ``at_once`` first."""
+        ``at_once`` first. ``traced``: those that are marked, while anybody wants to know, are noted."""
+        looks = self._tracing.looks if traced else ()
         others, mine, limit, large, own = self._queue, self._mine, self.TOPICS_LIMIT, self.LARGE_BYTES, self._own
 
         def receive(sample: zenoh.Sample) -> bool:
+            if looks and (trace := self._tracing.begin(sample)) is not None:
+                noted = noting(trace, on_batch, on_numbered, at_once)
+                return self.receiver(noted[0], noted[1], at_once=noted[2], traced=False)(sample)
             try:
                 payload = own.payload
             except AttributeError:  # the first in this thread
@@ -157,13 +189,12 @@ class Arrivals:
 
         return receive
 
-    def guarded(self, on_aged: OnAged, gate: Gate) -> Callable[[zenoh.Sample], None]:
+    def guarded(self, on_aged: OnAged, gate: Gate, behind: _Behind | None = None) -> Callable[[zenoh.Sample], None]:
         """The same for what is judged before it may wait, and where Zenoh's thread must never wait: what the gate does
         not admit is not even copied, what it takes is done, and for the rest there is room or there is not."""
         queue, own = self._queue, self._own
-        behind: Counter[str] = Counter()
-        """Of each key, how many wait for the loop that are large, or came after such a one: nothing overtakes them."""
-        counting = threading.Lock()
+        looks = self._tracing.looks if behind is None else ()
+        behind = _Behind() if behind is None else behind
 
         def handle(samples: Iterator[tuple[str, Payload, float, float, bool]]) -> None:
             on_aged(aged(samples))
@@ -175,12 +206,12 @@ class Arrivals:
                     yield key, payload, age_s + now - at, now
                 finally:
                     if counted:
-                        with counting:
-                            behind[key] -= 1
-                            if not behind[key]:
-                                del behind[key]
+                        behind.leave(key)
 
         def receive(sample: zenoh.Sample) -> None:
+            if looks and (trace := self._tracing.begin(sample)) is not None:
+                self.guarded(noting_aged(trace, on_aged), NotingGate(trace, gate), behind)(sample)
+                return
             try:
                 payload = own.payload
             except AttributeError:  # the first in this thread
@@ -198,7 +229,7 @@ class Arrivals:
                 if stamp := sample.timestamp:
                     age_s = gate.age(key, stamp.get_id(), stamp.get_time_as_ntp64().as_secs_f64(), now)
                 if size <= self.AT_ONCE_BYTES:
-                    if key in behind:
+                    if key in behind.waiting:
                         self._try(gate.rescue, key, payload, now)  # a stop waits for nothing
                     elif self._try(gate.first, key, payload, age_s, now):
                         return
@@ -207,10 +238,7 @@ class Arrivals:
             if len(queue) >= self.LIMIT or not self._takes_room_for(len(payload)):
                 self._behind("loop_behind")
                 return
-            with counting:
-                counted = len(payload) > self.AT_ONCE_BYTES or key in behind
-                if counted:
-                    behind[key] += 1
+            counted = behind.enter(key, len(payload) > self.AT_ONCE_BYTES)
             queue.append((handle, (key, payload, age_s, now, counted), False))
             if not self._waiting:
                 self._wake_loop()

@@ -22,6 +22,7 @@ from macs_zenoh.protocol.policing import Policer, Policy
 from .declared import Outlet, Payload, Traffic
 from .loopback import Loopback
 from .panics import call, unwatched
+from .tracing import Marked, Tracing
 
 log = logging.getLogger("macs.mesh")
 
@@ -36,9 +37,9 @@ class _Bare:
         self._key = key
         self._way = way
 
-    def put(self, payload: Payload) -> None:
+    def put(self, payload: Payload, **mark: Any) -> None:
         """Publish."""
-        self._session.put(self._key, payload, **self._way)
+        self._session.put(self._key, payload, **self._way, **mark)
 
 
 class _Outlet(NamedTuple):
@@ -83,7 +84,10 @@ class Outgoing:
         linked: bool,
         backlog_bytes: int,
         from_thread: Callable[[Callable[[], None]], None],
+        tracing: Tracing,
     ) -> None:
+        self._tracing = tracing
+        self._marked = tracing.wanted
         self.policer = policer
         self.linked = linked
         self.drops = drops
@@ -115,6 +119,8 @@ class Outgoing:
             return
         if not (self.linked or kept):
             self.drops["no_route"] += 1
+        if self._marked and (mark := self._tracing.mark(key, command=traffic is Traffic.COMMAND)) is not None:
+            publisher = Marked(publisher, mark)
         if traffic is not CALL or (self._sender.idle and len(payload) <= self.LARGE_BYTES):
             self._loopback.put(publisher, payload)
         elif kept:  # one publisher numbers them all

@@ -18,7 +18,7 @@ from macs_zenoh.config import MeshSettings, Priority, TrafficRule
 from macs_zenoh.errors import ConfigError, Unreachable
 from macs_zenoh.handles import Callbacks, Handle
 from macs_zenoh.losses import Losses
-from macs_zenoh.protocol import ping
+from macs_zenoh.protocol import ping, trace
 from macs_zenoh.protocol.directory import published
 from macs_zenoh.protocol.guard import Gate
 from macs_zenoh.protocol.keyexpr import PING
@@ -34,6 +34,7 @@ from .outgoing import Outgoing
 from .panics import call, end_on_panics, last_words, watched
 from .reliable import Recovered
 from .threads import keep_attached, shared_threads
+from .tracing import Tracing
 from .zenoh_config import check_files, first_line, id_is_chosen, insert, zenoh_config
 
 log = logging.getLogger("macs.mesh")
@@ -79,7 +80,9 @@ class Mesh:
         self._loop_thread = threading.get_ident()
         end_on_panics(self._loop)
         self._loopback = Loopback()
-        self._arrivals = Arrivals(self._loop, self._from_thread, self.drops, self._loopback)
+        self.tracing = Tracing(own, self.zid, settings.trace_every)
+        """What is traced of what this session puts and receives."""
+        self._arrivals = Arrivals(self._loop, self._from_thread, self.drops, self._loopback, self.tracing)
         self._recovered: set[Recovered] = set()
         self._needs_router = settings.mode == "client"
         self.linked = not self._needs_router
@@ -92,6 +95,7 @@ class Mesh:
             linked=self.linked,
             backlog_bytes=backlog_bytes,
             from_thread=self._from_thread,
+            tracing=self.tracing,
         )
         self._calls = Calls(session, self._arrivals, self._outgoing, self._from_thread)
         self.tells: Callable[[], dict[str, int]] = dict
@@ -128,7 +132,23 @@ class Mesh:
         Raises ConfigError when Zenoh does not accept the configuration or a file of it is missing, Unreachable when a
         router cannot listen.
         """
-        return cls(await open_session(settings, on_waiting=on_waiting, quiet=quiet), settings, traffic)
+        zenoh.init_log_from_env_or("off" if quiet else LOGGED)  # RUST_LOG, as with Zenoh's own tools
+        check_files(zenoh_config(settings))  # once: a file that is being replaced ends nobody who waits
+        waiting = False
+        while True:
+            config = zenoh_config(settings)
+            try:
+                return cls(await _open(config), settings, traffic)
+            except zenoh.ZError as error:
+                problem = first_line(error)
+                if settings.mode != "client":
+                    raise Unreachable(", ".join(settings.listen) or "the mesh", problem) from error
+                if not problem.startswith("Unable to connect"):
+                    raise ConfigError("zenoh configuration", problem) from error
+                if not waiting:
+                    waiting = True
+                    (on_waiting or _log_waiting)(", ".join(settings.routers) or "a router")
+                await asyncio.sleep(settings.retry_max_ms / 1000)
 
     @classmethod
     async def open_once(cls, settings: MeshSettings, *, timeout_s: float) -> Mesh:
@@ -412,6 +432,8 @@ class Mesh:
                 away=self.away(),
                 address=self.address,
             )
+            if payload.startswith(trace.PREFIX):
+                payload = self.tracing.answer(payload)
             if payload == ping.AGENTS and self.agents is not None:
                 payload = ping.encode_agents(self.agents())
             return ping.encode(said, payload)
@@ -464,29 +486,6 @@ class Mesh:
             (self._loop.call_soon if here else self._loop.call_soon_threadsafe)(callback, *args)
         except RuntimeError:  # the loop is closed: the program is ending and nobody waits for this
             log.debug("the event loop has ended")
-
-
-async def open_session(
-    settings: MeshSettings, *, on_waiting: Callable[[str], None] | None = None, quiet: bool = False
-) -> zenoh.Session:
-    """A session of Zenoh's by these settings. See `Mesh.open`."""
-    zenoh.init_log_from_env_or("off" if quiet else LOGGED)  # RUST_LOG, as with Zenoh's own tools
-    check_files(zenoh_config(settings))  # once: a file that is being replaced ends nobody who waits
-    waiting = False
-    while True:
-        config = zenoh_config(settings)
-        try:
-            return await _open(config)
-        except zenoh.ZError as error:
-            problem = first_line(error)
-            if settings.mode != "client":
-                raise Unreachable(", ".join(settings.listen) or "the mesh", problem) from error
-            if not problem.startswith("Unable to connect"):
-                raise ConfigError("zenoh configuration", problem) from error
-            if not waiting:
-                waiting = True
-                (on_waiting or _log_waiting)(", ".join(settings.routers) or "a router")
-            await asyncio.sleep(settings.retry_max_ms / 1000)
 
 
 async def _open(config: zenoh.Config) -> zenoh.Session:

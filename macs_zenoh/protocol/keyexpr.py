@@ -433,7 +433,7 @@ PING = Key(
     PingFields,
     publisher="`macs doctor` (query; a put to itself, for the router's timestamp)",
     subscriber="every agent and gateway (queryable); the doctor's own second session",
-    payload="any bytes; the reply is one message: facts in JSON, and the bytes back",
+    payload="any bytes; the reply is one message: facts in JSON, and the bytes back, or what they ask for",
 )
 
 SLOW = Key(
