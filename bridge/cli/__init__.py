@@ -25,7 +25,6 @@ NAMES = (
     "router",
     "gateway",
     "agent",
-    "rmw-zenoh",
     "headset",
     "awareness",
     "ls",
@@ -34,6 +33,7 @@ NAMES = (
     "action",
     "top",
     "watch",
+    "trace",
     "ping",
     "bench",
     "stop",
@@ -55,7 +55,7 @@ class Verbs(Mapping[str, ModuleType]):
     def __getitem__(self, name: str) -> ModuleType:
         if name not in NAMES:
             raise KeyError(name)
-        return importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
+        return importlib.import_module(f"{__name__}.{name}")
 
     def __iter__(self) -> Iterator[str]:
         return iter(NAMES)

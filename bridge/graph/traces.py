@@ -1,0 +1,256 @@
+"""Traces of a robot's messages: asked for, collected from all who note them, and told hop by hop."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from macs_zenoh.errors import MacsError, Unreachable
+from macs_zenoh.protocol import ping, trace
+from macs_zenoh.protocol.keyexpr import LEASE, PING, STREAM, UNICAST, block_of
+from macs_zenoh.protocol.messages import ROS, node_name
+from macs_zenoh.protocol.offers import absolute
+from macs_zenoh.protocol.trace import ROUTER, Hop, Offset, Point, Report, TraceRequest, at_share
+from macs_zenoh.topics import TopicSubscription
+
+from .echo import subscribed
+from .site import Site
+
+POLL_S = 0.2
+ASK_S = 3.0
+"""So long each request holds; it is repeated while traces are collected."""
+PINGS = 10
+WARM = 2
+"""So many first messages of each way do not count: they find nothing prepared."""
+
+
+@dataclass
+class Noting:
+    """A program that notes marked messages, and what it has told so far."""
+
+    zid: str
+    name: str
+    after: int = 0
+    reports: list[Report] = field(default_factory=list)
+
+
+class Row(NamedTuple):
+    """A hop, in ms."""
+
+    hop: str
+    mean_ms: float
+    p50_ms: float
+    p99_ms: float
+    min_ms: float
+    max_ms: float
+
+
+@dataclass(frozen=True)
+class Traced:
+    """All messages of one way; the last row is the whole."""
+
+    title: str
+    receiver: str
+    topic: str
+    robot: int
+    count: int
+    at_once: int
+    rows: list[Row]
+    clocks: dict[str, float | None]
+    """By name: within how many ms it is known; None: not at all."""
+
+    @property
+    def clocks_text(self) -> str:
+        return ", ".join(
+            f"{name} within {bound:.3f} ms" if bound is not None else f"{name} not known"
+            for name, bound in sorted(self.clocks.items())
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "topic": self.topic,
+            "robot": self.robot,
+            "receiver": self.receiver,
+            "count": self.count,
+            "at_once": self.at_once,
+            "hops": [row._asdict() for row in self.rows[:-1]],
+            "end_to_end": {name: value for name, value in self.rows[-1]._asdict().items() if name != "hop"},
+            "clocks_within_ms": self.clocks,
+        }
+
+
+class Tracing:
+    """One ``macs trace``."""
+
+    def __init__(self, site: Site, robot: int, topic: str, *, every: int, commands: bool) -> None:
+        self._site = site
+        self._mesh = site.agent.mesh
+        self._robot = robot
+        self._topic = absolute(topic)
+        self._every = every
+        self._commands = commands
+        found = site.agent.directory.get(ROS, robot)
+        if found is None:
+            raise Unreachable(f"robot {robot}", "it is not online (macs ls)")
+        self._robot_zid = found.zid
+        self._names: dict[str, str] = {found.zid: f"robot {robot}", self._mesh.zid: "here"}
+        self._looking: list[Noting] = []
+        self._marking: list[str] = []
+        """Sessions of those who put what is traced."""
+        self._subscription: TopicSubscription | None = None
+        self._taking: asyncio.Task[None] | None = None
+        self._scope: Any = None
+
+    @property
+    def _key(self) -> str:
+        """How the keys begin of what is traced."""
+        if self._commands:
+            return UNICAST.every(type=ROS, block=block_of(self._robot), id=self._robot).removesuffix("**")
+        return STREAM.of(type=ROS, id=self._robot, node=node_name(self._topic))
+
+    async def begin(self) -> None:
+        """Find who marks and who notes, and receive the topic here. Raises Unreachable, Refused, UsageError."""
+        leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every(), timeout_s=self._site.timeout_s)]
+        gateways = sorted({lease.zid for lease in leases if lease is not None})
+        for zid in gateways:
+            pong = await self._pong(zid)
+            self._names[zid] = f"gateway {pong.address}" if pong is not None and pong.address else f"gateway {zid[:8]}"
+        if self._commands:
+            putting = {*gateways, *(agent.zid for agent in self._site.agent.online())}
+            self._marking = sorted(putting - {self._mesh.zid, self._robot_zid})
+            self._looking = [Noting(self._robot_zid, self._names[self._robot_zid])]
+            return
+        self._marking = [self._robot_zid]
+        self._looking = [Noting(zid, self._names[zid]) for zid in gateways]
+        self._looking.append(Noting(self._mesh.zid, "here"))
+        self._scope = subscribed(self._site, self._topic, None)
+        self._subscription = await self._scope.__aenter__()
+        self._taking = asyncio.get_running_loop().create_task(self._take(self._subscription))
+
+    async def end(self) -> None:
+        """Receive the topic no more; what was asked for ends by itself."""
+        if self._taking is not None:
+            self._taking.cancel()
+        if self._scope is not None:
+            await self._scope.__aexit__(None, None, None)
+
+    async def _take(self, subscription: TopicSubscription) -> None:
+        async for _ in subscription:
+            pass
+
+    async def collect(self, *, seconds: float, count: int | None) -> None:
+        """Ask again and again, until there were so many messages of one way, or for so long."""
+        deadline = time.monotonic() + seconds
+        marked_s = 0.0
+        while time.monotonic() < deadline:
+            if time.monotonic() - marked_s > ASK_S / 3:
+                marked_s = time.monotonic()
+                mark = TraceRequest(
+                    put=self._key, every=self._every, look=False, seconds=ASK_S, commands=self._commands
+                )
+                await asyncio.gather(*(self._ask(zid, mark) for zid in self._marking))
+            await self._poll()
+            if count is not None and any(len(noting.reports) >= count + WARM for noting in self._looking):
+                return
+            await asyncio.sleep(POLL_S)
+
+    async def _poll(self) -> None:
+        answers = await asyncio.gather(
+            *(self._ask(each.zid, TraceRequest(seconds=ASK_S, after=each.after)) for each in self._looking)
+        )
+        for noting, answer in zip(self._looking, answers, strict=True):
+            for report in answer.reports if answer is not None else ():
+                noting.after = max(noting.after, report.number)
+                if report.key.startswith(self._key):
+                    noting.reports.append(report)
+
+    async def _ask(self, zid: str, request: TraceRequest) -> trace.TraceAnswer | None:
+        asked = trace.encode_request(request)
+        try:
+            if zid == self._mesh.zid:
+                return trace.decode_answer(self._mesh.tracing.answer(asked))
+            answer = await self._mesh.query(PING.of(zid=zid), asked, timeout_s=ASK_S)
+            return trace.decode_answer(ping.decode(answer)[1])
+        except MacsError:
+            return None
+
+    async def _pong(self, zid: str) -> ping.Pong | None:
+        try:
+            return ping.decode(await self._mesh.query(PING.of(zid=zid), b"", timeout_s=self._site.timeout_s))[0]
+        except MacsError:
+            return None
+
+    # -- what follows --------------------------------------------------------------------------------------------
+
+    async def conclude(self) -> list[Traced]:
+        """Each way that messages took, by who received them; none of nothing."""
+        await self._poll()
+        reports = [report for noting in self._looking for report in noting.reports]
+        programs = {clock for report in reports for name, _, clock in report.points if name != ROUTER}
+        clocks = {zid: await self._compared(zid) for zid in programs}
+        return [traced for noting in self._looking for traced in self._ways(noting, clocks)]
+
+    async def _compared(self, zid: str) -> Offset:
+        """The clock of a program against ours; no difference is assumed where that is possible."""
+        if zid == self._mesh.zid:
+            return Offset(0.0, 0.0)
+        best = Offset()
+        for _ in range(PINGS):
+            sent_ns = time.time_ns()
+            pong = await self._pong(zid)
+            heard_ns = time.time_ns()
+            if pong is None:
+                return best
+            within_ns = (heard_ns - sent_ns) / 2
+            if best.within_ns is None or within_ns < best.within_ns:
+                best = Offset(pong.time_s * 1e9 - (sent_ns + heard_ns) / 2, within_ns)
+        same = best.within_ns is not None and abs(best.ahead_ns) <= best.within_ns
+        return Offset(0.0, best.within_ns) if same else best
+
+    def _ways(self, noting: Noting, clocks: Mapping[str, Offset]) -> Iterator[Traced]:
+        """Messages that passed the same points, each such way by itself."""
+        by_way: dict[tuple[tuple[str, str], ...], list[tuple[Report, list[Point]]]] = {}
+        for report in noting.reports:
+            points = trace.corrected([Point(*point) for point in report.points], clocks)
+            by_way.setdefault(tuple((point.name, point.clock) for point in points), []).append((report, points))
+        for way, reports in by_way.items():
+            kept = reports[WARM:] if len(reports) > 2 * WARM else reports
+            yield self._traced(noting, way, kept, dict(clocks))
+
+    def _traced(
+        self,
+        noting: Noting,
+        way: tuple[tuple[str, str], ...],
+        reports: list[tuple[Report, list[Point]]],
+        clocks: dict[str, Offset],
+    ) -> Traced:
+        ways = [points for _, points in reports]
+        for clock in dict.fromkeys(clock for name, clock in way if name == ROUTER):
+            clocks[clock] = trace.bound_by_order(ways, clock)
+            ways = [trace.corrected(points, {clock: clocks[clock]}) for points in ways]
+        taken = [list(trace.hops(points, self._names)) for points in ways]
+        rows = [_row(name, [hops[at].took_ns for hops in taken]) for at, name in enumerate(_names(taken[0]))]
+        rows.append(_row("end to end", [sum(hop.took_ns for hop in hops) for hops in taken]))
+        shown = {}
+        for name, clock in way:
+            offset = clocks.get(clock, Offset())
+            title = self._names.get(clock) or f"{'router ' if name == ROUTER else ''}{clock[:8]}"
+            shown[title] = None if offset.within_ns is None else round(offset.within_ns / 1e6, 4)
+        what = f"commands to robot {self._robot} from {self._names.get(way[0][1], way[0][1][:8])}"
+        title = what if self._commands else f"{self._topic} of robot {self._robot} to {noting.name}"
+        at_once = sum(report.way == "at once" for report, _ in reports)
+        return Traced(title, noting.name, self._topic, self._robot, len(reports), at_once, rows, shown)
+
+
+def _names(hops: list[Hop]) -> list[str]:
+    return [hop.name for hop in hops]
+
+
+def _row(name: str, times_ns: list[float]) -> Row:
+    ordered = sorted(times_ns)
+    mean, p50, p99 = sum(ordered) / len(ordered), at_share(ordered, 0.5), at_share(ordered, 0.99)
+    return Row(name, *(round(value / 1e6, 4) for value in (mean, p50, p99, ordered[0], ordered[-1])))
