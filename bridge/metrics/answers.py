@@ -43,7 +43,7 @@ class Answers:
         if path == "/metrics" and self._exposition is None:
             return Answered(501, f"{self._missing}\n".encode(), TEXT)
         if path == "/metrics" and self._exposition is not None:
-            body, media_type = self._exposition.write(self._watched.figures(), accept)
+            body, media_type = self._exposition.write(self._watched.figures(), self._watched.histograms(), accept)
             return Answered(200, body, media_type)
         if path == "/healthz":  # whoever answers this lives
             return Answered(200, b"ok\n", TEXT)

@@ -8,7 +8,7 @@ from typing import Any
 
 from macs_zenoh.errors import MissingExtra
 
-from .families import Family
+from .families import Family, Histogram
 
 
 class MissingPrometheus(MissingExtra):
@@ -32,11 +32,14 @@ class Exposition:
         self._core: Any = core
         process.ProcessCollector(registry=self._registry)
 
-    def write(self, families: Iterable[Family], accept: str = "") -> tuple[bytes, str]:
+    def write(
+        self, families: Iterable[Family], histograms: Iterable[Histogram] = (), accept: str = ""
+    ) -> tuple[bytes, str]:
         """The text and its media type; ``accept`` is the request's header."""
         encode, media_type = self._encoders.choose_encoder(accept)
         registry = self._core.CollectorRegistry()
-        registry.register(_Collector([*self._families(families), *self._registry.collect()]))
+        written = [*self._families(families), *map(self._histogram, histograms)]
+        registry.register(_Collector([*written, *self._registry.collect()]))
         return encode(registry), str(media_type)
 
     def _families(self, families: Iterable[Family]) -> Iterator[Any]:
@@ -54,6 +57,16 @@ class Exposition:
                 else:
                     written.add_metric([text for _, text in labels], value)
             yield written
+
+    def _histogram(self, histogram: Histogram) -> Any:
+        written = self._core.HistogramMetricFamily(histogram.name, histogram.help, labels=["hop"])
+        for hop, (counts, total) in histogram.rows.items():
+            below, buckets = 0, []
+            for bound, count in zip([*map(str, histogram.bounds), "+Inf"], counts, strict=True):
+                below += count
+                buckets.append((bound, below))
+            written.add_metric([hop], buckets=buckets, sum_value=total)
+        return written
 
 
 class _Collector:

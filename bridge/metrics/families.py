@@ -42,6 +42,16 @@ class Family:
         return kept.add(rest, **dict.fromkeys(names, OTHERS))
 
 
+@dataclass
+class Histogram:
+    """How often something was within which bound; of each hop the numbers in each bucket, and their sum."""
+
+    name: str
+    help: str
+    bounds: tuple[float, ...]
+    rows: dict[str, tuple[list[int], float]] = field(default_factory=dict)
+
+
 def counter(name: str, text: str) -> Family:
     """What only grows."""
     return Family(name, "counter", text)

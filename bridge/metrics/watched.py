@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.versions import installed
 
-from .families import Family, build, by_type, drops, gauge
+from .families import Family, Histogram, build, by_type, drops, gauge
+from .hops import HopTimes
 
 if TYPE_CHECKING:
     from macs_zenoh.mesh import Mesh
@@ -43,6 +44,7 @@ class Watched:
         self._problems = problems
         self._facts = facts
         self._directory = directory
+        self._hops = HopTimes()
         self._began_s = time.monotonic()
         self._versions = {"macs": installed("macs-zenoh"), "zenoh": installed("eclipse-zenoh")}
 
@@ -66,6 +68,13 @@ class Watched:
                 by_type("macs_agents", "agents online on the mesh", (type_name(agent.type) for agent in directory))
             )
         return [family.bounded() for family in (*families, *self._figures())]
+
+    def histograms(self) -> list[Histogram]:
+        """How long hops took of what was traced, since somebody first asked."""
+        mesh = self._mesh()
+        if mesh is not None:
+            mesh.tracing.on_report = self._hops.take
+        return [self._hops.histogram()]
 
     def problems(self) -> list[str]:
         """Why it is not ready, in words; empty when it is."""

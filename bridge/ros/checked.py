@@ -6,21 +6,24 @@ by the headset.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+from bridge.ros import fields
 from bridge.ros.interface import Drops
 from bridge.ros.rules import Rules
-from bridge.ros.side import NamesAndTypes, Side
-from bridge.ros.types import InterfaceName
+from bridge.ros.types import resolve
 from macs_zenoh.errors import Refused
 
 KNOWN = 4096
 """Names that are remembered as looked at."""
 
+NamesAndTypes = Iterable[tuple[str, list[str]]]
+
 
 class CheckedSettings:
     """What is wrong in the messages of the rules, as far as the graph tells their types. In the ROS thread."""
 
-    def __init__(self, side: Side, rules: Rules, drops: Drops) -> None:
-        self._side = side
+    def __init__(self, rules: Rules, drops: Drops) -> None:
         self._rules = rules
         self._drops = drops
         self._seen: set[tuple[str, str]] = set()
@@ -48,14 +51,11 @@ class CheckedSettings:
 
     def _try(self, name: str, of_type: str, interface: str, message: dict[str, object], what: str) -> None:
         try:
-            parsed = InterfaceName.parse(of_type, interface)
-            kind = (
-                self._side.message(parsed, name) if interface == "msg" else self._side.service(parsed, name).response
-            )
+            kind = resolve(of_type, interface)
         except Refused:  # not installed here: whoever registers it hears that
             return
         try:
-            kind.filled(message, what)
+            fields.filled(kind.Response if interface == "srv" else kind, message, what)
         except Refused as refusal:
             self.wrong[name] = refusal.reason
             self._drops.note("wrong_settings", name, refusal.reason)

@@ -56,6 +56,7 @@ class Observer:
         self._asked_s: dict[int, float] = {}
         self._asking: set[int] = set()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._link = mesh.on_link(self._linked)
 
     async def begin(self) -> None:
         """See who is there, and ask everybody once; nobody hears of that as of something that has changed."""
@@ -79,6 +80,7 @@ class Observer:
 
     def close(self) -> None:
         """Look no more."""
+        self._link.close()
         self._presence.close()
 
     # -- what changes --------------------------------------------------------------------------------------------
@@ -86,6 +88,12 @@ class Observer:
     def _changed(self, changes: list[Change]) -> None:
         at_s = time.time()
         self._tell([event for change in changes for event in self.picture.presence(change, at_s)])
+
+    def _linked(self, up: bool) -> None:
+        if not up and self._mesh.linked:
+            return  # another router is left
+        text = "our own router is back" if up else "our own router is lost: what happens meanwhile is not seen"
+        self._tell([Event(time.time(), "came" if up else "left", "router", text)])
 
     def _tell(self, events: list[Event]) -> None:
         if events and self._began:

@@ -65,6 +65,11 @@ async def test_robots_and_topics_are_asked_from_the_mesh(router: str, monkeypatc
         await until_offered("macs headset 127.0.0.1 sub /", ["/chatter"])
         await until_offered("macs headset 127.0.0.1 pub /", ["/cmd_vel"])
         await until_offered("macs headset 127.0.0.1 call /", ["/set"])
+        await until_offered("macs topic echo /", ["/chatter"])
+        await until_offered("macs topic pub /", ["/cmd_vel"])
+        await until_offered("macs service call /", ["/set"])
+        await until_offered("macs topic hz /x --robot 7,", ["7,12"])
+        await until_offered("macs ping 1", ["12"])
 
 
 async def test_without_a_mesh_nothing_is_offered() -> None:

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import sys
+import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from typing import Any
 import pytest
 from geometry_msgs.msg import PoseStamped, Twist
 from rclpy.action import ActionServer
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
@@ -157,6 +159,46 @@ async def test_rates_sizes_and_ages_are_measured(site: Site) -> None:
     assert json.loads(out.splitlines()[-1])["delay_s"] > 0
 
 
+async def test_age_and_size_are_those_that_rclpy_sees(site: Site) -> None:
+    """Of a stamped topic: what `delay` and `bw` say here, and what a subscription on the robot says."""
+    node, session = site.peer.session.node, site.peer.session
+    publisher = await site.peer.publisher(PoseStamped, "/pose")
+    received = await site.peer.subscription(PoseStamped, "/pose", 1000)
+    ages: list[float] = []
+
+    def publish() -> None:
+        pose = PoseStamped()
+        pose.header.stamp = node.get_clock().now().to_msg()
+        publisher.publish(pose)
+
+    async def talk() -> None:
+        while True:
+            await session.run(publish)
+            stamp = (await get(received)).header.stamp
+            ages.append(time.time() - stamp.sec - stamp.nanosec / 1e9)
+            await asyncio.sleep(0.02)
+
+    talking = asyncio.create_task(talk())
+    try:
+        await site.offered("/pose")
+        began = len(ages)
+        code, out, log = await site.macs("topic", "delay", "/pose", "--count", "50", "--json")
+        assert code == 0, log
+        there = ages[began:]
+        here = json.loads(out.splitlines()[-1])
+        assert here["window"] == 50
+        assert abs(here["delay_s"] - sum(there) / len(there)) < 0.25  # the mesh, and a busy machine
+        assert here["min_s"] > -0.05
+        code, out, log = await site.macs("topic", "bw", "/pose", "--count", "50", "--json")
+        assert code == 0, log
+        size = len(serialize_message(PoseStamped()))
+        here = json.loads(out.splitlines()[-1])
+        assert size <= here["mean_bytes"] <= size + 8  # DDS pads what it carries
+        assert here["bytes_per_s"] == pytest.approx(here["mean_bytes"] * 50 / 1.0, rel=1.0)
+    finally:
+        talking.cancel()
+
+
 async def test_publishing_reaches_ros_and_says_why_not(site: Site) -> None:
     """YAML and JSON arrive; a robot that is stopped refuses with its reason, and the exit code is 1."""
     code, out, log = await site.macs("topic", "pub", "/cmd_vel", "linear: {x: 0.25}", "-1", "--robot", "7")
@@ -232,7 +274,7 @@ async def test_goals_are_given(site: Site, count_action: Any) -> None:
     assert out.endswith("Goal finished with status: SUCCEEDED\n")
     code, out, _ = await site.macs("action", "send", "/count", "to: 1", "--json")
     last = json.loads(out.splitlines()[-1])
-    assert last == {"action": "/count", "robot": 7, "status": "succeeded", "result": {"reached": 1}}
+    assert last == {"action": "/count", "robot": 7, "status": "succeeded", "result": {"reached": 1, "text": ""}}
     assert (await site.macs("stop", "7"))[0] == 0
     code, _, log = await site.macs("action", "send", "/count", "to: 2")
     assert code == 1

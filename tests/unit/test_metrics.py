@@ -13,14 +13,17 @@ import pytest
 
 from bridge.metrics.answers import Answers
 from bridge.metrics.endpoint import parse_address
+from bridge.metrics.exposition import Exposition
 from bridge.metrics.families import OTHERS, by_type, counter, drops, gauge
+from bridge.metrics.hops import HopTimes
 from bridge.metrics.watched import Watched
 from macs_zenoh.errors import UsageError
+from macs_zenoh.protocol.trace import Report
 from tests.support.processes import ROOT
 
 CONFIG = ROOT / "config"
 RULES = CONFIG / "prometheus" / "alerts.yml"
-OF_OTHERS = {"up", "process_cpu_seconds_total", "process_resident_memory_bytes"}
+OF_OTHERS = {"macs_hop_seconds_bucket", "up", "process_cpu_seconds_total", "process_resident_memory_bytes"}
 FIGURE = re.compile(r"\b(macs_[a-z_]+|process_[a-z_]+)\b")
 
 
@@ -80,6 +83,23 @@ def test_figures_are_written_as_prometheus_reads_them() -> None:
     assert body.endswith(b"# EOF\n")
 
 
+def test_hops_of_traced_messages_are_a_histogram() -> None:
+    """A bucket for each bound, all hops of one message, and what a clock gets wrong counts as nothing."""
+    hops = HopTimes()
+    for _ in range(3):
+        points = [("put", 0, "r"), ("sent", 400_000, "r"), ("router", 300_000, "x"), ("in", 5, "g"), ("done", 9, "g")]
+        hops.take(Report(1, 1, "key", "loop", points))
+    made = hops.histogram()
+    assert set(made.rows) == {"into_zenoh", "to_router", "handled"}
+    assert made.rows["into_zenoh"][0][:3] == [0, 3, 0]
+    assert made.rows["into_zenoh"][1] == pytest.approx(0.0012)
+    assert made.rows["to_router"] == ([3] + [0] * 10, 0.0)
+    text = Exposition().write([], [made])[0].decode()
+    assert 'macs_hop_seconds_bucket{hop="into_zenoh",le="0.0005"} 3.0' in text
+    assert 'macs_hop_seconds_bucket{hop="into_zenoh",le="+Inf"} 3.0' in text
+    promtool("check", "metrics", text=text)
+
+
 def test_health_and_diagnostics() -> None:
     """Alive is who answers; not ready says why; all that is known is JSON; what there is not is told."""
     assert answers().answer("/healthz")[:2] == (200, b"ok\n")
@@ -121,7 +141,7 @@ def figures_in_the_code() -> set[str]:
     found = set()
     for path in (ROOT / "bridge").rglob("*.py"):
         text = path.read_text(encoding="utf-8")
-        for kind, name in re.findall(r"\b(counter|gauge|by_type|Family)\(\s*\"(macs_\w+)\"", text):
+        for kind, name in re.findall(r"\b(counter|gauge|by_type|Family|Histogram)\(\s*\"(macs_\w+)\"", text):
             found.add(f"{name}_total" if kind == "counter" else f"{name}_info" if kind == "Family" else name)
     server = (ROOT / "bridge" / "gateway" / "server.py").read_text(encoding="utf-8")
     amounts = server.partition("def amounts")[2].partition("]\n")[0]
