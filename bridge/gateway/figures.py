@@ -67,7 +67,7 @@ def _figures(gateway: Gateway) -> Iterator[Family]:
         sum(each.full for each in online)
     )
     for name, what, amount in gateway.amounts():
-        yield gauge(f"macs_{name}", what).add(amount)
+        yield gauge(name, what).add(amount)
     received, sent = gateway.carried()
     yield (
         counter("macs_agent_bytes", "bytes of agents' sockets")

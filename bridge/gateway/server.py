@@ -204,11 +204,11 @@ class Gateway:
     def amounts(self) -> list[tuple[str, str, int]]:
         """What all connections together have of what is limited: name, what it is, how much."""
         return [
-            ("outbox_bytes", "bytes that wait for agents that read slowly", self._memory.waiting.used),
-            ("unfinished_bytes", "bytes of frames that have begun", self._memory.unfinished.used),
-            ("registered_nodes", "interface nodes that agents have registered", self._nodes.used),
-            ("streams", "topics of robots that somebody here receives", len(self._delivery.streams)),
-            ("waiting_connections", "connections that wait for an id", len(self._waiting) + len(self._coming)),
+            ("macs_outbox_bytes", "bytes that wait for agents that read slowly", self._memory.waiting.used),
+            ("macs_unfinished_bytes", "bytes of frames that have begun", self._memory.unfinished.used),
+            ("macs_registered_nodes", "interface nodes that agents have registered", self._nodes.used),
+            ("macs_streams", "topics of robots that somebody here receives", len(self._delivery.streams)),
+            ("macs_waiting_connections", "connections that wait for an id", len(self._waiting) + len(self._coming)),
         ]
 
     def carried(self) -> tuple[int, int]:

@@ -145,7 +145,7 @@ def figures_in_the_code() -> set[str]:
             found.add(f"{name}_total" if kind == "counter" else f"{name}_info" if kind == "Family" else name)
     server = (ROOT / "bridge" / "gateway" / "server.py").read_text(encoding="utf-8")
     amounts = server.partition("def amounts")[2].partition("]\n")[0]
-    return found | {f"macs_{name}" for name in re.findall(r'\("(\w+)", "', amounts)}
+    return found | set(re.findall(r'\("(\w+)", "', amounts))
 
 
 def dashboard_expressions(value: Any) -> list[str]:
