@@ -40,6 +40,8 @@ NAMES = (
     "doctor",
     "security",
     "conformance",
+    "record",
+    "bag",
     "audit",
     "token",
     "init",

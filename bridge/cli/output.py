@@ -12,11 +12,13 @@ import io
 import json
 import logging
 import os
+import shutil
 import sys
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
-from macs_zenoh.plain import plain_json, plain_lines
+from macs_zenoh.plain import plain, plain_json, plain_lines
 
 
 class OutputLost(Exception):
@@ -97,6 +99,24 @@ def note(text: str) -> None:
     with suppress(OSError, ValueError):
         sys.stderr.write(plain_lines(text) + "\n")
         sys.stderr.flush()
+
+
+@contextmanager
+def status_line() -> Iterator[Callable[[str], None]]:
+    """One line on a terminal's stderr that is written over again and again, and gone in the end; elsewhere nothing."""
+    if not sys.stderr.isatty():
+        yield lambda text: None
+        return
+
+    def write(text: str) -> None:
+        with suppress(OSError, ValueError):
+            sys.stderr.write(f"\r\x1b[K{plain(text)[: shutil.get_terminal_size().columns - 1]}")
+            sys.stderr.flush()
+
+    try:
+        yield write
+    finally:
+        write("")
 
 
 def as_json(value: Any) -> str:

@@ -17,6 +17,9 @@ It is TOML with up to five sections and a list of rules, one struct each::
     [operator]                               # OperatorSettings: `macs ls`, `macs stop`, `macs doctor`
     id = 5
 
+    [record]                                 # RecordSettings: `macs record`
+    on = ["stop", "deadman"]
+
     [[traffic]]                              # TrafficRule: every program that sends
     match = "macs/from/ros/*/nd__camera$*"
     max_hz = 10
@@ -38,6 +41,8 @@ from macs_zenoh.sections import read, read_text, toml
 from .awareness import AwarenessSettings
 from .gateway import GatewaySettings
 from .operator import OperatorSettings
+from .rmw_zenoh import RmwZenohRobot, RmwZenohSettings
+from .record import RecordSettings
 from .robot import ROBOT_HIDES, WHO_STOPPED, RobotSettings, TopicRule
 
 __all__ = [
@@ -46,6 +51,9 @@ __all__ = [
     "AwarenessSettings",
     "GatewaySettings",
     "OperatorSettings",
+    "RmwZenohRobot",
+    "RmwZenohSettings",
+    "RecordSettings",
     "RobotSettings",
     "Settings",
     "TopicRule",
@@ -62,6 +70,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     robot: RobotSettings = RobotSettings()
     awareness: AwarenessSettings = AwarenessSettings()
     operator: OperatorSettings = OperatorSettings()
+    record: RecordSettings = RecordSettings()
     traffic: list[TrafficRule] = []
 
 

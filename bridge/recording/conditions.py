@@ -1,0 +1,116 @@
+"""What robots say of themselves, as events: a robot's whole state when it has changed, and what of it has. Pure."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import msgspec
+from msgspec import UNSET
+
+from bridge.recording.streams import CONTROL, DEADMAN, DROPS, STATUS, STOPS
+from macs_zenoh.protocol.robot_state import NodeStatus, RobotStatus
+
+STOP, DEAD_MAN = "stop", "deadman"
+"""What a ring is written for."""
+TRIGGERS = (STOP, DEAD_MAN)
+
+
+class Event(NamedTuple):
+    """Something that is recorded as JSON: on which channel, what, under which name it is the newest, and which trigger
+    it is, if it is one."""
+
+    channel: str
+    value: dict[str, Any]
+    keep: str = ""
+    trigger: str = ""
+
+
+class Condition:
+    """One robot's."""
+
+    def __init__(self, robot: int) -> None:
+        self._robot = robot
+        self._last: RobotStatus | None = None
+        self._stable: object = None
+
+    def tell(self, status: RobotStatus) -> list[Event]:
+        """The robot says how it is now: what is new in it. Times that only run on are not."""
+        stable = _stable(status)
+        if stable == self._stable:
+            return []
+        before, self._last, self._stable = self._last, status, stable
+        events = [self._event(STATUS, {"status": msgspec.to_builtins(status)}, keep="status")]
+        events += self._stops(before, status)
+        events += self._nodes(before, status)
+        events += self._drops(before, status)
+        return events
+
+    def _stops(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
+        was = (before.stopped, before.stop.times, before.stop.pressed) if before else (False, now.stop.times, [])
+        if was == (now.stopped, now.stop.times, now.stop.pressed):
+            return []
+        value = {
+            "stopped": now.stopped,
+            "by": now.stop.by,
+            "pressed": now.stop.pressed,
+            "times": now.stop.times,
+            "history": now.stop.history,
+        }
+        is_new = now.stop.times > was[1] or (now.stopped and not was[0])
+        return [self._event(STOPS, value, keep="stop", trigger=STOP if is_new and before is not None else "")]
+
+    def _nodes(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
+        events = []
+        known = {(node.role, node.name): node for node in before.nodes} if before is not None else {}
+        for node in now.nodes:
+            old = known.get((node.role, node.name))
+            holder, held = _holder(node), _holder(old) if old is not None else None
+            if holder != held:
+                who = {"topic": node.name, "holder": holder, "before": held}
+                events.append(self._event(CONTROL, who, keep=f"control {node.name}"))
+            if node.deadman is not UNSET:
+                trips = old.deadman.trips if old is not None and old.deadman is not UNSET else 0
+                if node.deadman.trips > trips:
+                    value = {"topic": node.name, "trips": node.deadman.trips, "why": node.deadman.last}
+                    trigger = DEAD_MAN if before is not None else ""
+                    events.append(self._event(DEADMAN, value, trigger=trigger))
+        return events
+
+    def _drops(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
+        was = before.drops if before is not None else {}
+        more = {name: count - was.get(name, 0) for name, count in now.drops.items() if count != was.get(name, 0)}
+        return [self._event(DROPS, {"more": more, "in_all": now.drops})] if more else []
+
+    def _event(self, channel: str, value: dict[str, Any], *, keep: str = "", trigger: str = "") -> Event:
+        name = f"{channel} {self._robot} {keep}" if keep else ""
+        return Event(channel, {"robot": self._robot, **value}, name, trigger)
+
+
+def stop_topic(status: RobotStatus) -> str:
+    """The topic of a robot's emergency stop; empty for none."""
+    return next((node.name for node in status.nodes if node.role == "emergency stop"), "")
+
+
+def _holder(node: NodeStatus) -> str | None:
+    return node.control.holder if node.control is not UNSET else None
+
+
+def _stable(status: RobotStatus) -> object:
+    """What of a state is no time that runs."""
+    nodes = []
+    for node in status.nodes:
+        deadman = node.deadman if node.deadman is not UNSET else None
+        goals = node.goals if node.goals is not UNSET else []
+        nodes.append(
+            (
+                node.role,
+                node.name,
+                node.type,
+                sorted(node.registrants),
+                _holder(node),
+                (deadman.silence_s, deadman.commander, deadman.trips, deadman.last) if deadman else None,
+                [(goal.goal, goal.status, goal.owner, goal.finished) for goal in goals],
+            )
+        )
+    stop = status.stop
+    return (status.ros_node, status.stopped, stop.by, stop.pressed, stop.times, nodes, status.drops, status.ros_domain)

@@ -1,0 +1,184 @@
+"""The topics of one robot, as a recording hears them.
+
+It registers as any headset does, so the robot's uplink carries one copy, whether a gateway has asked for it or not.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterator
+
+from bridge.recording.disk import Entry, Sink, now_ns
+from bridge.recording.schema_source import Schemas
+from bridge.recording.streams import Channel, robot_channel
+from macs_zenoh.agent import Agent
+from macs_zenoh.errors import MacsError, Refused, WireError
+from macs_zenoh.mesh import Sample
+from macs_zenoh.nodes import Nodes
+from macs_zenoh.protocol.directory import AgentInfo, Change
+from macs_zenoh.protocol.keyexpr import STREAM
+from macs_zenoh.protocol.limits import ANSWER_BYTES
+from macs_zenoh.protocol.messages import ROS, decode_data, node_name
+from macs_zenoh.protocol.offers import short_type
+from macs_zenoh.protocol.robot_state import Offered, TopicQos
+from macs_zenoh.protocol.schemas import full_type
+from macs_zenoh.protocol.wire import Layout, parse_frames
+from macs_zenoh.topics import TopicMessage, TopicSubscription
+
+log = logging.getLogger("macs.record")
+
+OFFERS_STREAM = "_offers"
+"""Where a robot says what it offers, whenever that changes."""
+DEPTH = 200
+"""Messages that the robot may hold for a recording, where it is the first to register."""
+LARGE_DEPTH = 10
+"""The same of types that are large."""
+LARGE = ("Image", "PointCloud", "CompressedVideo", "OccupancyGrid", "Map")
+AGAIN_S = 2.0
+"""Pause between attempts where a robot does not say what it has."""
+PATIENCE_S = 20.0
+"""How long a registration may take."""
+OnNote = Callable[[dict[str, object]], None]
+
+
+class RobotFollower:
+    """Follows one robot while it is online. ``wants(topic)`` says which topics; ``carried_out``: also those that only
+    others than the robot's nodes publish to, where its commands are seen as it carried them out."""
+
+    def __init__(
+        self,
+        agent: Agent,
+        robot: int,
+        sink: Sink,
+        schemas: Schemas,
+        *,
+        wants: Callable[[str], bool],
+        carried_out: bool,
+        on_note: OnNote,
+        on_stop_state: Callable[[], None],
+    ) -> None:
+        self.robot = robot
+        self.offered = Offered()
+        self.subscriptions: dict[str, TopicSubscription] = {}
+        self.refused: dict[str, str] = {}
+        self._agent = agent
+        self._sink = sink
+        self._schemas = schemas
+        self._wants = wants
+        self._carried_out = carried_out
+        self._on_note = on_note
+        self._on_stop_state = on_stop_state
+        self._layout = Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots)
+        self._nodes = Nodes(agent, self._layout)
+        self._following: dict[str, asyncio.Task[None]] = {}
+        self._stop_topic = ""
+        key = STREAM.of(type=ROS, id=robot, node=OFFERS_STREAM)
+        self._stream = agent.mesh.subscribe(key, self._heard)
+        self._asking = asyncio.get_running_loop().create_task(self._ask())
+
+    def presence(self, agent: AgentInfo, online: bool) -> None:
+        """Somebody came or left."""
+        self._nodes.presence(Change(agent, online))
+
+    def id_changed(self, old: int, new: int) -> None:
+        """The recording has another id."""
+        self._nodes.id_changed((self._agent.type_number, old), new)
+
+    def close(self) -> None:
+        """Follow no more: the robot is told."""
+        self._asking.cancel()
+        for task in self._following.values():
+            task.cancel()
+        self._stream.close()
+        for subscription in list(self.subscriptions.values()):
+            subscription.close()
+        self._nodes.close()
+
+    def topic_of(self, node: str) -> str:
+        """The topic or service behind the name of an interface node, as well as it can be known."""
+        offered = self.offered
+        for table in (offered.subscribers, offered.publishers, offered.services, offered.actions):
+            for name in table:
+                if node_name(name) == node:
+                    return name
+        return "/" + node.removeprefix("nd_").removeprefix("_")
+
+    def stop_topic(self, topic: str) -> None:
+        """The robot's emergency stop is on this topic: its state is heard at once."""
+        if topic and topic != self._stop_topic:
+            self._stop_topic = topic
+            self._follow(topic, "std_msgs/msg/Bool", TopicQos("reliable", "transient_local"), self._on_stop_state)
+
+    # -- what it has ---------------------------------------------------------------------------------------------
+
+    async def _ask(self) -> None:
+        while True:
+            try:
+                answer = await self._agent.call(ROS, self.robot, "offers", timeout_s=PATIENCE_S)
+                self._take(decode_data(Offered, answer, ANSWER_BYTES))
+                return
+            except MacsError as error:
+                log.debug("ros/%d does not say what it offers: %s", self.robot, error)
+            await asyncio.sleep(AGAIN_S)
+
+    def _heard(self, batch: Iterator[Sample]) -> None:
+        for _, payload in batch:
+            try:
+                for frame in parse_frames(payload, self._layout):
+                    self._take(decode_data(Offered, frame.body, ANSWER_BYTES))
+            except WireError as error:
+                log.warning("what ros/%d says that it offers cannot be read: %s", self.robot, error)
+
+    def _take(self, offered: Offered) -> None:
+        self.offered = offered
+        topics = dict(offered.publishers)
+        if self._carried_out:
+            topics = {**offered.subscribers, **topics}
+        for topic, of_type in topics.items():
+            if self._wants(topic):
+                self._follow(topic, of_type, offered.qos.get(topic, TopicQos()))
+
+    def _follow(self, topic: str, of_type: str, qos: TopicQos, on_message: Callable[[], None] | None = None) -> None:
+        if topic in self._following:
+            return
+        loop = asyncio.get_running_loop()
+        self._following[topic] = loop.create_task(self._subscribe(topic, of_type, qos, on_message))
+
+    async def _subscribe(self, topic: str, of_type: str, qos: TopicQos, on_message: Callable[[], None] | None) -> None:
+        try:
+            schema = await self._schemas.of(self.robot, full_type(of_type))
+            depth = LARGE_DEPTH if any(word in of_type for word in LARGE) else DEPTH
+            subscription = await self._nodes.subscribe(topic, self.robot, (), short_type(of_type), depth, PATIENCE_S)
+        except Refused as refusal:
+            self._not_recorded(topic, refusal.reason)
+            return
+        except MacsError as error:
+            self._not_recorded(topic, str(error))
+            await asyncio.sleep(AGAIN_S)
+            self._following.pop(topic, None)
+            if not self._asking.done() or topic in {*self.offered.publishers, *self.offered.subscribers}:
+                self._follow(topic, of_type, qos, on_message)
+            return
+        self.refused.pop(topic, None)
+        self.subscriptions[topic] = subscription
+        subscription.on_refused(lambda _, reason: self._not_recorded(topic, reason))
+        channel = robot_channel(self.robot, topic, of_type, schema.text, schema.hash, qos)
+        subscription.on_message(self._taking(channel, on_message))
+
+    def _taking(self, channel: Channel, on_message: Callable[[], None] | None) -> Callable[[TopicMessage], None]:
+        put, keep = self._sink.put, channel.topic if channel.latched else ""
+
+        def take(message: TopicMessage) -> None:
+            data = message.data
+            put(Entry(channel, channel.next(len(data)), now_ns(), data, keep))
+            if on_message is not None:
+                on_message()
+
+        return take
+
+    def _not_recorded(self, topic: str, reason: str) -> None:
+        if self.refused.get(topic) != reason:
+            self.refused[topic] = reason
+            log.warning("/%d%s is not recorded: %s", self.robot, topic, reason)
+            self._on_note({"robot": self.robot, "topic": topic, "not_recorded": reason})

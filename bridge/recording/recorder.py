@@ -1,0 +1,284 @@
+"""Records a mesh: follows who is there, hears robots and headsets, and gives all of it to a sink. Asyncio."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from bridge.recording.conditions import Condition, Event, stop_topic
+from bridge.recording.disk import Entry, Sink, now_ns
+from bridge.recording.follower import RobotFollower
+from bridge.recording.schema_source import Schemas
+from bridge.recording.streams import CDR, JSON, MESSAGES, NOTES, OFFERS, PRESENCE, Channel, command_topic
+from bridge.recording.traffic import Said, Sent, Traffic
+from macs_zenoh.agent import Agent
+from macs_zenoh.errors import MacsError, Unreachable, WireError
+from macs_zenoh.mesh import Sample
+from macs_zenoh.protocol.directory import AgentInfo
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST, block_of
+from macs_zenoh.protocol.limits import ANSWER_BYTES
+from macs_zenoh.protocol.messages import ROS, decode_data
+from macs_zenoh.protocol.name_patterns import matches
+from macs_zenoh.protocol.robot_state import RobotStatus
+from macs_zenoh.protocol.schemas import full_type
+from macs_zenoh.protocol.wire import Layout
+
+log = logging.getLogger("macs.record")
+
+STATUS_S = 1.0
+"""How often a robot is asked how it is; its stop is heard at once."""
+WITHOUT_STATUS_S = 30.0
+"""The same of one that has not answered: an existing program."""
+EARLY = 4096
+"""So many commands wait for the schema of their type."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is recorded.
+
+    Attributes:
+        robots: their ids; none: all.
+        topics: patterns of topics' names; none: all.
+        commands: what is sent to robots as commands and calls, what they answer and refuse, and the topics that they
+            carry commands out on.
+        headsets: plain messages between agents as well.
+    """
+
+    robots: frozenset[int] = frozenset()
+    topics: tuple[str, ...] = ()
+    commands: bool = False
+    headsets: bool = False
+
+    def robot(self, robot: int) -> bool:
+        """Whether this robot is wanted."""
+        return not self.robots or robot in self.robots
+
+    def topic(self, topic: str) -> bool:
+        """Whether this topic is wanted."""
+        return not self.topics or any(matches(pattern, topic) for pattern in self.topics)
+
+
+class Recorder:
+    """One recording of a mesh, from `start` to `close`. ``on_trigger(name, about)`` hears of stops and dead-men."""
+
+    def __init__(
+        self,
+        agent: Agent,
+        sink: Sink,
+        wanted: Wanted,
+        on_trigger: Callable[[str, dict[str, Any]], None] = lambda name, about: None,
+    ) -> None:
+        self.agent = agent
+        self.robots: dict[int, RobotFollower] = {}
+        self._sink = sink
+        self._wanted = wanted
+        self._on_trigger = on_trigger
+        self._schemas = Schemas(agent)
+        self._json: dict[str, Channel] = {}
+        self._commands: dict[tuple[str, str, str, str], Channel | None] = {}
+        self._early: deque[tuple[Sent, int]] = deque()
+        self._watching: dict[int, asyncio.Task[None]] = {}
+        self._asked: dict[int, asyncio.Event] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._subscribed: list[Any] = []
+        layout = Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots)
+        self._traffic = Traffic(layout, self._bad)
+        self._bad_frames = 0
+        self._lost_before: Counter[str] = Counter()
+
+    def start(self) -> None:
+        """Record from now on."""
+        if self._wanted.commands or self._wanted.headsets:
+            for key in self._keys():
+                self._subscribed.append(self.agent.mesh.subscribe(key, self._heard))
+        self.agent.on_presence(self._presence)
+        self.agent.on_id(self._id_changed)
+
+    def close(self) -> None:
+        """Hear no more; robots are told."""
+        for task in [*self._watching.values(), *self._tasks]:
+            task.cancel()
+        for subscription in self._subscribed:
+            subscription.close()
+        for follower in self.robots.values():
+            follower.close()
+        self.robots.clear()
+
+    @property
+    def topics(self) -> int:
+        """How many topics are recorded now."""
+        return sum(len(follower.subscriptions) for follower in self.robots.values())
+
+    def losses(self) -> Counter[str]:
+        """What was lost here since this was asked last, by name, before it could be recorded."""
+        now = Counter(self.agent.drops) + Counter(self.agent.mesh.drops) + Counter(bad_frame=self._bad_frames)
+        more = now - self._lost_before
+        self._lost_before = now
+        return more
+
+    def note(self, value: dict[str, Any]) -> None:
+        """Something to know about the recording itself."""
+        self._put(Event(NOTES, value))
+
+    # -- who is there --------------------------------------------------------------------------------------------
+
+    def _presence(self, agent: AgentInfo, online: bool) -> None:
+        is_me = agent.zid == self.agent.mesh.zid
+        about = {
+            "agent": str(agent.key),
+            "group": agent.group,
+            "online": online,
+            "session": agent.zid,
+            "epoch": agent.epoch,
+        }
+        if is_me:
+            about["recorder"] = True
+        self._put(Event(PRESENCE, about, keep=f"{PRESENCE} {agent.key}"))
+        for follower in self.robots.values():
+            follower.presence(agent, online)
+        if agent.type != ROS or not self._wanted.robot(agent.id):
+            return
+        if online and agent.id not in self.robots:
+            self._follow(agent.id)
+        elif online:
+            self._asked[agent.id].set()
+        elif not online:
+            self._schemas.forget(agent.id)
+
+    def _follow(self, robot: int) -> None:
+        asked = self._asked[robot] = asyncio.Event()
+        self.robots[robot] = RobotFollower(
+            self.agent,
+            robot,
+            self._sink,
+            self._schemas,
+            wants=self._wanted.topic,
+            carried_out=self._wanted.commands,
+            on_note=self.note,
+            on_stop_state=asked.set,
+        )
+        self._watching[robot] = asyncio.get_running_loop().create_task(self._watch(robot))
+
+    def _id_changed(self, old: int, new: int) -> None:
+        for follower in self.robots.values():
+            follower.id_changed(old, new)
+
+    async def _watch(self, robot: int) -> None:
+        """Ask a robot how it is, for as long as this recording goes on."""
+        condition, asked, offered = Condition(robot), self._asked[robot], None
+        pause_s = STATUS_S
+        while True:
+            asked.clear()
+            if (ROS, robot) in self.agent.directory:
+                try:
+                    answer = await self.agent.call(ROS, robot, "status", timeout_s=5.0)
+                    status = decode_data(RobotStatus, answer, ANSWER_BYTES)
+                    for event in condition.tell(status):
+                        self._put(event)
+                    self.robots[robot].stop_topic(stop_topic(status))
+                    pause_s = STATUS_S
+                except Unreachable as error:
+                    log.debug("ros/%d does not say how it is: %s", robot, error)
+                    pause_s = WITHOUT_STATUS_S
+                except MacsError as error:
+                    log.debug("ros/%d: %s", robot, error)
+            if self.robots[robot].offered is not offered:
+                offered = self.robots[robot].offered
+                told = {"robot": robot, "offers": msgspec.to_builtins(offered)}
+                self._put(Event(OFFERS, told, keep=f"{OFFERS} {robot}"))
+            waiting = asyncio.ensure_future(asked.wait())
+            await asyncio.wait([waiting], timeout=pause_s)
+            waiting.cancel()
+
+    # -- what is said --------------------------------------------------------------------------------------------
+
+    def _keys(self) -> list[str]:
+        """What is sent to robots and by robots, and what agents say to each other."""
+        keys = [BROADCAST.every()] if self._wanted.headsets else []
+        if not self._wanted.robots:
+            to_robots = [UNICAST.every(type=ROS)]
+            by_robots = [UNICAST.every(type="unity", from_type=ROS)]
+        else:
+            robots = sorted(self._wanted.robots)
+            to_robots = [UNICAST.every(type=ROS, block=block_of(robot), id=robot) for robot in robots]
+            by_robots = [UNICAST.every(type="unity", from_type=ROS, from_id=robot) for robot in robots]
+        others = [UNICAST.every(type="unity")] if self._wanted.headsets else []
+        groups = GROUP.every() if self._wanted.headsets else GROUP.every(type=ROS)
+        return [*keys, *to_robots, groups, *(others or by_robots)]
+
+    def _heard(self, batch: Iterator[Sample]) -> None:
+        for key, payload in batch:
+            for what in self._traffic.read(key, payload):
+                if isinstance(what, Sent):
+                    self._command(what, now_ns())
+                elif self._wanted.headsets or what.channel != MESSAGES:
+                    self._say(what)
+
+    def _say(self, said: Said) -> None:
+        self._put(Event(said.channel, said.value))
+
+    def _bad(self, key: str, error: WireError) -> None:
+        self._bad_frames += 1
+        log.debug("a frame on %s cannot be read: %s", key, error)
+
+    def _command(self, sent: Sent, log_ns: int) -> None:
+        known = (sent.sender, sent.to, sent.node, sent.type)
+        channel = self._commands.get(known)
+        if channel is not None:
+            self._put_command(channel, sent, log_ns)
+            return
+        if len(self._early) >= EARLY:
+            self._early.popleft()
+            self._bad_frames += 1
+        self._early.append((sent, log_ns))
+        if known not in self._commands:
+            self._commands[known] = None
+            task = asyncio.get_running_loop().create_task(self._open_command(known, sent))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+    def _put_command(self, channel: Channel, sent: Sent, log_ns: int) -> None:
+        data = sent.data
+        if channel.encoding == JSON:
+            data = msgspec.json.encode({"type": sent.type, "bytes": len(data), "data": data})
+        self._sink.put(Entry(channel, channel.next(len(data)), log_ns, data))
+
+    async def _open_command(self, known: tuple[str, str, str, str], sent: Sent) -> None:
+        """Make the channel of commands like this one, and record those that waited for it."""
+        robots = [self.robots[int(sent.to)]] if sent.to.isdigit() and int(sent.to) in self.robots else []
+        robots += [follower for follower in self.robots.values() if follower not in robots]
+        topic = robots[0].topic_of(sent.node) if robots else "/" + sent.node.removeprefix("nd_").removeprefix("_")
+        metadata = {"robot": sent.to, "sender": sent.sender, "as": "sent", "topic": topic, "node": sent.node}
+        name, of_type = command_topic(sent.sender, sent.to, topic), full_type(sent.type)
+        channel = Channel(name, JSON, metadata=metadata)
+        for follower in robots:
+            try:
+                schema = await self._schemas.of(follower.robot, of_type)
+            except MacsError:
+                continue
+            metadata |= {"topic_type_hash": schema.hash, "offered_qos_profiles": ""}
+            channel = Channel(name, CDR, of_type, schema.text, metadata)
+            break
+        self._commands[known] = channel
+        waiting, self._early = self._early, deque()
+        for early, log_ns in waiting:
+            if (early.sender, early.to, early.node, early.type) == known:
+                self._put_command(channel, early, log_ns)
+            else:
+                self._early.append((early, log_ns))
+
+    def _put(self, event: Event) -> None:
+        channel = self._json.get(event.channel)
+        if channel is None:
+            channel = self._json[event.channel] = Channel(event.channel, metadata={"recorder": str(self.agent.key)})
+        data = msgspec.json.encode(event.value)
+        self._sink.put(Entry(channel, channel.next(len(data)), now_ns(), data, event.keep))
+        if event.trigger:
+            self._on_trigger(event.trigger, event.value)

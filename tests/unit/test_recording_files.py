@@ -1,0 +1,549 @@
+"""Recordings as files: what is written is read by others, mended, merged and cut, with bounded memory."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import resource
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mcap", reason="needs the extra record: pip install 'macs-zenoh[record]'")
+
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from bridge.recording import repair as repairing
+from bridge.recording.bag import BadBag, Bag, Unfinished
+from bridge.recording.copying import cut, merge
+from bridge.recording.disk import Disk, Entry, Plan
+from bridge.recording.mcap_file import COMPRESSIONS, McapFile
+from bridge.recording.ring import Ring
+from bridge.recording.rosbag2 import ros_name, to_rosbag2
+from bridge.recording.streams import (
+    CDR,
+    JSON,
+    Channel,
+    command_topic,
+    qos_of,
+    qos_text,
+    robot_channel,
+    robot_topic,
+    split_topic,
+)
+from macs_zenoh.errors import ConfigError
+from macs_zenoh.protocol.robot_state import TopicQos
+from tests.support.programs import ROOT
+
+S = 1_000_000_000
+BEGIN = 1_700_000_000 * S
+STRING = "string data\n"
+
+
+def cdr(text: str) -> bytes:
+    """std_msgs/String."""
+    data = text.encode() + b"\0"
+    return b"\x00\x01\x00\x00" + struct.pack("<I", len(data)) + data
+
+
+def string_channel(robot: int = 7, topic: str = "/chatter", durability: str = "volatile") -> Channel:
+    return robot_channel(robot, topic, "std_msgs/msg/String", STRING, "", TopicQos("reliable", durability))
+
+
+def entries(channel: Channel, count: int, *, start: int = BEGIN, step: int = S // 100) -> Iterator[Entry]:
+    """Numbered texts, one each hundredth of a second unless said otherwise."""
+    for number in range(count):
+        data = cdr(f"message {number}")
+        yield Entry(channel, channel.next(len(data)), start + number * step, data)
+
+
+def write(path: Path, count: int = 1000, *, channel: Channel | None = None, **options: object) -> Path:
+    """A finished file."""
+    file = McapFile(path, **options)  # type: ignore[arg-type]
+    _fill(file, channel or string_channel(), count)
+    file.close()
+    return path
+
+
+def _fill(file: McapFile, channel: Channel, count: int, start: int = BEGIN) -> None:
+    schema = file.schema(channel.type, "ros2msg", channel.schema.encode())
+    number = file.channel(channel.topic, channel.encoding, schema, channel.metadata)
+    for entry in entries(channel, count, start=start):
+        file.add(number, entry.sequence, entry.log_ns, entry.log_ns, entry.data)
+
+
+def texts(bag: Bag, **options: int) -> list[bytes]:
+    return [message.data for message in bag.messages(**options)]
+
+
+# -- names -----------------------------------------------------------------------------------------------------------
+
+
+def test_names_of_channels() -> None:
+    """A robot's topic is found in a channel's name; commands, JSON channels and others' names are no robot's."""
+    assert robot_topic(7, "/camera/image") == "/7/camera/image"
+    assert split_topic("/7/camera/image") == (7, "/camera/image")
+    for name in ("/macs/presence", command_topic("unity/256", "7", "/cmd_vel"), "/7", "/", "", "/7777777/x"):
+        assert split_topic(name) is None, name
+    assert command_topic("unity/256", "7", "/cmd_vel") == "/sent/unity/256/7/cmd_vel"
+    assert ros_name("/7/camera") == "/robot_7/camera"
+    assert ros_name("/sent/unity/256/7/cmd_vel") == "/sent/unity/id_256/id_7/cmd_vel"
+
+
+@pytest.mark.parametrize("reliability", ["reliable", "best_effort"])
+@pytest.mark.parametrize("durability", ["volatile", "transient_local"])
+def test_qos_in_metadata(reliability: str, durability: str) -> None:
+    """What rosbags reads of our QoS is what was said, and we read what others write in words."""
+    from rosbags.rosbag2.metadata import parse_qos
+
+    qos = TopicQos(reliability, durability)
+    (read,) = parse_qos(qos_text(qos))
+    assert (read.reliability.name.lower(), read.durability.name.lower()) == (reliability, durability)
+    assert qos_of({"offered_qos_profiles": qos_text(qos)}) == qos
+    words = f"- history: keep_last\n  reliability: {reliability}\n  durability: {durability}\n  depth: 1"
+    assert qos_of({"offered_qos_profiles": words}) == qos
+
+
+# -- one file --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_others_read_what_is_written(tmp_path: Path, compression: str) -> None:
+    """mcap's own reader, with all checksums, and rosbags find each message, its times, number and bytes."""
+    path = write(tmp_path / "a.mcap", 3000, compression=compression, chunk_bytes=10_000)
+    expected = [cdr(f"message {number}") for number in range(3000)]
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 3000
+        assert len(summary.chunk_indexes) > 5
+        found = list(reader.iter_messages())
+    assert [message.data for _, _, message in found] == expected
+    assert [message.sequence for _, _, message in found] == list(range(1, 3001))
+    assert {channel.topic for _, channel, _ in found} == {"/7/chatter"}
+    assert {channel.metadata["robot"] for _, channel, _ in found} == {"7"}
+    with AnyReader([path]) as any_reader:
+        assert [bytes(data) for _, _, data in any_reader.messages()] == expected
+        assert any_reader.deserialize(expected[5], "std_msgs/msg/String").data == "message 5"  # type: ignore[attr-defined]
+    with Bag(path) as bag:
+        assert texts(bag) == expected
+        assert (bag.start_ns, bag.end_ns) == (BEGIN, BEGIN + 2999 * S // 100)
+        assert texts(bag, start_ns=BEGIN + 10 * S, end_ns=BEGIN + 11 * S) == expected[1000:1100]
+
+
+def test_others_files_are_read(tmp_path: Path) -> None:
+    """Files of mcap's own writer, with chunks and without, channels in chunks, and messages out of order."""
+    from mcap.writer import CompressionType, Writer
+
+    for number, (chunks, compression) in enumerate(itertools.product((True, False), CompressionType)):
+        path = tmp_path / f"{number}.mcap"
+        with path.open("wb") as stream:
+            writer = Writer(stream, chunk_size=500, compression=compression, use_chunking=chunks)
+            writer.start(profile="ros2", library="another")
+            schema = writer.register_schema("std_msgs/msg/String", "ros2msg", STRING.encode())
+            channel = writer.register_channel("/a", "cdr", schema)
+            for at in range(100):
+                time_ns = BEGIN + (at ^ 3) * S  # each four the other way round
+                writer.add_message(channel, time_ns, cdr(str(at)), time_ns, at)
+            writer.finish()
+        with Bag(path) as bag:
+            times = [message.log_ns for message in bag.messages()]
+            assert len(times) == 100
+            assert times == sorted(times) or not chunks
+            assert bag.library.startswith("another")
+        assert repairing.problems(path) == []
+
+
+def test_chunks_that_overlap_are_read_by_time(tmp_path: Path) -> None:
+    """However chunks lie over each other, messages come by time, and only so much is kept in memory."""
+    file = McapFile(tmp_path / "a.mcap", compression="none")
+    channel = file.channel("/a", "json", 0, {})
+    for start in range(50):
+        for step in range(20):
+            file.add(channel, 0, BEGIN + (start + 50 * step) * S, 0, b"x" * 1000)
+        file.flush()
+    file.close()
+    with Bag(tmp_path / "a.mcap", cache_bytes=50_000) as bag:
+        times = [message.log_ns for message in bag.messages()]
+        assert times == [BEGIN + number * S for number in range(1000)]
+        assert not bag._cache
+
+
+def test_nothing_is_written_over(tmp_path: Path) -> None:
+    """A file that exists stays what it is."""
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"mine")
+    with pytest.raises(FileExistsError):
+        McapFile(path)
+    with pytest.raises(ConfigError, match="nothing is written over"):
+        Disk(Plan(path)).start()
+    assert path.read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        (b"", BadBag),
+        (b"text", BadBag),
+        (b"\x89MCAP0\r\n", BadBag),
+        (b"\x89MCAP0\r\n\x01\xff\xff\xff\xff\xff\xff\xff\x7f", BadBag),
+        (b"\x89MCAP0\r\n" + b"\x01" + struct.pack("<Q", 8) + bytes(8), Unfinished),
+    ],
+)
+def test_what_is_no_recording_is_told(tmp_path: Path, content: bytes, error: type[Exception]) -> None:
+    """One line says what is wrong with a file, and nothing that it declares is believed."""
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    with pytest.raises(error) as raised:
+        Bag(path)
+    assert str(path) in str(raised.value)
+
+
+def test_every_damaged_byte_is_survived(tmp_path: Path) -> None:
+    """Any byte of a small file may be another: reading and mending it end with an error of ours or with messages."""
+    whole = write(tmp_path / "a.mcap", 20, compression="zstd").read_bytes()
+    path = tmp_path / "b.mcap"
+    for at in range(len(whole)):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :])
+        try:
+            with Bag(path) as bag:
+                assert len(texts(bag)) <= 20
+        except BadBag:
+            pass
+        out = tmp_path / "c.mcap"
+        try:
+            repairing.repair(path, out)
+        except BadBag:
+            assert at < 17  # it is no MCAP file then, or has a header whose length is wrong
+        else:
+            found = repairing.problems(out)
+            assert all("schema" in problem for problem in found), (at, found)
+            out.unlink()
+
+
+def test_a_chunk_that_grows_without_end_is_refused(tmp_path: Path) -> None:
+    """What a chunk says of its size bounds what is made of it."""
+    import zstandard
+
+    from bridge.recording.bag import decompressed
+
+    bomb = zstandard.ZstdCompressor().compress(bytes(100 << 20))
+    for size in (1000, 1 << 40):
+        with pytest.raises(ValueError, match=r"size|bytes"):
+            decompressed(bomb, "zstd", size)
+    import lz4.frame
+
+    with pytest.raises(ValueError, match="bytes"):
+        decompressed(lz4.frame.compress(bytes(100 << 20)), "lz4", 1000)
+
+
+# -- killed, damaged, full -------------------------------------------------------------------------------------------
+
+
+def test_a_file_that_is_cut_anywhere_is_mended(tmp_path: Path) -> None:
+    """All messages before the cut are there, those of the chunk that was cut as far as they go."""
+    whole = write(tmp_path / "a.mcap", 2000, compression="none", chunk_bytes=20_000).read_bytes()
+    with Bag(tmp_path / "a.mcap") as bag:
+        ends = [chunk.offset + chunk.length for chunk in bag.chunks]
+        counts = [len(texts(bag, end_ns=chunk.end_ns + 1)) for chunk in bag.chunks]
+    path, out = tmp_path / "b.mcap", tmp_path / "c.mcap"
+    for at in [*ends, *(end - 5000 for end in ends), *(end + 3 for end in ends), len(whole) - 40]:
+        path.write_bytes(whole[:at])
+        with pytest.raises(Unfinished, match="macs bag repair"):
+            Bag(path)
+        done = repairing.repair(path, out)
+        least = max((count for end, count in zip(ends, counts, strict=True) if end <= at), default=0)
+        assert done.messages >= least
+        assert repairing.problems(out) == []
+        with Bag(out) as bag:
+            assert texts(bag) == [cdr(f"message {number}") for number in range(done.messages)]
+        out.unlink()
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_compressed_chunk_that_is_cut_is_kept_as_far_as_it_goes(tmp_path: Path, compression: str) -> None:
+    """What can be decompressed of the last chunk is in the mended file."""
+    file = McapFile(tmp_path / "a.mcap", compression=compression, chunk_bytes=4 << 20)
+    channel = file.channel("/a", "json", 0, {})
+    for number in range(300):
+        file.add(channel, number, BEGIN + number, 0, os.urandom(2000))
+    file.close()
+    with Bag(tmp_path / "a.mcap") as bag:
+        (chunk,) = bag.chunks
+    (tmp_path / "b.mcap").write_bytes((tmp_path / "a.mcap").read_bytes()[: chunk.offset + chunk.length * 3 // 4])
+    done = repairing.repair(tmp_path / "b.mcap", tmp_path / "c.mcap")
+    assert 100 < done.messages < 300
+    assert done.damaged == 1
+    assert repairing.problems(tmp_path / "c.mcap") == []
+
+
+def test_a_damaged_chunk_costs_itself(tmp_path: Path) -> None:
+    """What follows a chunk with a wrong checksum is kept, and it is told which one it was."""
+    path = write(tmp_path / "a.mcap", 2000, compression="none", chunk_bytes=20_000)
+    with Bag(path) as bag:
+        chunk = bag.chunks[1]
+    data = bytearray(path.read_bytes())
+    data[chunk.offset + chunk.length // 2] ^= 1
+    path.write_bytes(data)
+    assert any("checksum" in problem for problem in repairing.problems(path))
+    with Bag(path) as bag, pytest.raises(BadBag, match="macs bag repair"):
+        texts(bag)
+    done = repairing.repair(path, tmp_path / "b.mcap")
+    assert done.damaged == 1
+    assert 1800 < done.messages <= 2000  # of that chunk as far as its messages' sizes are right
+    assert repairing.problems(tmp_path / "b.mcap") == []
+
+
+KILLED = """
+import sys, time
+from pathlib import Path
+from bridge.recording.disk import Disk, Entry, Plan, now_ns
+from bridge.recording.streams import Channel
+disk = Disk(Plan(Path(sys.argv[1])))
+disk.start()
+channel = Channel("/a", "json")
+while True:
+    data = b'{"at": %d}' % time.time_ns()
+    disk.put(Entry(channel, channel.next(len(data)), now_ns(), data))
+    print(channel.count, flush=True)
+    time.sleep(0.001)
+"""
+
+
+def test_a_killed_program_loses_less_than_a_second(tmp_path: Path) -> None:
+    """kill -9 in the middle of writing: all but the last second is there after repair."""
+    path = tmp_path / "a.mcap"
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(path)], cwd=ROOT, stdout=subprocess.PIPE, text=True, bufsize=1
+    )
+    assert process.stdout is not None
+    seen = [int(process.stdout.readline()) for _ in range(2000)]
+    killed_ns = time.time_ns()
+    process.kill()
+    process.wait()
+    done = repairing.repair(path, tmp_path / "b.mcap")
+    with Bag(tmp_path / "b.mcap") as bag:
+        times = [message.log_ns for message in bag.messages()]
+    assert done.messages == len(times) > 0
+    assert seen[-1] >= 2000
+    assert killed_ns - times[-1] < S
+    assert repairing.problems(tmp_path / "b.mcap") == []
+
+
+FULL = """
+import sys, time, os
+from pathlib import Path
+from bridge.recording.disk import Disk, Entry, Plan, now_ns
+from bridge.recording.streams import Channel
+reasons = []
+disk = Disk(Plan(Path(sys.argv[1]), compression="none"), reasons.append)
+disk.start()
+channel = Channel("/a", "json")
+while not disk.has_ended:
+    for _ in range(20):
+        disk.put(Entry(channel, channel.next(1000), now_ns(), os.urandom(1000)))
+    time.sleep(0.001)
+disk.stop()
+print(len(reasons), reasons[0])
+print(channel.count, disk.messages, sum(disk.lost.values()))
+"""
+
+
+def test_a_full_disk_ends_a_recording_that_stays_readable(tmp_path: Path) -> None:
+    """The reason is told once, each message is in the file or counted, there as well, and the file is whole."""
+    path = tmp_path / "a.mcap"
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000_000, 10_000_000))  # writing more is an error, as when full
+
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, str(path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        preexec_fn=limited,
+        check=True,
+        timeout=60,
+    )
+    reason, numbers = done.stdout.splitlines()
+    assert reason.startswith("1 the disk takes no more: ")
+    put, written, lost = map(int, numbers.split())
+    assert put == written + lost
+    assert lost > 0
+    assert path.stat().st_size <= 10_000_000
+    assert repairing.problems(path) == []
+    with Bag(path) as bag:
+        assert bag.messages_in_all in (written, written + bag.counts.get(_id(bag, "/macs/lost"), 0))
+        told = dict(bag.metadata())["macs.lost"]
+        assert 0 < int(told["disk_full"]) <= lost
+
+
+def _id(bag: Bag, topic: str) -> int:
+    return next((channel.id for channel in bag.channels.values() if channel.topic == topic), -1)
+
+
+# -- the thread that writes ------------------------------------------------------------------------------------------
+
+
+def test_splitting_loses_nothing(tmp_path: Path) -> None:
+    """Each message is in one file, and each file begins with what its latched topics said last."""
+    disk = Disk(Plan(tmp_path / "a.mcap", max_bytes=100_000, split=True, compression="none"))
+    disk.start()
+    latched, channel = string_channel(topic="/map", durability="transient_local"), string_channel()
+    disk.put(Entry(latched, latched.next(8), BEGIN, cdr("the map"), keep=latched.topic))
+    for entry in entries(channel, 10_000, start=BEGIN + 1):
+        disk.put(entry)
+    disk.stop()
+    assert len(disk.files) > 3
+    assert [path.name for path in disk.files[:2]] == ["a_0.mcap", "a_1.mcap"]
+    found: list[bytes] = []
+    for path in disk.files:
+        assert repairing.problems(path) == []
+        with Bag(path) as bag:
+            messages = list(bag.messages())
+            found += [message.data for message in messages if message.data != cdr("the map")]
+            assert messages[0].data == cdr("the map")
+            assert messages[0].publish_ns == BEGIN
+    assert found == [cdr(f"message {number}") for number in range(10_000)]
+    assert not disk.lost
+
+
+@pytest.mark.parametrize("limits", [{"max_bytes": 50_000}, {"max_s": 10.0}])
+def test_a_limit_ends_a_recording(tmp_path: Path, limits: dict[str, float]) -> None:
+    """Without splitting it ends there, says why, and counts what comes after."""
+    reasons: list[str] = []
+    disk = Disk(Plan(tmp_path / "a.mcap", compression="none", **limits), reasons.append)  # type: ignore[arg-type]
+    disk.start()
+    for entry in entries(string_channel(), 5000):
+        disk.put(entry)
+    disk.stop()
+    assert reasons == ["the recording has the size or length that it may have"]
+    assert disk.messages + disk.lost["after_end"] == 5000
+    assert 0 < disk.messages < 5000
+    with Bag(tmp_path / "a.mcap") as bag:
+        assert bag.messages_in_all == disk.messages
+
+
+def test_what_the_disk_cannot_follow_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More than the queue holds is lost by name, in the file too."""
+    from bridge.recording import disk as module
+
+    monkeypatch.setattr(module, "QUEUE_BYTES", 10_000)
+    disk = Disk(Plan(tmp_path / "a.mcap"))
+    for entry in entries(string_channel(), 2000):  # before it takes any
+        disk.put(entry)
+    lost = disk.lost["disk_behind"]
+    assert lost > 0
+    disk.start()
+    disk.stop()
+    assert disk.messages == 2000 - lost
+    with Bag(tmp_path / "a.mcap") as bag:
+        assert dict(bag.metadata())["macs.lost"] == {"disk_behind": str(lost)}
+
+
+def test_a_ring_keeps_the_last_seconds(tmp_path: Path) -> None:
+    """A file made of it has what is not older than the ring is long, what was latched before, and what comes after."""
+    ring, channel = Ring(10.0, 1 << 30), string_channel()
+    latched = string_channel(topic="/map", durability="transient_local")
+    ring.put(Entry(latched, latched.next(8), BEGIN, cdr("the map"), keep=latched.topic))
+    for entry in entries(channel, 6000, start=BEGIN + 1):  # a minute
+        ring.put(entry)
+    assert not ring.lost
+    disk = Disk(Plan(tmp_path / "a.mcap"))
+    disk.start()
+    assert ring.write(disk) == len(ring) + 1
+    late = Entry(channel, channel.next(1), BEGIN + 61 * S, cdr("after"))
+    ring.put(late)
+    ring.release(disk)
+    ring.put(late._replace(data=cdr("too late")))
+    disk.stop()
+    with Bag(tmp_path / "a.mcap") as bag:
+        found = texts(bag)
+    assert found[0] == cdr("the map")
+    assert found[-1] == cdr("after")
+    assert found[1:-1] == [cdr(f"message {number}") for number in range(4999, 6000)]
+
+
+def test_a_ring_has_a_size(tmp_path: Path) -> None:
+    """What had to go before its time is counted, and told with the file."""
+    ring = Ring(10.0, 5000)
+    for entry in entries(string_channel(), 1000):
+        ring.put(entry)
+    assert ring.bytes <= 5000
+    assert ring.lost["ring_full"] > 0
+    disk = Disk(Plan(tmp_path / "a.mcap"))
+    disk.start()
+    ring.write(disk)
+    disk.stop()
+    assert disk.lost["ring_full"] == ring.lost["ring_full"]
+
+
+# -- out of others ---------------------------------------------------------------------------------------------------
+
+
+def test_merging_is_by_time(tmp_path: Path) -> None:
+    """Messages of several files are in one, by time; a channel that is the same in both is one."""
+    one, two = tmp_path / "1.mcap", tmp_path / "2.mcap"
+    for path, start, robot in ((one, BEGIN, 7), (two, BEGIN + S // 200, 7)):
+        file = McapFile(path, chunk_bytes=3000)
+        _fill(file, string_channel(robot), 500, start)
+        file.close()
+    out = tmp_path / "both.mcap"
+    assert merge([one, two], out) == 1000
+    assert repairing.problems(out) == []
+    with Bag(out) as bag:
+        times = [message.log_ns for message in bag.messages()]
+        assert times == sorted(times)
+        assert len(bag.channels) == 1
+    with pytest.raises(ConfigError):
+        merge([one, two], out)
+
+
+def test_cutting_keeps_what_was_latched(tmp_path: Path) -> None:
+    """A part has the messages of its time, and before them what latched topics said last."""
+    file = McapFile(tmp_path / "a.mcap")
+    latched = string_channel(topic="/map", durability="transient_local")
+    schema = file.schema(latched.type, "ros2msg", latched.schema.encode())
+    number = file.channel(latched.topic, CDR, schema, latched.metadata)
+    for text in ("old map", "the map"):
+        file.add(number, 0, BEGIN, BEGIN, cdr(text))
+    _fill(file, string_channel(), 1000)
+    file.close()
+    count = cut(
+        tmp_path / "a.mcap", tmp_path / "b.mcap", lambda channel: True, start_ns=BEGIN + 5 * S, end_ns=BEGIN + 6 * S
+    )
+    assert count == 101
+    with Bag(tmp_path / "b.mcap") as bag:
+        assert texts(bag) == [cdr("the map"), *(cdr(f"message {number}") for number in range(500, 600))]
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_of_ros_has_every_message(tmp_path: Path, storage: str) -> None:
+    """Under names that ROS takes, with the same bytes, times and QoS; JSON is text there."""
+    file = McapFile(tmp_path / "a.mcap")
+    _fill(file, string_channel(), 100)
+    number = file.channel("/macs/stops", JSON, 0, {})
+    file.add(number, 1, BEGIN, BEGIN, b'{"robot": 7}')
+    file.close()
+    assert to_rosbag2(tmp_path / "a.mcap", tmp_path / "bag", storage) == 101
+    with AnyReader([tmp_path / "bag"]) as reader:
+        found = {connection.topic: connection for connection in reader.connections}
+        assert set(found) == {"/robot_7/chatter", "/macs/stops"}
+        read = [(c.topic, t, bytes(data)) for c, t, data in reader.messages()]
+        assert [entry for entry in read if entry[0] != "/macs/stops"] == [
+            ("/robot_7/chatter", BEGIN + number * S // 100, cdr(f"message {number}")) for number in range(100)
+        ]
+        text = next(data for topic, _, data in read if topic == "/macs/stops")
+        assert json.loads(reader.deserialize(text, "std_msgs/msg/String").data) == {"robot": 7}  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError):
+        to_rosbag2(tmp_path / "a.mcap", tmp_path / "bag", storage)
