@@ -42,6 +42,7 @@ NAMES = (
     "conformance",
     "record",
     "bag",
+    "replay",
     "audit",
     "token",
     "init",

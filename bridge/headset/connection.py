@@ -124,6 +124,17 @@ class Connection:
         except OSError as error:
             raise Unreachable(self.target, error.strerror or str(error)) from error
 
+    @property
+    def unsent(self) -> int:
+        """How many bytes wait to be sent."""
+        return self._stream.unsent
+
+    def put(self, frame: bytes) -> None:
+        """Write one frame without waiting, for who looks at `unsent`; nothing, when the connection is gone."""
+        if not self._stream.closing:
+            self._stream.write(frame)
+            self.last_output = asyncio.get_running_loop().time()
+
     async def close(self) -> None:
         """Send what is written, then close. Waits at most a second for a peer that does not take it."""
         with contextlib.suppress(OSError, asyncio.TimeoutError, RuntimeError):

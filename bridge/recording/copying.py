@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from bridge.recording.bag import CACHE_BYTES, Bag, ChannelRecord, Message
+from bridge.recording.bag import CACHE_BYTES, Bag
 from bridge.recording.mcap_file import McapFile
+from bridge.recording.mcap_records import ChannelRecord, Message
 from bridge.recording.repair import Progress, quiet
 from bridge.recording.streams import qos_of
 from macs_zenoh.errors import ConfigError

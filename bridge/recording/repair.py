@@ -9,7 +9,9 @@ from pathlib import Path
 from mcap.records import Channel, Schema
 
 from bridge.recording import scan
-from bridge.recording.bag import (
+from bridge.recording.bag import BadBag, Bag, Unfinished
+from bridge.recording.mcap_file import McapFile
+from bridge.recording.mcap_records import (
     CHANNEL,
     CHUNK,
     DATA_END,
@@ -17,17 +19,13 @@ from bridge.recording.bag import (
     MESSAGE,
     METADATA,
     SCHEMA,
-    BadBag,
-    Bag,
     Chunk,
     Fields,
-    Unfinished,
     channel_record,
     message_in,
     records_in,
     schema_record,
 )
-from bridge.recording.mcap_file import McapFile
 from macs_zenoh.errors import ConfigError
 
 Progress = Callable[[str, int, int], None]

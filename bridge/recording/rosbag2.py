@@ -10,8 +10,9 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bridge.recording.bag import BadBag, Bag, ChannelRecord
+from bridge.recording.bag import BadBag, Bag
 from bridge.recording.copying import STEP
+from bridge.recording.mcap_records import ChannelRecord
 from bridge.recording.repair import Progress, quiet
 from bridge.recording.streams import CDR, JSON, qos_of
 from macs_zenoh.errors import ConfigError, MissingExtra

@@ -12,17 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from bridge.recording.bag import (
-    DATA_END,
-    MAGIC,
-    MAX_CHUNK_BYTES,
-    MAX_RECORD_BYTES,
-    BadBag,
-    Chunk,
-    Fields,
-    read_chunk,
-    records_in,
-)
+from bridge.recording.bag import MAGIC, MAX_RECORD_BYTES, BadBag
+from bridge.recording.mcap_records import DATA_END, MAX_CHUNK_BYTES, Chunk, Fields, read_chunk, records_in
 from macs_zenoh.errors import ConfigError
 
 _HEAD = struct.Struct("<BQ")

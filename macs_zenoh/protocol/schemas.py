@@ -128,3 +128,36 @@ def definitions_in(name: str, text: str) -> dict[str, Definition]:
         if first.startswith("MSG: "):
             found[full_type(first.removeprefix("MSG: ").strip())] = Definition(rest)
     return found
+
+
+_DYNAMIC = re.compile(r"\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?\[(?:<=\d+)?\]\s")
+_LARGE = frozenset({"float64", "int64", "uint64"})
+
+
+def unity_differs(name: str, definitions: Mapping[str, Definition]) -> bool:
+    """Whether Unity's serializer may write and read a type otherwise than ROS does: wstring, structures without
+    fields, and lists of numbers of eight bytes. True where that cannot be told."""
+    seen: set[str] = set()
+    waiting = [name]
+    while waiting:
+        each = waiting.pop()
+        if each in seen:
+            continue
+        seen.add(each)
+        text = text_of(each, definitions)
+        if text is None:
+            return True
+        fields = 0
+        for line in text.splitlines():
+            line = line.partition("#")[0]
+            match = _FIELD.match(line)
+            if match is None or re.match(r"\s*\S+\s+\w+\s*=", line):
+                continue
+            fields += 1
+            dynamic = _DYNAMIC.match(line)
+            if match["type"] == "wstring" or (dynamic is not None and dynamic["type"] in _LARGE):
+                return True
+        if not fields:
+            return True
+        waiting += needs(each, text)
+    return False

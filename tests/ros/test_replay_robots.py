@@ -1,0 +1,276 @@
+"""`macs replay`: a recorded robot that headsets, agents and ROS nodes take for one, and commands sent once more."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mcap", reason="needs the extra record: pip install 'macs-zenoh[record]'")
+
+from geometry_msgs.msg import Twist
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import serialize_message
+from std_msgs.msg import String
+
+import macs_zenoh
+from bridge.headset.client import Headset
+from bridge.headset.nodes import Subscription
+from bridge.recording.mcap_file import McapFile
+from bridge.recording.streams import CDR, OFFERS, PRESENCE, Channel, command_topic, robot_channel
+from bridge.replay.player import Player
+from bridge.replay.recorded import recorded_robots
+from bridge.replay.timeline import Timeline
+from macs_zenoh.protocol.robot_state import TopicQos
+from tests.support.bags import BEGIN, STRING, cdr
+from tests.support.programs import Program, ended, macs
+from tests.support.ros_peer import Peer
+from tests.support.routers import Router
+from tests.support.waiting import get, until
+
+TWIST = f"Vector3 linear\nVector3 angular\n{'=' * 80}\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
+
+
+def twist(x: float) -> bytes:
+    message = Twist()
+    message.linear.x = float(x)
+    return bytes(serialize_message(message))
+
+
+class Writing:
+    """A recording that a test makes."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.file = McapFile(path)
+        self._ids: dict[str, int] = {}
+
+    def add(self, channel: Channel, at_s: float, data: bytes) -> None:
+        if channel.topic not in self._ids:
+            schema = self.file.schema(channel.type, "ros2msg", channel.schema.encode()) if channel.schema else 0
+            self._ids[channel.topic] = self.file.channel(channel.topic, channel.encoding, schema, channel.metadata)
+        at_ns = BEGIN + int(at_s * 1e9)
+        self.file.add(self._ids[channel.topic], channel.next(len(data)), at_ns, at_ns, data)
+
+    def say(self, topic: str, at_s: float, value: dict[str, Any]) -> None:
+        self.add(Channel(topic), at_s, json.dumps(value).encode())
+
+
+def text_topic(robot: int, topic: str, durability: str = "volatile") -> Channel:
+    return robot_channel(robot, topic, "std_msgs/msg/String", STRING, "RIHS01_x", TopicQos("reliable", durability))
+
+
+async def following(subscription: Subscription) -> Any:
+    """The next message of a headset's subscription."""
+    return await asyncio.wait_for(anext(aiter(subscription)), 60)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """Robot 7 says who it is once, and something a hundred times a second for two seconds; headset 256 drove it."""
+    writing = Writing(tmp_path / "a.mcap")
+    writing.say(PRESENCE, 0, {"agent": "ros/7", "group": 3, "online": True})
+    offers = {"subscribers": {"/cmd_vel": "geometry_msgs/msg/Twist"}, "services": {"/set": "std_srvs/srv/SetBool"}}
+    writing.say(OFFERS, 0, {"robot": 7, "offers": offers})
+    writing.add(text_topic(7, "/name", "transient_local"), 0, cdr("seven"))
+    chatter = text_topic(7, "/chatter")
+    for number in range(200):
+        writing.add(chatter, number / 100, cdr(f"message {number}"))
+    metadata = {"as": "sent", "robot": "7", "topic": "/cmd_vel", "sender": "unity/256"}
+    sent = Channel(command_topic("unity/256", "7", "/cmd_vel"), CDR, "geometry_msgs/msg/Twist", TWIST, metadata)
+    for number in range(10):
+        writing.add(sent, number / 10, twist(number))
+    writing.file.close()
+    return writing.path
+
+
+@pytest.fixture
+async def router() -> AsyncIterator[Router]:
+    async with Router() as router:
+        yield router
+
+
+def replay(recording: Path, endpoint: str, *options: str, env: dict[str, str] | None = None) -> Program:
+    return Program("replay", str(recording), "-e", endpoint, *options, env=env)
+
+
+async def test_what_a_file_says_of_its_robots(recording: Path) -> None:
+    """Topics, types, QoS, group, what it offered besides, and what was latched before the place to begin at."""
+    robots = recorded_robots(recording, lambda topic: True, start_s=1.0)
+    assert set(robots) == {7}
+    robot = robots[7]
+    assert robot.group == 3
+    offers = robot.offers()
+    assert offers.publishers == {"/name": "std_msgs/msg/String", "/chatter": "std_msgs/msg/String"}
+    assert offers.subscribers == {"/cmd_vel": "geometry_msgs/msg/Twist"}
+    assert offers.services == {"/set": "std_srvs/srv/SetBool"}
+    assert offers.qos["/name"] == TopicQos("reliable", "transient_local")
+    assert robot.topics["/name"].last == cdr("seven")
+    assert robot.definitions["std_msgs/msg/String"].hash == "RIHS01_x"
+
+
+async def test_a_headset_takes_it_for_a_robot(recording: Path, router: Router) -> None:
+    """Online with its group, it offers its topics, sends what was recorded in order, and late ones what was latched;
+    services and commands are refused with the reason."""
+    async with (
+        Program("gateway", "--port", "0", "-e", router.endpoint) as gateway,
+        await Headset.connect("127.0.0.1", gateway.port) as headset,
+    ):
+        chatter = await headset.subscribe("/chatter", "std_msgs/String", agents=[7])
+        async with replay(recording, router.endpoint, "--loop") as playing:
+            assert playing.ready == f"playing {recording} as robot 7 to mesh"
+            (row,) = [row for row in await macs("ls", "-v", "--json", "-e", router.endpoint) if row["type"] == "ros"]
+            assert (row["id"], row["group"]) == (7, 3)
+            assert row["offers"]["publishers"] == {"/chatter": "std_msgs/msg/String", "/name": "std_msgs/msg/String"}
+            received = [(await following(chatter)).data for _ in range(150)]
+            first = int(received[0].rstrip(b"\0").rpartition(b" ")[2])
+            assert received == [cdr(f"message {(first + number) % 200}") for number in range(150)]
+            name = await headset.subscribe("/name", "std_msgs/String", agents=[7])
+            assert (await following(name)).data == cdr("seven")
+            with pytest.raises(macs_zenoh.Refused, match="is a recording"):
+                await headset.call("/set", "std_srvs/SetBool", 7, b"\x00\x01\x00\x00\x01", failures=True)
+            async with macs_zenoh.join("unity", connect=[router.endpoint]) as agent:
+                with pytest.raises(macs_zenoh.Refused, match="is a recording"):
+                    await agent.publish("/cmd_vel", twist(1), robot=7, type="geometry_msgs/Twist")
+                with pytest.raises(macs_zenoh.Refused, match="not in the recording"):
+                    await agent.subscribe("/other", robot=7, type="std_msgs/String")
+                with pytest.raises(macs_zenoh.Refused, match="is a recording"):
+                    await agent.call("ros", 7, "stop", b"true")
+                told = json.loads(await agent.call("ros", 7, "definitions"))
+                assert told["definitions"]["std_msgs/msg/String"]["text"] == STRING
+    # and nothing is left
+
+
+async def test_it_leaves_nothing_behind(recording: Path, router: Router) -> None:
+    """At its end, and after a signal: the robot has left."""
+    async with macs_zenoh.join("unity", connect=[router.endpoint]) as agent:
+        async with replay(recording, router.endpoint, "--as-robot", "7:17") as playing:
+            await until(lambda: (1, 17) in agent.directory)
+            assert (1, 7) not in agent.directory
+            assert await playing.wait() == 0
+        await until(lambda: (1, 17) not in agent.directory)
+        async with replay(recording, router.endpoint, "--loop"):
+            await until(lambda: (1, 7) in agent.directory)
+            code, _, errors = await ended("replay", str(recording), "-e", router.endpoint)
+            assert code == 2
+            assert "already online" in errors
+        await until(lambda: (1, 7) not in agent.directory)
+
+
+async def test_a_recording_is_played_into_ros(recording: Path, router: Router, peer: Peer, domain: int) -> None:
+    """An rclpy subscription gets each message, and a late one what is latched."""
+    received = await peer.subscription(String, "/chatter", 1000)
+    env = {"ROS_DOMAIN_ID": str(domain)}
+    async with replay(recording, router.endpoint, "--to", "ros", "--loop", env=env):
+        first = int((await get(received)).data.rpartition(" ")[2])
+        for number in range(1, 150):
+            assert (await get(received)).data == f"message {(first + number) % 200}"
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        assert (await get(await peer.subscription(String, "/name", latched))).data == "seven"
+
+
+async def test_a_recording_is_played_to_a_gateway(recording: Path, router: Router) -> None:
+    """As an existing robot program it is there under an id that the gateway has set aside for robots."""
+    async with (
+        Program("gateway", "--port", "0", "-e", router.endpoint, "--robots", "7") as gateway,
+        await Headset.connect("127.0.0.1", gateway.port) as headset,
+    ):
+        chatter = await headset.subscribe("/chatter", "std_msgs/String", agents=[7])
+        async with replay(recording, router.endpoint, "--to", "gateway", f"127.0.0.1:{gateway.port}", "--loop"):
+            received = [(await following(chatter)).data for _ in range(100)]
+            first = int(received[0].rstrip(b"\0").rpartition(b" ")[2])
+            assert received == [cdr(f"message {(first + number) % 200}") for number in range(100)]
+
+
+async def test_commands_go_only_to_a_robot_that_was_named_twice(
+    recording: Path, router: Router, peer: Peer, domain: int
+) -> None:
+    """Without its id a second time nothing is sent; with it the robot gets each command as it was recorded."""
+    driven = await peer.subscription(Twist, "/cmd_vel", 100)
+    async with Program("agent", "--id", "7", "-e", router.endpoint, env={"ROS_DOMAIN_ID": str(domain)}):
+        for options in ([], ["--confirm", "8"]):
+            command = ("replay", str(recording), "-e", router.endpoint, "--commands-to", "7", *options)
+            code, out, errors = await ended(*command)
+            assert (code, out) == (2, "")
+            assert "named twice" in errors or "--confirm 7" in errors
+        assert driven.empty()
+        code, out, errors = await ended(
+            "replay", str(recording), "-e", router.endpoint, "--commands-to", "7", "--confirm", "7"
+        )
+        assert code == 0, errors
+        assert "10 messages" in out
+        speeds = [(await get(driven)).linear.x]
+        while speeds[-1] != 9.0:
+            speeds.append((await get(driven)).linear.x)
+        assert speeds == [float(number) for number in range(10)][-len(speeds) :]
+        assert len(speeds) > 7  # the first may come before ROS has found the subscription
+
+
+def test_messages_are_played_at_their_time(tmp_path: Path) -> None:
+    """A thousand a second: each at its time or a little later, none before, and none is left out."""
+    writing = Writing(tmp_path / "a.mcap")
+    channel = text_topic(7, "/chatter")
+    for number in range(2000):
+        writing.add(channel, number / 1000, cdr(f"message {number}"))
+    writing.file.close()
+    played: list[tuple[float, bytes]] = []
+    errors: list[object] = []
+    player = Player(
+        Timeline(writing.path, lambda channel: True),
+        lambda message: played.append((time.monotonic(), message.data)),
+        errors.append,
+    )
+    player.start()
+    while not errors:
+        time.sleep(0.01)
+    player.stop()
+    assert errors == [None]
+    assert [data for _, data in played] == [cdr(f"message {number}") for number in range(2000)]
+    assert min(player.late_s) >= 0
+    began = played[0][0]
+    assert all(at - began >= number / 1000 - 0.001 - player.late_s[0] for number, (at, _) in enumerate(played))
+
+
+@pytest.mark.parametrize(("rate", "loop"), [(10.0, False), (100.0, True)])
+def test_rate_and_loop(tmp_path: Path, rate: float, loop: bool) -> None:
+    """It is played so many times as fast, and again and again if that is wanted, until it is stopped."""
+    writing = Writing(tmp_path / "a.mcap")
+    channel = text_topic(7, "/chatter")
+    for number in range(20):
+        writing.add(channel, number, cdr(str(number)))
+    writing.file.close()
+    played: list[bytes] = []
+    errors: list[object] = []
+    timeline = Timeline(writing.path, lambda channel: True, start_s=10.0, rate=rate, loop=loop)
+    player = Player(timeline, lambda message: played.append(message.data), errors.append)
+    player.start()
+    while not (errors or len(played) >= 35):
+        time.sleep(0.01)
+    player.stop()
+    expected = [cdr(str(number)) for number in range(10, 20)]
+    assert played[:10] == expected
+    assert (played[10:20] == expected) is loop
+    assert errors == ([] if loop else [None])
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--rate", "0"], "no rate"),
+        (["--as-robot", "7"], "OLD:NEW"),
+        (["--to", "moon"], "--to gateway HOST:PORT"),
+        (["--to", "gateway"], "--to gateway HOST:PORT"),
+        (["--topics", "/none"], "no topics"),
+        (["--commands-to", "9", "--confirm", "9"], "no commands to robot 9"),
+    ],
+)
+async def test_wrong_options_are_told(recording: Path, options: list[str], says: str) -> None:
+    """Exit code 2, and one line that says what is wrong."""
+    code, out, errors = await ended("replay", str(recording), *options)
+    assert (code, out) == (2, "")
+    assert says in errors
