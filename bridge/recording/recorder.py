@@ -25,7 +25,7 @@ from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST, block_of
 from macs_zenoh.protocol.limits import ANSWER_BYTES
 from macs_zenoh.protocol.messages import ROS, decode_data
 from macs_zenoh.protocol.name_patterns import matches
-from macs_zenoh.protocol.robot_state import RobotStatus
+from macs_zenoh.protocol.robot_state import Offered, RobotStatus
 from macs_zenoh.protocol.schemas import full_type
 from macs_zenoh.protocol.wire import Layout
 
@@ -80,7 +80,7 @@ class Recorder:
         self._sink = sink
         self._wanted = wanted
         self._on_trigger = on_trigger
-        self._schemas = Schemas(agent)
+        self.schemas = Schemas(agent)
         self._json: dict[str, Channel] = {}
         self._commands: dict[tuple[str, str, str, str], Channel | None] = {}
         self._early: deque[tuple[Sent, int]] = deque()
@@ -91,6 +91,9 @@ class Recorder:
         layout = Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots)
         self._traffic = Traffic(layout, self._bad)
         self._bad_frames = 0
+        self.demand: Callable[[int, str], bool] = lambda robot, topic: True
+        """Whether a topic of a robot is wanted now; `RobotFollower.look_again` when that has changed."""
+        self.on_offered: Callable[[int, Offered], None] = lambda robot, offered: None
         self._lost_before: Counter[str] = Counter()
 
     def start(self) -> None:
@@ -110,6 +113,10 @@ class Recorder:
         for follower in self.robots.values():
             follower.close()
         self.robots.clear()
+
+    def wants(self, topic: str) -> bool:
+        """Whether a topic of this name may be recorded."""
+        return self._wanted.topic(topic)
 
     @property
     def topics(self) -> int:
@@ -150,7 +157,7 @@ class Recorder:
         elif online:
             self._asked[agent.id].set()
         elif not online:
-            self._schemas.forget(agent.id)
+            self.schemas.forget(agent.id)
 
     def _follow(self, robot: int) -> None:
         asked = self._asked[robot] = asyncio.Event()
@@ -158,11 +165,12 @@ class Recorder:
             self.agent,
             robot,
             self._sink,
-            self._schemas,
-            wants=self._wanted.topic,
+            self.schemas,
+            wants=lambda topic: self._wanted.topic(topic) and self.demand(robot, topic),
             carried_out=self._wanted.commands,
             on_note=self.note,
             on_stop_state=asked.set,
+            on_offered=lambda offered: self.on_offered(robot, offered),
         )
         self._watching[robot] = asyncio.get_running_loop().create_task(self._watch(robot))
 
@@ -260,7 +268,7 @@ class Recorder:
         channel = Channel(name, JSON, metadata=metadata)
         for follower in robots:
             try:
-                schema = await self._schemas.of(follower.robot, of_type)
+                schema = await self.schemas.of(follower.robot, of_type)
             except MacsError:
                 continue
             metadata |= {"topic_type_hash": schema.hash, "offered_qos_profiles": ""}

@@ -84,7 +84,7 @@ class Timeline:
 
     def _read(self) -> None:
         try:
-            with Bag(self._path) as bag:
+            with Bag(self._path, cache_bytes=AHEAD_BYTES) as bag:
                 start_ns = bag.start_ns + int(self._start_s * 1e9)
                 length_s = max(0.0, (bag.end_ns - start_ns) / 1e9) / self._rate + LOOP_PAUSE_S
                 turn = 0

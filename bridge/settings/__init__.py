@@ -41,7 +41,6 @@ from macs_zenoh.sections import read, read_text, toml
 from .awareness import AwarenessSettings
 from .gateway import GatewaySettings
 from .operator import OperatorSettings
-from .rmw_zenoh import RmwZenohRobot, RmwZenohSettings
 from .record import RecordSettings
 from .robot import ROBOT_HIDES, WHO_STOPPED, RobotSettings, TopicRule
 
@@ -51,8 +50,6 @@ __all__ = [
     "AwarenessSettings",
     "GatewaySettings",
     "OperatorSettings",
-    "RmwZenohRobot",
-    "RmwZenohSettings",
     "RecordSettings",
     "RobotSettings",
     "Settings",

@@ -56,6 +56,8 @@ IMAGES = [
 IGNORES = [path for path in FILES if path.suffix == ".dockerignore"]
 KERNEL = [path for path in FILES if path.suffix == ".conf" and path.parent.name == "wan"]
 CORES = [CONFIG / "tmpfiles.d" / "macs-cpu-latency.conf", CONFIG / "tuned" / "macs" / "tuned.conf"]
+LAYOUTS = [CONFIG / "foxglove-demo.json"]
+"""In tests/ros/test_foxglove.py."""
 LAUNCH = [CONFIG / "robot.launch.py"]
 """In tests/ros/test_parameters.py."""
 
@@ -73,7 +75,7 @@ def ids(path: Path) -> str:
 
 def test_every_file_is_tested() -> None:
     """Each shipped file is of a kind that a test here loads."""
-    known = [*ROUTERS, *SETTINGS, *PLANS, *COMPOSED, *UNITS, *IMAGES, *IGNORES, *KERNEL, *CORES, *LAUNCH]
+    known = [*ROUTERS, *SETTINGS, *PLANS, *COMPOSED, *UNITS, *IMAGES, *IGNORES, *KERNEL, *CORES, *LAUNCH, *LAYOUTS]
     assert sorted(known) == FILES
 
 
