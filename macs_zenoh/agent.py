@@ -38,6 +38,7 @@ RETRY_S = 0.05
 
 OnMessage = Callable[[Message], None]
 OnPresence = Callable[[AgentInfo, bool], None]
+OnAsleep = Callable[[AgentInfo], None]
 OnId = Callable[[int, int], None]
 
 
@@ -69,6 +70,7 @@ class Agent:
         self._closed = False
         self._declared: list[Subscription] = []
         self._on_presence: Callbacks[OnPresence] = Callbacks()
+        self._on_asleep: Callbacks[OnAsleep] = Callbacks()
         self._on_id: Callbacks[OnId] = Callbacks()
         self._served = Served(self._layout, lambda: self.key, guard)
         self._warned: set[tuple[int, int]] = set()
@@ -413,6 +415,11 @@ class Agent:
             callback(agent, True)
         return handle
 
+    def on_asleep(self, callback: OnAsleep) -> Handle:
+        """Call ``callback(agent)`` when the connection of a headset has ended that may come back as the same agent
+        (``agent.asleep``), and when it has. Meanwhile it counts as online; what it was moving has to stop."""
+        return self._on_asleep.add(callback)
+
     def on_id(self, callback: OnId) -> Handle:
         """Call ``callback(old, new)`` when the id has had to change; then ``id`` is the new one already.
 
@@ -424,7 +431,11 @@ class Agent:
 
     def _presence_changed(self, changes: list[Change]) -> None:
         for change in changes:
-            agent, online = change
+            agent, online, same = change
+            if same:
+                for told in self._on_asleep:
+                    _contained(f"telling of {agent.type_name}/{agent.id}", told, agent)
+                continue
             if self._nodes is not None:
                 _contained("what follows for interface nodes", self._nodes.presence, change)
             if agent.zid != self.mesh.zid:

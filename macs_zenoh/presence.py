@@ -112,12 +112,14 @@ class Presence:
                 handle.cancel()
         self._sweep.cancel()
 
-    def declare(self, agent_type: int, agent_id: int, group: int, epoch: int = 0) -> Token:
+    def declare(self, agent_type: int, agent_id: int, group: int, epoch: int = 0, *, asleep: int = 0) -> Token:
         """Be online under this id, until the token is closed. Subscribe the inbox before: who is seen is sent to.
 
-        ``epoch`` is another one for each agent that this session gives the id.
+        ``epoch`` is another one for each agent that this session gives the id, ``asleep`` for each time that its
+        connection has ended.
         """
-        return self._mesh.declare_token(AgentInfo(agent_type, agent_id, group, self._mesh.zid, epoch).presence)
+        agent = AgentInfo(agent_type, agent_id, group, self._mesh.zid, epoch, asleep)
+        return self._mesh.declare_token(agent.presence)
 
     def elsewhere(self, agent_type: int) -> list[AgentInfo]:
         """The online agents of a type whose token is not only ours."""

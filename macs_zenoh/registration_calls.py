@@ -154,7 +154,9 @@ class RobotCalls:
     def presence(self, change: Change) -> None:
         """A robot that comes, comes back or changes its group is told everything that is registered for it, and what
         it has to take back of a group that it has left. Where an agent has left, another may have its place."""
-        agent, online = change
+        agent, online, same = change
+        if same:
+            return
         if agent.type != ROS:
             if not online:
                 for task in self._registrations.holder_left(agent.key, self._online):

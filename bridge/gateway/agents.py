@@ -92,6 +92,10 @@ class Agents:
             token.close()
         return token is not None, emptied
 
+    def never_mind(self, agent_id: int) -> None:
+        """Who was given this id is an agent that has another one."""
+        self._by_id.pop(agent_id, None)
+
     def find(self, agent_type: object, agent_id: object) -> Connection | None:
         """The online agent with this type and id, if it is ours."""
         connection = self._by_id.get(agent_id)  # type: ignore[call-overload]

@@ -16,20 +16,21 @@ from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.addresses import joined, of_peer
 from macs_zenoh.protocol.budget import Toll
 from macs_zenoh.protocol.decoders import FrameDecoder
+from macs_zenoh.protocol.kept import Kept
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.protocol.limits import REQUESTS_PER_S, UNFINISHED_FREE_BYTES
-from macs_zenoh.protocol.messages import AgentsGone, GoneAgent
+from macs_zenoh.protocol.messages import AgentsGone, GoneAgent, SessionResumed
 from macs_zenoh.protocol.outbox import Chunk, Outbox
 from macs_zenoh.protocol.rate_limit import Pace
 from macs_zenoh.protocol.recipient import Recipient, to_agent
-from macs_zenoh.protocol.tcp_agent import Event, Joined, Left, Rejected, Sent, State, TcpAgent
+from macs_zenoh.protocol.tcp_agent import Arrived, Event, Joined, Left, Rejected, Sent, State, TcpAgent
 
 from .backpressure import Backpressure
 from .door import OPEN_TO_ALL, Entrance
 from .memory import Memory
 from .owner import Owner
 from .tcp import is_gone, tune, waiting_bytes
-from .writer import BUFFER_BYTES, ENDED, Writer
+from .writer import BUFFER_BYTES, ENDED, NOBODY, Writer
 
 log = logging.getLogger("macs.gateway")
 
@@ -38,6 +39,9 @@ AWAY_S = 10.0
 
 LOOK_S = 1.0
 """How often it is looked whether the host of an agent that is away is gone."""
+
+ASLEEP_BYTES = 1 << 20
+"""So much may wait for an agent whose socket is gone, if its outbox has no less."""
 
 TELL_S = 1.0
 """How often an agent is told the same of what it may not do, while it goes on."""
@@ -82,6 +86,12 @@ class Connection(asyncio.BufferedProtocol):
         self.stranger = False
         """Whether a token is wanted of its agent, and it has shown none yet."""
         self._not_let_in = False
+        self.asleep = False
+        """Whether its socket is gone, and the agent may come back over another."""
+        self.seen_asleep = 0
+        """The so many-th sleep in which others see it; 0 while they see it awake."""
+        self._successor: Connection | None = None
+        """Whose socket it is now, when its agent turned out to be one that was here before."""
         self.shown_token: str | None = None
         """What was shown before the first frame, where that is possible."""
         self.peer: TcpAgent
@@ -93,6 +103,7 @@ class Connection(asyncio.BufferedProtocol):
         self.host = self.address = "?"
         self.drops = Losses(log)
         self._outbox = Outbox(outbox_bytes)
+        self._outbox_bytes = outbox_bytes
         self._memory = memory
         self._write_timeout_s = write_timeout_s
         self._transport: asyncio.Transport
@@ -187,6 +198,8 @@ class Connection(asyncio.BufferedProtocol):
         self.received_bytes += nbytes
         if events := self.peer.advance(nbytes, began):
             self._events(events)
+            if self._successor is not None:
+                return
         unfinished = self.peer.partial_bytes
         if unfinished != self._unfinished and (unfinished > UNFINISHED_FREE_BYTES or self._unfinished):
             self._note_unfinished(unfinished)
@@ -220,12 +233,15 @@ class Connection(asyncio.BufferedProtocol):
             self.robot_backpressure.release()
 
     def connection_lost(self, exc: Exception | None) -> None:
+        self._transport = ENDED
+        if self.greeted and not self._refused and self.owner.sleeps(self):
+            return
         for timer in (self._timer, self._tolled, self.regrouping):
             if timer is not None:
                 timer.cancel()
         self._writer.close_direct()
         self._writer.detach()
-        self._transport = ENDED
+        self._expect_back_no_more()
         if self._refused:
             return
         if self.greeted:
@@ -240,7 +256,7 @@ class Connection(asyncio.BufferedProtocol):
     # -- in ------------------------------------------------------------------------------------------------------
 
     def _events(self, events: list[Event]) -> None:
-        for event in events:
+        for number, event in enumerate(events):
             try:
                 if type(event) is Sent:
                     self.owner.forward(self, event)
@@ -250,9 +266,18 @@ class Connection(asyncio.BufferedProtocol):
                         continue
                     self._warn_once(type(event.error).__name__, str(event.error))  # the peer has counted it
                 elif isinstance(event, Left):
-                    self.close(event.reason)
+                    if event.silent:
+                        self._give_up(event.reason)
+                    else:
+                        self.close(event.reason)
+                elif isinstance(event, Arrived):
+                    if self._writer.kept is not None:
+                        self._writer.kept.arrived(event.received)
                 else:
                     self.owner.handle(self, event)
+                    if self._successor is not None:
+                        self._successor._events(events[number + 1 :])
+                        return
                     if isinstance(event, Joined):
                         if self._transport.is_closing():
                             return  # it was not let in, and nothing that it sent before counts
@@ -285,13 +310,13 @@ class Connection(asyncio.BufferedProtocol):
         """The same for several, of ``size`` together, with the next `flush`. Whether the caller has to see to that:
         what is gathered begins with these."""
         if not self._writer.full:
-            return self._gather(messages, size)
+            return self._gather(messages, size, keep=True)
         beyond_bytes = IN_FLIGHT * self._outbox.limit_bytes if self.backpressure.holds else 0
         for message in messages:
             if self._has_room(len(message)) and not self._outbox.put_call(message, beyond_bytes):
                 self._warn_once("outbox_full", f"it reads too slowly: {self._outbox.bytes} bytes are waiting")
             self._account()
-        self.congested = self._outbox.bytes > self._outbox.limit_bytes // 4
+        self.congested = not self.asleep and self._outbox.bytes > self._outbox.limit_bytes // 4
         return False
 
     @property
@@ -341,11 +366,11 @@ class Connection(asyncio.BufferedProtocol):
         if not self._writer.write_now(message):
             self._loop.call_soon_threadsafe(self.flush)
 
-    def _gather(self, messages: Sequence[Chunk], size: int | None = None) -> bool:
+    def _gather(self, messages: Sequence[Chunk], size: int | None = None, *, keep: bool = False) -> bool:
         size = sum(map(len, messages)) if size is None else size
         if size > BUFFER_BYTES and not self._has_room(size):
             return False
-        return self._writer.gather(messages, size)
+        return self._writer.gather(messages, size, keep=keep)
 
     def tell_gone(self, gone: list[GoneAgent]) -> None:
         """Tell a robot program that these have left, if there are any."""
@@ -418,26 +443,113 @@ class Connection(asyncio.BufferedProtocol):
 
     def close(self, reason: str) -> None:
         """Send what is gathered, then FIN."""
-        if self._transport.is_closing():
+        if self._transport.is_closing() and not self.asleep:
             return
-        self.peer.lost()
+        self._expect_back_no_more()
+        if not self.asleep:
+            self.peer.lost()
         level = logging.INFO if reason == "went offline" else logging.WARNING
         level = logging.DEBUG if self._not_let_in else level
         log.log(level, "%s leaves: %s", self, reason)
-        self._writer.close(self._write_timeout_s)
+        if self.asleep:
+            self.abort()
+        else:
+            self._writer.close(self._write_timeout_s)
 
     def finish(self, reason: str) -> None:
         """Send all that waits, then FIN; `abort` whoever does not take it in time."""
-        if not self.greeted:
+        if not self.greeted or self.asleep:
             self.abort()
         elif not self._transport.is_closing():
+            self._expect_back_no_more()
             self.peer.lost()
             log.info("%s leaves: %s", self, reason)
             self._writer.finish()
 
     def abort(self) -> None:
         """End the connection at once; does nothing to one that has ended."""
-        self._transport.abort()
+        if self.asleep:
+            self._expect_back_no_more()
+            self.connection_lost(None)
+        else:
+            self._transport.abort()
+
+    # -- sleep ---------------------------------------------------------------------------------------------------
+
+    @property
+    def returns(self) -> bool:
+        """Whether the agent is expected back when its connection ends."""
+        return self._writer.kept is not None
+
+    def expect_back(self, kept: Kept[Chunk]) -> None:
+        """The agent comes back when its connection ends, and what has not arrived by then is to be said again."""
+        self._writer.kept = kept
+
+    def _expect_back_no_more(self) -> None:
+        kept, self._writer.kept = self._writer.kept, None
+        if kept is not None:
+            kept.clear()
+
+    def fall_asleep(self) -> None:
+        """The socket has ended, or is to: what is said to the agent waits from now on, and less may than otherwise."""
+        transport, self._transport = self._transport, ENDED
+        self.asleep = True
+        self._writer.fall_asleep()
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._tolled is not None:
+            self._tolled.cancel()
+            self._go_on()
+        if transport is not ENDED:
+            transport.set_protocol(NOBODY)
+            transport.abort()
+        self._outbox.limit_bytes = min(self._outbox_bytes, ASLEEP_BYTES)
+        self.congested = False
+        self.backpressure.release()
+        self.robot_backpressure.release()
+        self._memory.unfinished.note(self, self.host, 0)
+        self._unfinished = self._unread = 0
+        self._account()
+
+    def wake(self, newcomer: Connection, received: int) -> None:
+        """The agent is there again, as a newcomer who has ``received`` so much: its socket and its state machine are
+        this one's from now on."""
+        kept = self._writer.kept
+        assert kept is not None
+        self._memory.waiting.set(self, self.host, 0)
+        transport = newcomer._give_to(self)
+        self.asleep = False
+        self.peer, self.recipient = newcomer.peer, newcomer.peer.recipient
+        self.entrance, self.host, self.address = newcomer.entrance, newcomer.host, newcomer.address
+        self.greeted_at, self.pace = newcomer.greeted_at, newcomer.pace
+        self.drops.update(newcomer.drops)
+        self._transport = transport
+        self._outbox.limit_bytes = self._outbox_bytes
+        again, gap = kept.again(received)
+        resumed = to_agent(SessionResumed(self.agent_id, self.peer.heard, gap))
+        self._writer.wake(transport, resumed, again)
+        self._account()
+        if self._pauses:
+            transport.pause_reading()
+        self._looked = False
+        self._schedule()
+
+    def _give_to(self, successor: Connection) -> asyncio.Transport:
+        """What comes through this socket is another connection's from now on."""
+        transport, self._transport = self._transport, ENDED
+        self._successor = successor
+        if self._timer is not None:
+            self._timer.cancel()
+        self._writer.detach()
+        self._memory.unfinished.note(self, self.host, 0)
+        self._memory.waiting.set(self, self.host, 0)
+        transport.set_protocol(successor)
+        return transport
+
+    def _give_up(self, reason: str) -> None:
+        """Nothing comes of its socket: close it, unless the agent may come back over another."""
+        if not self.owner.sleeps(self):
+            self.close(reason)
 
     def all_drops(self) -> Counter[str]:
         """Everything that was dropped for this agent, by name."""
@@ -465,12 +577,12 @@ class Connection(asyncio.BufferedProtocol):
             self._looked = False  # what comes when its time has run out another time is looked at anew
         if in_time or not self._must_be_read():
             self._events(self.peer.tick(now))
-        paused_at = self._writer.paused_at
+        paused_at = None if self.asleep else self._writer.paused_at
         if paused_at is not None and now >= paused_at + self._write_timeout_s:
-            self.close(f"it has not read for {self._write_timeout_s:g} s")
-        elif self.is_away(now) and is_gone(self._transport.get_extra_info("socket")):
-            self.close("its host does not answer")
-        if self.peer.state is not State.GONE:
+            self._give_up(f"it has not read for {self._write_timeout_s:g} s")
+        elif self.is_away(now) and not self.asleep and is_gone(self._transport.get_extra_info("socket")):
+            self._give_up("its host does not answer")
+        if self.peer.state is not State.GONE and not self.asleep:
             self._schedule()
 
     @property
@@ -480,8 +592,8 @@ class Connection(asyncio.BufferedProtocol):
         return time.monotonic() < self.drove_at + DRIVES_S
 
     def is_away(self, now: float) -> bool:
-        """Whether nothing was heard of the agent for a while, though it is connected."""
-        return now >= self.peer.heard_at + AWAY_S
+        """Whether nothing was heard of the agent for a while, though it is online."""
+        return self.asleep or now >= self.peer.heard_at + AWAY_S
 
     def _must_be_read(self) -> bool:
         """Whether the agent's time has run out, but not all of what it had sent by then was looked at: the loop may

@@ -176,7 +176,7 @@ class Delivery:
                         continue
                     if registrant in registered:
                         keep = False
-                        if robot is not None and connection.full:
+                        if robot is not None and connection.full and not connection.asleep:
                             if may_hold is None:  # once for the sample: it looks at everybody
                                 may_hold = self._all_are_full(robot)
                             keep = may_hold and connection.robot_backpressure.hold(

@@ -140,19 +140,26 @@ class Door:
         self._watch.read_again()  # it may have been made a moment ago
         return self._watch.tokens.find(shown, time.time())
 
-    def failed(self, entrance: Entrance, host: str) -> int:
-        """Somebody was not let in. How often by now from there, when that is to be told; else 0."""
+    def failed(self, entrance: Entrance, host: str, what: str = "valid token", counted_as: str = "NotAdmitted") -> int:
+        """Somebody was not let in, or not as who he said. How often by now from there, when that is to be told;
+        else 0."""
         count = self._attempts.note(host, time.monotonic())
         if count:
             so_far = "" if count == 1 else f", {count} times by now"
-            log.warning(
-                "%s shows no valid token at the %s port%s (counted as NotAdmitted)", host, entrance.name, so_far
-            )
+            problem = "%s shows no %s at the %s port%s (counted as %s)"
+            log.warning(problem, host, what, entrance.name, so_far, counted_as)
         return count
 
     def leave(self, connection: Connection) -> None:
         """A connection has ended."""
         self._holders.pop(connection, None)
+
+    def is_now(self, newcomer: Connection, connection: Connection) -> None:
+        """Who came by one connection is who was here before by the other."""
+        held = self._holders.pop(newcomer, None)
+        self.leave(connection)
+        if held is not None:
+            self._holders[connection] = held
 
     async def exchange(self, code: str) -> str | None:
         """A new secret for who shows the code of a pairing; None: there is no such pairing."""

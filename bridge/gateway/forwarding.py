@@ -83,6 +83,17 @@ class Forwarding:
         self._routes.pop(connection, None)
         self.afar.leave(connection)
 
+    def sleeps(self, connection: Connection) -> None:
+        """Its socket has ended: nothing newer comes for now."""
+        self.flush()
+        self._latest.go(connection)
+        self._questions.leave(connection)
+        self._flooding.pop(connection, None)
+
+    def never_mind(self, connection: Connection) -> None:
+        """It was no agent of its own."""
+        self._routes.pop(connection, None)
+
     def close(self) -> None:
         """Nothing is forwarded any more."""
         self._latest.close()

@@ -29,5 +29,9 @@ class Owner(Protocol):
     def received(self, connection: Connection) -> None:
         """All events of one read were passed on."""
 
+    def sleeps(self, connection: Connection) -> bool:
+        """The socket is gone, or nothing comes of it: whether the agent may come back over another. It is asleep
+        then."""
+
     def closed(self, connection: Connection) -> None:
-        """The socket is gone."""
+        """The agent is gone."""

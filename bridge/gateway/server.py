@@ -30,7 +30,7 @@ from macs_zenoh.protocol.addresses import joined
 from macs_zenoh.protocol.budget import Budget
 from macs_zenoh.protocol.credit import Credit, Credits
 from macs_zenoh.protocol.decoders import FrameDecoder
-from macs_zenoh.protocol.directory import Change
+from macs_zenoh.protocol.directory import AgentInfo, Change
 from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
 from macs_zenoh.protocol.limits import (
     NAMED_EACH,
@@ -70,8 +70,10 @@ from macs_zenoh.protocol.tcp_agent import (
     Joined,
     Limits,
     NotLetIn,
+    NotResumed,
     Registering,
     RegistrationRefused,
+    Resumed,
     Sent,
     Streamed,
     TcpAgent,
@@ -95,6 +97,7 @@ from .listeners import Listeners
 from .memory import Memory
 from .renumbering import Renumbering
 from .robot_ids import RobotIds
+from .sleepers import Sleepers
 from .stead import Stead
 from .waiting import NAMED_S, WaitingRoom
 
@@ -169,6 +172,13 @@ class Gateway:
         self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged)
         self._delivery = Delivery(self.agents, self.directory, self._layout, stead, judged, forwarding.afar)
         self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
+        self._sleepers = Sleepers(
+            settings.resume_s,
+            self.agents,
+            self._presence,
+            on_asleep=self._falls_asleep,
+            note=lambda event, connection: self._audit.record(event, _who(connection)),
+        )
         self._leases = Leases(
             mesh,
             settings.block,
@@ -270,6 +280,7 @@ class Gateway:
     async def close(self) -> None:
         """Stop accepting, tell the mesh, send what waits for ``FLUSH_S`` at most, leave."""
         self.listeners.close()
+        self._sleepers.close()
         self._door.close()
         self._renumbering.close()
         self._robots.close()
@@ -356,6 +367,7 @@ class Gateway:
                 admit=self._door.admit(connection),
                 stranger=connection.stranger,
                 recipient=Recipient(partial(self._registered_there, connection), self.settings.robot_packages),
+                resume=self._sleepers.resume_for(connection) if self.settings.resume_s else None,
             )
             self.agents.enter(agent_id, connection)
             self._forwarding.enter(connection)
@@ -385,16 +397,15 @@ class Gateway:
 
     def closed(self, connection: Connection) -> None:
         """Forget a connection; its presence ends at once."""
-        self._admission.leave(connection.host)
-        self._known(connection)
         self._door.leave(connection)
+        self._sleepers.left(connection)
+        if not connection.asleep:
+            self._leaves_address(connection)
         if not connection.greeted:
             if (timer := self._coming.pop(connection, None)) is not None:
                 timer.cancel()
             self._waiting.leave(connection)
             return
-        now = time.monotonic()
-        self._churn.ended(connection.host, now - connection.greeted_at, now)
         if connection.peer.dials_a_router:
             what = "%s is a Zenoh program: it wants a router, and this is a gateway"
             self._drops.once("zenoh_program", what, connection.address)
@@ -418,6 +429,46 @@ class Gateway:
         if not self.agents:
             self._all_closed.set()
         self._greet_waiting()
+
+    def _leaves_address(self, connection: Connection) -> None:
+        """A socket has ended."""
+        self._admission.leave(connection.host)
+        self._known(connection)
+        if connection.greeted:
+            now = time.monotonic()
+            self._churn.ended(connection.host, now - connection.greeted_at, now)
+
+    def sleeps(self, connection: Connection) -> bool:
+        """Whether an agent whose socket is gone may come back, and sleeps now."""
+        return self._sleepers.sleeps(connection)
+
+    def _falls_asleep(self, connection: Connection) -> None:
+        self._leaves_address(connection)
+        self._forwarding.sleeps(connection)
+
+    def _resume(self, newcomer: Connection, event: Resumed) -> None:
+        """A newcomer is who was here before: what was his own is not needed."""
+        former = self.agents.find(event.former.agent_type, event.former.agent_id)
+        assert former is not None
+        self._known(newcomer)
+        self._forwarding.never_mind(newcomer)
+        self.agents.never_mind(event.spare_id)
+        self._leases.give_back(event.spare_id)
+        self._credits.leave(newcomer.host, event.spare_credit, time.monotonic())
+        self._door.is_now(newcomer, former)
+        nodes, named = self._nodes.of(former), self._named.of(former)
+        self._nodes.set(former, former.host, 0)
+        self._named.set(former, former.host, 0)
+        self._sleepers.resumed(newcomer, event)
+        self._nodes.set(former, former.host, nodes)
+        self._named.set(former, former.host, named)
+        self._greet_waiting()
+
+    def _not_resumed(self, connection: Connection) -> None:
+        connection.drops["not_resumed"] += 1
+        count = self._door.failed(connection.entrance, connection.host, "session of its own", "not_resumed")
+        if count:
+            self._audit.record("refused", who(address=connection.address), "resume", f"{count} times by now")
 
     def _known(self, connection: Connection) -> None:
         """A connection is no stranger any more."""
@@ -478,6 +529,10 @@ class Gateway:
             self._tell_access(connection, AccessRefused("no_token", "a valid token is wanted here"))
         elif isinstance(event, Withdrawn):
             self._withdraw(connection, event)
+        elif isinstance(event, Resumed):
+            self._resume(connection, event)
+        elif isinstance(event, NotResumed):
+            self._not_resumed(connection)
         elif isinstance(event, AskedOnline):
             self._answer_online(connection, event.request_id)
             connection.charge()
@@ -597,6 +652,7 @@ class Gateway:
             return
         self._declarations.declare(connection)
         self._enter_group(connection)
+        self._sleepers.joined(connection)
         self._renumbering.joined(connection)
         by = f" with token {connection.peer.grant.name}" if connection.peer.grant.name else ""
         self._audit.record("joined", _who(connection), f"group {event.group}" if event.group else "")
@@ -626,7 +682,8 @@ class Gateway:
         if group:
             self._subscribe(GROUP.every(type=kind, group=group), self._delivery.group)
         # the token last: whoever sees the agent can reach it
-        token = self._presence.declare(kind, agent_id, group, connection.peer.connection_number)
+        number, asleep = connection.peer.connection_number, connection.seen_asleep
+        token = self._presence.declare(kind, agent_id, group, number, asleep=asleep)
         before, emptied = self.agents.join(connection, token)
         self._group_emptied(emptied)
         loop = asyncio.get_running_loop()
@@ -690,9 +747,16 @@ class Gateway:
 
     # -- presence ------------------------------------------------------------------------------------------------
 
+    def _is_here(self, agent: AgentInfo) -> bool:
+        """Whether it is one of ours: when its presence changes twice in a moment, it can seem to be gone."""
+        connection = self.agents.find(agent.type, agent.id) if agent.zid == self.mesh.zid else None
+        return connection is not None and connection.peer.connection_number == agent.epoch
+
     def _tell(self, changes: list[Change]) -> None:
         self._online_reply = b""
-        gone = [GoneAgent(agent.type, agent.id) for agent, online in changes if not online]
+        gone = [
+            GoneAgent(*change.agent.key) for change in changes if not (change.online or self._is_here(change.agent))
+        ]
         if gone:
             message = to_agent(AgentsGone(gone))
             for connection in self.agents.online():

@@ -484,6 +484,11 @@ class WebSocketTransport(asyncio.Transport):
         """As the transport below; ``websocket`` is true."""
         return True if name == "websocket" else self._below.get_extra_info(name, default)
 
+    def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
+        """What comes is another connection's from now on, or nobody's."""
+        self._connection = protocol if isinstance(protocol, Connection) else None
+        self._may_read.set()
+
     def is_closing(self) -> bool:
         return self._closing is not None or self._connection is None or self._below.is_closing()
 

@@ -14,9 +14,13 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 
+from macs_zenoh.protocol.kept import Kept
 from macs_zenoh.protocol.outbox import Chunk, Outbox
 
 from .listener import descriptors
+
+COPY_BYTES = 16 << 10
+"""A piece of a sample that is no larger than this is kept as a copy, and not with all of the sample."""
 
 BUFFER_BYTES = 256 << 10
 """What the transport may hold before messages wait in the outbox, where a call can still overtake topic data."""
@@ -32,11 +36,16 @@ class Writer:
         """How often it has taken something again."""
         self.written_bytes = 0
         """Of everything."""
+        self.kept: Kept[Chunk] | None = None
+        """What may have to be sent again over another connection; None: there will be none."""
+        self._to_keep: list[tuple[Sequence[Chunk], bool]] = []
+        """Of what is gathered: in the same order, and whether it is kept, or only counted."""
         self._outbox = outbox
         self._transport: asyncio.Transport
         self._gathered: list[Chunk] = []
         self._gathered_bytes = 0
         self._direct: DirectWriter | None = None
+        self._wants_direct = False
         self._lock = threading.RLock()
         """Held by whoever writes, the loop or a thread of Zenoh's, as long as older messages are on their way."""
         self._rest = b""
@@ -52,11 +61,35 @@ class Writer:
         with self._lock:
             self._transport = ENDED
 
+    def fall_asleep(self) -> None:
+        """It has ended, and there will be another: until then everything waits. What was gathered is kept, or lost."""
+        with self._lock:
+            self.flush()
+            self.close_direct()
+            self.detach()
+            self._rest = b""
+            self.pause()
+
+    def wake(self, transport: asyncio.Transport, first: bytes, again: Sequence[Chunk]) -> None:
+        """There is another: write this first, then again what has not arrived, then what waits."""
+        with self._lock:
+            self._rest = b""
+            self.attach(transport)
+            if self._wants_direct:
+                self.open_direct()
+            self.paused_at = None
+            self.write([first])
+            self._keep(again)
+            self.write(list(again))
+            if self.paused_at is None:
+                self.resume()
+
     # -- past the loop -------------------------------------------------------------------------------------------
 
     def open_direct(self) -> None:
         """Let threads write past the loop, if a descriptor is left and what is written goes out as it is, which
         it does not over TLS and WebSocket: else topics take the usual way."""
+        self._wants_direct = True
         plain = not any(map(self._transport.get_extra_info, ("sslcontext", "websocket")))
         if plain and self._direct is None and not self._transport.is_closing():
             with suppress(OSError):
@@ -82,6 +115,8 @@ class Writer:
     def write_now(self, message: bytes) -> bool:
         """Write past the loop. False when something is left, for the loop to `flush` soon."""
         with self._lock:
+            if self.kept is not None:
+                self.kept.skip()
             sent = self._direct.send(message) if self.free and self._direct is not None else 0
             self.written_bytes += sent
             if sent == len(message):
@@ -96,10 +131,13 @@ class Writer:
         """Whether what is sent now has to wait in the outbox."""
         return self.paused_at is not None
 
-    def gather(self, messages: Sequence[Chunk], size: int) -> bool:
-        """Keep for the next `flush`, but no more than the transport may hold. Whether it is the first."""
+    def gather(self, messages: Sequence[Chunk], size: int, *, keep: bool = False) -> bool:
+        """Have ready for the next `flush`, but no more than the transport may hold. Whether it is the first. ``keep``:
+        it must also reach who comes back over another connection."""
         first = not self._gathered
         self._gathered += messages
+        if self.kept is not None:
+            self._to_keep.append((messages, keep))
         self._gathered_bytes += size
         if self._gathered_bytes > BUFFER_BYTES:
             self.flush()
@@ -109,7 +147,25 @@ class Writer:
         """Write what was gathered, in one go."""
         with self._lock:
             gathered, self._gathered, self._gathered_bytes = self._gathered, [], 0
+            if self._to_keep:
+                self._keep_gathered()
             self.write(gathered)
+
+    def _keep_gathered(self) -> None:
+        """Number what is written now: with the lock, since who writes past the loop counts as well."""
+        to_keep, self._to_keep = self._to_keep, []
+        for messages, keep in to_keep:
+            if keep:
+                self._keep(messages)
+            elif self.kept is not None:
+                self.kept.skip(len(messages))
+
+    def _keep(self, messages: Sequence[Chunk]) -> None:
+        if self.kept is None:
+            return
+        for message in messages:
+            small = type(message) is memoryview and len(message) <= COPY_BYTES
+            self.kept.put(bytes(message) if small else message, len(message))
 
     def write(self, chunks: list[Chunk]) -> None:
         """Write at once, behind what is left of a message that went past the loop."""
@@ -131,7 +187,12 @@ class Writer:
             self.resumed += 1
             self.paused_at = None
             while self._outbox and self.paused_at is None:  # writing may pause us again
-                self.write(self._outbox.take(BUFFER_BYTES))
+                taken = self._outbox.take(BUFFER_BYTES)
+                if self.kept is not None:
+                    calls = self._outbox.calls_taken
+                    self._keep(taken[:calls])
+                    self.kept.skip(len(taken) - calls)
+                self.write(taken)
 
     def close(self, most_s: float) -> None:
         """Write what is gathered, then FIN. Who does not read is cut, at once or after ``most_s``, since a transport
@@ -171,6 +232,13 @@ class _Ended(asyncio.Transport):
 
 
 ENDED = _Ended()
+
+
+class _Nobody(asyncio.Protocol):
+    """Who a socket talks to that is given up: it hears nothing."""
+
+
+NOBODY = _Nobody()
 
 
 class DirectWriter:

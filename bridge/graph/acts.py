@@ -229,7 +229,7 @@ class _Nobody:
     def __init__(self, agent: Agent) -> None:
         self.id = agent.id
 
-    async def send_frame(self, frame: bytes) -> None:
+    async def send_frame(self, frame: bytes, still_meant: object = None) -> None:
         raise NotImplementedError
 
     async def tell(self, frame: Callable[[int], bytes]) -> None:

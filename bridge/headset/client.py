@@ -24,7 +24,7 @@ import contextlib
 import itertools
 import logging
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Awaitable, Callable, Collection, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -45,6 +45,8 @@ from macs_zenoh.protocol.messages import (
     NodeType,
     OnlineReply,
     Refusal,
+    SessionOpened,
+    SessionResumed,
     Welcome,
     decode_data,
     node_name,
@@ -67,6 +69,7 @@ from .nodes import (
     Subscription,
 )
 from .questions import ROUTER, Questions
+from .resumption import ACK_S, Frame, Session, StillMeant, always
 from .stream import TCP, Way
 
 log = logging.getLogger("macs.headset")
@@ -80,6 +83,7 @@ RETRY_S = (0.1, 0.2, 0.5, 1.0, 2.0)
 INBOX_MESSAGES = 1000
 """How many messages outside interface nodes are held for a taker."""
 
+_OF_SESSIONS = frozenset({SessionOpened.manager, SessionResumed.manager})
 _GOODBYE_S = 1.0
 _CANCEL_AGAIN_S = 0.5
 
@@ -91,6 +95,8 @@ class Link:
     up: bool
     agent_id: int
     why: str = ""
+    resumed: bool = False
+    """Whether it is the same agent as before, so that nothing has to be repeated."""
 
 
 @dataclass(frozen=True)
@@ -125,6 +131,11 @@ class Headset:
         self._nodes: dict[tuple[int, str], Node] = {}
         self._inbox: Mailbox[Incoming] = Mailbox(INBOX_MESSAGES)
         self._connection: Connection | None = None
+        self._session: Session | None = None
+        """By which it can come back as the same agent, from a gateway that lets it."""
+        self._before = 0
+        """How many messages of its session had come when its connection began, less those that are not counted."""
+        self._acknowledged_at = 0.0
         self._welcome_request = 0
         self._questions = Questions()
         self._reading = asyncio.Event()
@@ -151,8 +162,9 @@ class Headset:
     ) -> Headset:
         """Connect, wait for the router's first message and answer it.
 
-        ``group`` 0 is none. With ``reconnect`` a lost connection is made again and again until `close`, and every
-        node is registered anew; the first connection is tried once. ``extensions`` is the version of our extensions
+        ``group`` 0 is none. With ``reconnect`` a lost connection is made again and again until `close`; the headset is
+        the same agent then, if its gateway still knows it, and otherwise every node is registered anew. The first
+        connection is tried once. ``extensions`` is the version of our extensions
         of the protocol that it says it understands; with 0 it is an existing program to its gateway. ``token`` is
         shown to the gateway, and ``way`` says whether that is reached over TLS or WebSocket. ``on_link`` hears every
         start and end.
@@ -223,7 +235,9 @@ class Headset:
         """Ask who is online: ids of robots and of headsets. Raises CallTimeout or Unreachable."""
         answer = await self._questions.ask(
             ROUTER,
-            lambda number: self.send_frame(frames.online_request(self.id, number)),
+            lambda number: self.send_frame(
+                frames.online_request(self.id, number), lambda: self._questions.waits(ROUTER, number)
+            ),
             timeout_s=timeout_s,
             target=f"router {self.target}",
         )
@@ -236,7 +250,9 @@ class Headset:
         """
         answer = await self._questions.ask(
             ROUTER,
-            lambda number: self.send_frame(frames.management(self.id, number, manager, data)),
+            lambda number: self.send_frame(
+                frames.management(self.id, number, manager, data), lambda: self._questions.waits(ROUTER, number)
+            ),
             timeout_s=timeout_s,
             target=f"{manager} of gateway {self.target}",
         )
@@ -372,7 +388,8 @@ class Headset:
         await self.send_frame(
             frames.plain_data(
                 self.id, data, to_type=to, ids=ids, groups=groups, manager=manager, request_id=request_id
-            )
+            ),
+            always,
         )
 
     async def ask(self, robot: int, manager: str, data: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
@@ -381,19 +398,29 @@ class Headset:
         ``manager`` says what: ``FunctionalityGetter``, ``RobotStatus``, ``RobotControl``. Raises CallTimeout,
         Unreachable, or Refused, as when an existing robot program does not know what it is asked.
         """
+
+        def send(number: int) -> Awaitable[None]:
+            frame = frames.plain_data(self.id, data, to_type=ROS, ids=(robot,), manager=manager, request_id=number)
+            return self.send_frame(frame, lambda: self._questions.waits(robot, number))
+
         answer = await self._questions.ask(
             robot,
-            lambda number: self.send(data, to=ROS, ids=(robot,), manager=manager, request_id=number),
+            send,
             timeout_s=timeout_s,
             target=f"{manager} of robot {robot}",
         )
         return _not_refused(answer)
 
-    async def send_frame(self, frame: bytes) -> None:
-        """Send bytes as they are, also what no headset would say. Raises Unreachable without a connection."""
-        if self._connection is None:
+    async def send_frame(self, frame: bytes, still_meant: StillMeant | None = None) -> None:
+        """Send bytes as they are, also what no headset would say; and again if they are lost with the connection, the
+        headset comes back as the same agent, and they are ``still_meant`` then. Raises Unreachable without a
+        connection."""
+        connection = self._connection
+        if connection is None or connection.closing:
             raise Unreachable(self.target, self._why or "the connection is lost")
-        await self._connection.send(frame)
+        if self._session is not None:
+            self._session.say(frame, still_meant)
+        await connection.send(frame)
 
     async def set_group(self, group: int) -> None:
         """Move to another group: a second configuration reply on the same connection."""
@@ -479,7 +506,8 @@ class Headset:
 
     # --- inside ---
 
-    async def _join(self) -> None:
+    async def _join(self) -> bool:
+        """Have a connection. Whether the headset is the same agent as before on it."""
         connection = await Connection.open(
             self.host,
             self.port,
@@ -487,20 +515,70 @@ class Headset:
             max_message_bytes=self._options.max_message_bytes,
             way=self._options.way,
         )
+        former, told = self._session, None
         try:
             first = await connection.receive_first(self._options.handshake_timeout_s)
             metadata, data = split_message(first)
             self._take_id(Metadata.decode(metadata), bytes(data))
-            await connection.send(self._configuration(self.id))
+            await connection.send(self._configuration(self.id, first=True))
+            if former is not None and former.secret:
+                told = await self._what_became(connection)
         except WireError as error:
             connection.abort()
             raise Unreachable(self.target, f"its first message gives no id: {error}") from error
         except BaseException:
             connection.abort()
             raise
+        resumed = isinstance(told, SessionResumed)
+        if former is not None and isinstance(told, SessionResumed):
+            self.id = told.agent_id
+            await self._say_again(connection, former.resumed(told.received, self.id))
+        else:
+            self._fail_open(Unreachable(self.target, "its gateway does not know this headset any more"))
+            wanted = self._options.reconnect and self._options.extensions > 0
+            self._session = Session(told.session if isinstance(told, SessionOpened) else "") if wanted else None
+        if self._session is not None:
+            self._before = self._session.received - connection.received
         self._connection = connection
-        log.info("online at %s with id %d", self.target, self.id)
-        self._tell_link(Link(True, self.id))
+        log.info("online at %s with id %d%s", self.target, self.id, ", as before" if resumed else "")
+        self._tell_link(Link(True, self.id, resumed=resumed))
+        return resumed
+
+    async def _say_again(self, connection: Connection, said: list[Frame]) -> None:
+        """Before anything else is said. What is lost once more is in the session by then."""
+        if self._session is not None:
+            for frame in said:
+                self._session.say(*frame)
+        for frame in said:
+            await connection.send(frame.data)
+
+    async def _what_became(self, connection: Connection) -> SessionResumed | SessionOpened | None:
+        """Of the session whose secret was shown, which a gateway says first; None: it knows no sessions. Raises
+        Unreachable, WireError."""
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + self._options.handshake_timeout_s
+        while True:
+            try:
+                message = await within(connection.receive(), deadline - loop.time())
+            except asyncio.TimeoutError:
+                return None
+            metadata_json, data = split_message(message)
+            manager = Metadata.decode(metadata_json).message_manager
+            if manager == SessionResumed.manager:
+                return decode_data(SessionResumed, bytes(data))
+            if manager == SessionOpened.manager:
+                return decode_data(SessionOpened, bytes(data))
+            if manager == AccessRefused.manager:
+                self._take_access(decode_data(AccessRefused, bytes(data)))
+
+    def _take_session(self, message: Incoming) -> None:
+        if message.metadata.message_manager == SessionOpened.manager:
+            if self._session is not None:
+                self._session.secret = decode_data(SessionOpened, message.data).session
+                self._before -= 1
+                self._session.received = 0
+        elif self._connection is not None:  # it comes too late, when all has been registered anew
+            self._connection.abort()
 
     async def _be_let_in(self) -> None:
         """Wait until the gateway has taken the token. Raises Refused, Unreachable."""
@@ -518,9 +596,20 @@ class Headset:
         self.id = decode_data(Welcome, data).agent_id
         self._welcome_request = metadata.request_id
 
-    def _configuration(self, own_id: int) -> bytes:
+    def _configuration(self, own_id: int, *, first: bool = False) -> bytes:
+        """``first`` on its connection: only there sessions matter."""
+        session, received = None, 0
+        if first and self._options.reconnect and self._options.extensions > 0:
+            former = self._session
+            session, received = (former.secret, former.received) if former is not None else ("", 0)
         return frames.configuration(
-            own_id, self.group, self._welcome_request, self._options.extensions, self._options.token
+            own_id,
+            self.group,
+            self._welcome_request,
+            self._options.extensions,
+            self._options.token,
+            session,
+            received,
         )
 
     async def _live(self) -> None:
@@ -530,7 +619,8 @@ class Headset:
             if self._connection is not None:
                 self._connection.abort()
             self._connection = None
-            self._fail_open(Unreachable(self.target, why))
+            if self._session is None or not self._session.secret or self._not_let_in:
+                self._fail_open(Unreachable(self.target, why))
             if self._not_let_in:
                 why = self._not_let_in
             if not self._options.reconnect or self._not_let_in:
@@ -543,12 +633,14 @@ class Headset:
     async def _rejoin(self) -> None:
         for attempt in itertools.count():
             try:
-                await self._join()
-                await self._register_all()
+                if not await self._join():
+                    await self._register_all()
             except Unreachable as error:
                 log.debug("%s", error)
                 self.drop_connection()
                 self._connection = None
+                if self._not_let_in:
+                    return
             else:
                 return
             await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
@@ -557,7 +649,7 @@ class Headset:
         for node in self.nodes:
             if node.agents or node.groups:
                 agents, groups = sorted(node.agents), sorted(node.groups)
-                await self.send_frame(frames.registration(self.id, node.spec, agents, groups))
+                await self.send_frame(frames.registration(self.id, node.spec, agents, groups), always)
             if isinstance(node, ActionClient):
                 await node.ask_again()
 
@@ -569,6 +661,8 @@ class Headset:
             while True:
                 await self._reading.wait()
                 raw = await connection.receive()
+                if self._session is not None:
+                    self._session.received = self._before + connection.received
                 try:
                     await self._take(raw)
                 except WireError as error:
@@ -590,6 +684,9 @@ class Headset:
             await self.send_frame(self._configuration(self.id))
             return
         elif not metadata.message_manager and self._questions.take(message):
+            return
+        elif metadata.message_manager in _OF_SESSIONS and message.sender_type is None:
+            self._take_session(message)
             return
         else:
             self._take_refusal(message)
@@ -639,21 +736,29 @@ class Headset:
     async def _beat(self) -> None:
         loop, heartbeat_s = asyncio.get_running_loop(), self._options.heartbeat_s
         while True:
-            connection = self._connection
+            connection, session = self._connection, self._session
             due_s = heartbeat_s if connection is None else connection.last_output + heartbeat_s - loop.time()
-            if due_s > 0:
-                await asyncio.sleep(due_s)
-            elif connection is not None:
-                try:
-                    await connection.send(frames.heartbeat())
-                except Unreachable:
-                    await asyncio.sleep(heartbeat_s)  # the reading task sees the end as well
+            if session is not None and session.received > session.told:
+                due_s = min(due_s, self._acknowledged_at + ACK_S - loop.time())
+            if due_s > 0 or connection is None:
+                await asyncio.sleep(due_s if session is None else min(max(due_s, 0.05), ACK_S))
+                continue
+            try:
+                if session is None:
+                    await self.send_frame(frames.heartbeat())
+                    continue
+                session.told, self._acknowledged_at = session.received, loop.time()
+                await self.send_frame(frames.heartbeat(session.told))
+            except Unreachable:
+                await asyncio.sleep(heartbeat_s)  # the reading task sees the end as well
 
     async def tell(self, frame: Callable[[int], bytes]) -> None:
         """Send what a reconnection would repeat anyway: without a connection it waits for that."""
         if self.reconnecting:
+            if self._session is not None:
+                self._session.say_later(frame)
             return
-        await self.send_frame(frame(self.id))
+        await self.send_frame(frame(self.id), always)
 
     def _add(self, node: Node) -> None:
         key = (node.spec.kind, node.spec.name)

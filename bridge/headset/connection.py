@@ -39,6 +39,8 @@ class Connection:
         self._decoder = MessageDecoder(max_message_bytes, skip_large=True)
         self.too_large = 0
         """How many messages were let go of because they were."""
+        self.taken = 0
+        """How many messages were taken from here."""
         self._whole: deque[bytes] = deque()
         self._draining = asyncio.Lock()
 
@@ -100,7 +102,18 @@ class Connection:
                 raise Unreachable(self.target, "the router closed the connection")
             self._whole.extend(self._decoder.feed(data))
             self._note_skipped()
+        self.taken += 1
         return self._whole.popleft()
+
+    @property
+    def received(self) -> int:
+        """How many messages have come and are dealt with."""
+        return self.taken + self.too_large
+
+    @property
+    def closing(self) -> bool:
+        """Whether nothing can be sent any more."""
+        return self._stream.closing
 
     def _note_skipped(self) -> None:
         for skipped in self._decoder.skipped:

@@ -53,11 +53,20 @@ class NodeSpec:
         object.__setattr__(self, "name", node_name(self.tos_name))
 
 
-def configuration(agent_id: int, group: int, request_id: int, extensions: int = 0, token: str | None = None) -> bytes:
+def configuration(
+    agent_id: int,
+    group: int,
+    request_id: int,
+    extensions: int = 0,
+    token: str | None = None,
+    session: str | None = None,
+    received: int = 0,
+) -> bytes:
     """The answer to the router's first message: who I am. ``request_id`` is that message's.
 
-    ``extensions`` is what the C# program does not say: the version of our extensions that this headset understands;
-    and so is ``token``, by which it is let in.
+    The rest is what the C# program does not say. ``extensions`` is the version of our extensions that this headset
+    understands, by ``token`` it is let in. ``session`` says that it comes back when its connection ends; with the
+    secret of a session that it is back, after ``received`` messages.
     """
     management: dict[str, object] = {
         "agentType": UNITY,
@@ -70,12 +79,17 @@ def configuration(agent_id: int, group: int, request_id: int, extensions: int = 
         management["extensions"] = extensions
     if token is not None:
         management["token"] = token
+    if session is not None:
+        management |= {"session": session, "received": received}
     return _management_frame(management)
 
 
-def heartbeat() -> bytes:
-    """I am still here: due after 5 s without other output."""
-    return _management_frame({"messageManager": Heartbeat.manager})
+def heartbeat(received: int | None = None) -> bytes:
+    """I am still here: due after 5 s without other output. ``received``: so many messages of the session have come."""
+    management: dict[str, object] = {"messageManager": Heartbeat.manager}
+    if received is not None:
+        management["received"] = received
+    return _management_frame(management)
 
 
 def go_offline(agent_id: int) -> bytes:

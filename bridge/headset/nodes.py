@@ -18,6 +18,7 @@ from macs_zenoh.timeouts import within
 from . import frames
 from .frames import NodeSpec
 from .mailbox import Mailbox
+from .resumption import StillMeant, always
 
 log = logging.getLogger("macs.headset")
 
@@ -68,8 +69,9 @@ class Owner(Protocol):
     def id(self) -> int:
         """The headset's id now."""
 
-    async def send_frame(self, frame: bytes) -> None:
-        """Send a frame. Raises Unreachable without a connection."""
+    async def send_frame(self, frame: bytes, still_meant: StillMeant | None = None) -> None:
+        """Send a frame, and again over the next connection if it was lost with this one, is ``still_meant`` then, and
+        the gateway knows us again. Raises Unreachable without a connection."""
 
     async def tell(self, frame: Callable[[int], bytes]) -> None:
         """Send what a reconnection would repeat anyway: without a connection it waits for that."""
@@ -239,7 +241,7 @@ class ServiceClient(Node):
         answer = asyncio.get_running_loop().create_future()
         self._open[agent, request_id] = answer
         try:
-            await self._owner.send_frame(frame)
+            await self._owner.send_frame(frame, lambda: not answer.done())
             return await within(answer, timeout_s)
         except asyncio.TimeoutError as error:
             raise CallTimeout(f"service {self.spec.tos_name} of robot {agent}", timeout_s) from error
@@ -314,7 +316,7 @@ class Service(Node):
             self._owner.id, self.spec, data, (request.robot,), request_id=request.request_id, manager=manager
         )
         with contextlib.suppress(Unreachable):
-            await self._owner.send_frame(frame)
+            await self._owner.send_frame(frame, always)
 
     def end(self) -> None:
         for task in self._open:

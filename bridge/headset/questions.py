@@ -52,6 +52,11 @@ class Questions:
         answer.set_result(message.data)
         return True
 
+    def waits(self, whom: int, number: int) -> bool:
+        """Whether somebody waits for the answer to this question."""
+        answer = self._open.get((whom, number))
+        return answer is not None and not answer.done()
+
     def refuse(self, number: int, reason: str) -> None:
         """The gateway did not let the question of this number pass."""
         fail_all([answer for (_, asked), answer in self._open.items() if asked == number], Refused(reason))

@@ -144,6 +144,13 @@ class ActionNode(InterfaceNode):
             elif goal.former == agent:  # its id is another one's now
                 goal.former = None
 
+    def fell_asleep(self, agent: Registrant) -> None:
+        """Its goals end as when it leaves, and it hears how when it is back."""
+        if self.rule.cancel_on_leave:
+            for goal in list(self._goals.values()):
+                if goal.owner == agent:
+                    self._cancel(goal)
+
     def returned(self, agent: Registrant) -> None:
         for goal in self._goals.values():
             if goal.owner is None and goal.former == agent:

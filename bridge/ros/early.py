@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 from macs_zenoh.protocol.budget import may_have_one_more
@@ -103,10 +103,11 @@ class EarlyMessages:
         waiting = [early for (_, own), mine in self._waiting.items() if own == key for early in mine]
         return [early.message for early in sorted(waiting, key=lambda early: early.deadline)]
 
-    def drop(self, sender: Sender) -> None:
-        """Forget what somebody sent who has left: its id may be another one's by the time there is a node."""
+    def drop(self, sender: Sender, kinds: Collection[int] | None = None) -> None:
+        """Forget what somebody sent who has left: its id may be another one's by the time there is a node. With
+        ``kinds`` only for nodes of these types."""
         for who, key in list(self._waiting):
-            if who == sender:
+            if who == sender and (kinds is None or key.node_type in kinds):
                 self._take(who, key, lambda early: True)
 
     def expire(self, now: float) -> dict[NodeKey, list[Message]]:

@@ -253,6 +253,9 @@ class InterfaceNode(ABC):
     def left(self, agent: Registrant) -> None:  # noqa: B027 - only some nodes care
         """An agent left the mesh, registered here or not. On the loop."""
 
+    def fell_asleep(self, agent: Registrant) -> None:  # noqa: B027 - only some nodes move the robot
+        """The connection of an agent has ended, and it may come back as the same one. On the loop."""
+
     def returned(self, agent: Registrant) -> None:  # noqa: B027 - only some nodes care
         """An agent that left is there again, and nobody had its id meanwhile. On the loop."""
 

@@ -52,6 +52,9 @@ KINDS: dict[int, type[InterfaceNode]] = {
 """Interface nodes by their number on the wire."""
 
 
+MOVING = (NodeType.PUBLISHER, NodeType.ACTION)
+"""Nodes for which messages may move the robot on and on."""
+
 GONE_S = 2.0
 """After so long nothing of a removed node is left in ROS."""
 LOOK_S = 0.05
@@ -242,6 +245,13 @@ class InterfaceNodes:
                 self._deregister(node, registrant)
 
         self._each(let_go, [node for node in self if registrant in node.registrants])
+
+    def fell_asleep(self, registrant: Registrant) -> None:
+        """The connection of an agent has ended, and it may come back as the same one. What it moves stops, and what it
+        sent to move something is not done later; all else stays."""
+        with self._early_lock:
+            self._early.drop(registrant, MOVING)
+        self._each(lambda node: node.fell_asleep(registrant))
 
     def arrived(self, registrant: Registrant) -> None:
         """An agent is seen now; what it sent before waits to be judged."""

@@ -99,9 +99,9 @@ class DeadMan:
         deadline = self.deadline()
         return deadline is not None and now >= deadline and self._trip(f"no command for {self.silence_s:g} s")
 
-    def left(self, agent: Hashable) -> bool:
-        """An agent is gone. Whether it trips."""
-        return self._commander is not None and self._commander == agent and self._trip(f"{agent} left")
+    def left(self, agent: Hashable, how: str = "left") -> bool:
+        """An agent is gone, or its connection is. Whether it trips."""
+        return self._commander is not None and self._commander == agent and self._trip(f"{agent} {how}")
 
     def disarm(self, why: str) -> bool:
         """Somebody else stops the robot. Whether commands were under way."""

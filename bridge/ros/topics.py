@@ -208,6 +208,12 @@ class PublisherNode(TopicNode):
             if self.deadman is not None and self.deadman.left(agent):
                 self._publish_stop(self.deadman.why, logging.INFO)  # as it does every day
 
+    def fell_asleep(self, agent: Registrant) -> None:
+        """Control it keeps as long as it would without a command."""
+        with self.lock:
+            if self.deadman is not None and self.deadman.left(agent, "has lost its connection"):
+                self._publish_stop(self.deadman.why)
+
     def cut_off(self) -> None:
         with self.lock:
             if self.deadman is not None and self.deadman.disarm("the mesh is lost"):

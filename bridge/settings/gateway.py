@@ -71,6 +71,10 @@ class GatewaySettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=
     """A connection silent for so long is closed. Agents send a heartbeat after 5 s without other output; but a headset
     that is taken off for a moment sends none, and existing ones never connect again. Hosts that died are noticed by
     TCP, within 20 s."""
+    resume_s: Annotated[float, Meta(ge=0, le=600)] = 30.0
+    """So long after its connection has ended a headset that asks for it can come back, by any port of the gateway, as
+    the same one: with its id, group, registrations, and what waited for it. Others hear nothing of it, but robots stop
+    what it was moving. 0: it leaves at once."""
     outbox_bytes: Annotated[int, Meta(ge=64 * 1024, le=4 * 1024**3)] = 8 * 1024 * 1024
     """Waiting for one connection, at most. One message may always wait, however large."""
     write_timeout_s: Seconds = 30.0

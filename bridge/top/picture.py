@@ -97,7 +97,7 @@ class Picture:
 
     def presence(self, change: Change, at_s: float) -> list[Event]:
         """Somebody came, changed or left."""
-        agent, online = change
+        agent, online, _ = change
         before = self.robots[agent.id].info if agent.type == ROS and agent.id in self.robots else None
         if agent.type != ROS:
             before = self.others.get(agent.key)

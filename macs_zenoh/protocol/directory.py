@@ -16,6 +16,9 @@ from .keyexpr import PRESENCE, type_name
 
 EPOCH = "."
 """Between a Zenoh id and an epoch. No Zenoh id has one."""
+ASLEEP = ".asleep"
+"""Behind an epoch, and before a number. Programs from before there were sessions do not know such a key: for them the
+agent has left."""
 
 
 def published(zid: str) -> str:
@@ -29,7 +32,8 @@ class AgentInfo(NamedTuple):
 
     ``type`` is the number; ``group`` 0 means none. ``zid`` is the Zenoh session that declared it, the agent's own or
     its gateway's, as it is `published`. ``epoch`` counts those that had this id in that session one after the other:
-    what belongs to one of them does not belong to the next.
+    what belongs to one of them does not belong to the next. ``asleep``, if it is not 0: its connection has ended for
+    the so many-th time, and it is expected back; nothing that it does goes on.
     """
 
     type: int
@@ -37,6 +41,7 @@ class AgentInfo(NamedTuple):
     group: int
     zid: str
     epoch: int = 0
+    asleep: int = 0
 
     @classmethod
     def parse(cls, key: str) -> AgentInfo | None:
@@ -44,15 +49,19 @@ class AgentInfo(NamedTuple):
         fields = PRESENCE.parse(key)
         if fields is None:
             return None
-        zid, _, epoch = fields.zid.partition(EPOCH)
-        if epoch and not (epoch.isascii() and epoch.isdigit() and len(epoch) < 20):
-            return None
-        return cls(fields.type, fields.id, fields.group, zid, int(epoch or 0))
+        session, _, asleep = fields.zid.partition(ASLEEP)
+        zid, _, epoch = session.partition(EPOCH)
+        for number in (epoch, asleep):
+            if number and not (number.isascii() and number.isdigit() and len(number) < 20):
+                return None
+        return cls(fields.type, fields.id, fields.group, zid, int(epoch or 0), int(asleep or 0))
 
     @property
     def presence(self) -> str:
         """The key of its token."""
         session = f"{self.zid}{EPOCH}{self.epoch}" if self.epoch else self.zid
+        if self.asleep:
+            session += f"{ASLEEP}{self.asleep}"
         return PRESENCE.of(type=self.type, id=self.id, group=self.group, zid=session)
 
     @property
@@ -76,6 +85,8 @@ class Change(NamedTuple):
 
     agent: AgentInfo
     online: bool
+    same: bool = False
+    """Whether it fell asleep or is awake again, and all else is as it was."""
 
 
 class Directory:
@@ -207,7 +218,8 @@ class Directory:
         self._ids.setdefault(agent.type, set()).add(agent.id)
         current = self._current(agent.key)
         gone = [Change(before, online=False)] if before is not None and replaced else []
-        return [] if before == current else [*gone, Change(current, online=True)]
+        same = before is not None and before._replace(asleep=current.asleep) == current
+        return [] if before == current else [*gone, Change(current, online=True, same=same)]
 
     def _release(self, agent: AgentInfo) -> list[Change]:
         claims = self._claims.get(agent.key, {})

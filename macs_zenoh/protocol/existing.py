@@ -35,12 +35,15 @@ from .messages import (
     FOR_NEWER,
     MANAGERS,
     ROS,
+    AccessRefused,
     AddNode,
     AgentsGone,
     CallFailure,
     Metadata,
     NodeRefused,
     NodeType,
+    SessionOpened,
+    SessionResumed,
     Welcome,
     is_json_object,
 )
@@ -58,7 +61,9 @@ _TOPICS, _REQUESTS, _ANSWERS = (
 )
 """Types whose messages are known to have no fields. Of others `CDR` alone is taken for one that is cut short."""
 
-ROUTER_ONLY = frozenset({Welcome.manager, AgentsGone.manager, NodeRefused.manager})
+ROUTER_ONLY = frozenset(
+    kind.manager for kind in (Welcome, AgentsGone, NodeRefused, AccessRefused, SessionOpened, SessionResumed)
+)
 """What only a router says: no agent says it to a TCP agent, newer or not."""
 
 CLASSES = frozenset(

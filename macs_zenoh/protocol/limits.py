@@ -92,3 +92,12 @@ PARTIAL_BYTES_PER_S = 16 << 10
 
 PARTIAL_WINDOW_S = 60.0
 """Over how long that is judged: a headset that is taken off in the middle of a frame has so long to come back."""
+
+ASLEEP_IN_ALL, ASLEEP_PER_ADDRESS = 1024, 256
+"""Agents of a gateway whose connection has ended and who may come back, in all and of one address."""
+
+KEPT_BYTES, KEPT_MESSAGES = 1 << 20, 4096
+"""What was said to one agent that may come back and is kept until it has arrived, without topics."""
+
+KEPT_IN_ALL_BYTES = 64 << 20
+"""The same for all of a gateway together; beyond it those give way that have most."""

@@ -41,6 +41,7 @@ AgentType = Annotated[int, Meta(ge=0, le=255)]
 AgentId = Annotated[int, Meta(ge=0, le=0xFFFF)]
 GroupId = Annotated[int, Meta(ge=0, le=255)]
 RequestId = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
+Count = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
 
 PLAIN = r"^[^\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]*\Z"
 """Text without control characters and without those that turn the direction of writing."""
@@ -150,7 +151,8 @@ class Configuration(Management, frozen=True):
 
     ``extensions`` is the version of our extensions that the agent understands. Without it, it is an existing program:
     its gateway sends it only what those are known to survive. ``token`` says what the agent may (docs/security.md).
-    Existing routers ignore both keys.
+    ``session`` says that the agent comes back when its connection ends, and when it does it is the secret of its
+    session; ``received`` is how many messages of that it has. Existing routers ignore all of these keys.
     """
 
     manager: ClassVar[str] = "AgentclientConfigurer"
@@ -161,12 +163,15 @@ class Configuration(Management, frozen=True):
     functionality: Functionality | None = None
     extensions: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0
     token: str | None = None
+    session: str | None = None
+    received: Count = 0
 
 
 class Heartbeat(Management, frozen=True):
-    """Agent → router, after 5 s without other output."""
+    """Agent → router, after 5 s without other output. ``received`` is how many messages of its session it has."""
 
     manager: ClassVar[str] = "HeartbeatHandler"
+    received: Count | None = None
 
 
 class OnlineRequest(Management, frozen=True):
@@ -291,6 +296,28 @@ class AccessRefused(Management, frozen=True):
     request_id: RequestId = 0
 
 
+class SessionOpened(Management, frozen=True):
+    """Gateway → agent that says that it comes back, ours: the secret by which it is known then, for ``resume_s`` after
+    its connection has ended. To who showed another secret it says that it is a new agent, whatever was wrong."""
+
+    manager: ClassVar[str] = "SessionOpened"
+    session: str
+    resume_s: float = 0.0
+
+
+class SessionResumed(Management, frozen=True):
+    """Gateway → agent that showed the secret of its session, ours: it is the same agent as before, with this id.
+
+    ``received`` is how many frames of the session have come; all behind them have to be sent again, if they are still
+    meant. ``gap``: of what the agent has not received something could not be kept.
+    """
+
+    manager: ClassVar[str] = "SessionResumed"
+    agent_id: AgentId
+    received: Count = 0
+    gap: bool = False
+
+
 class DataRefused(Struct, frozen=True, rename="camel"):
     """Robot → agent: what it sent for an interface node was not taken, and why. For agents that know our extensions.
 
@@ -375,6 +402,8 @@ def encode_management(value: Management) -> bytes:
     fields = {**fields_of(value), "messageManager": value.manager}
     if isinstance(value, Configuration) and not value.extensions:
         del fields["extensions"]  # as existing programs write it
+    if isinstance(value, Configuration) and not value.received:
+        del fields["received"]
     return msgspec.json.encode(fields)
 
 

@@ -22,6 +22,8 @@ class Outbox:
         self.limit_bytes = limit_bytes
         self.bytes = 0
         self.drops: Counter[str] = Counter()
+        self.calls_taken = 0
+        """How many of what `take` gave last are calls: those come first."""
         self._calls: deque[Chunk] = deque()
         self._call_bytes = 0
         self._large = 0
@@ -71,8 +73,9 @@ class Outbox:
     def take(self, limit_bytes: int) -> list[Chunk]:
         """The next messages to send, in order, up to about ``limit_bytes`` (at least one, if any)."""
         taken: list[Chunk] = []
-        size = 0
+        size = self.calls_taken = 0
         while self and size < limit_bytes:
+            self.calls_taken += bool(self._calls)
             chunk = self._next_call() if self._calls else self._next_stream()
             taken.append(chunk)
             size += len(chunk)

@@ -186,6 +186,29 @@ class Left(NamedTuple):
     """The agent is gone; ``reason`` is for the log. Close the connection."""
 
     reason: str
+    silent: bool = False
+    """Whether nothing is wrong but that it says nothing: its network may be gone."""
+
+
+class Resumed(NamedTuple):
+    """The agent is one that was here before, over another connection: from now on it has that one's id and all else
+    that was its own. ``spare_id`` and ``spare_credit`` are what it had until now."""
+
+    former: TcpAgent
+    spare_id: int
+    spare_credit: Credit
+    received: int
+    """How many messages of its session it has."""
+
+
+class NotResumed(NamedTuple):
+    """The agent showed the secret of no session, or of none that is its own."""
+
+
+class Arrived(NamedTuple):
+    """The agent has so many messages of its session."""
+
+    received: int
 
 
 Event = (
@@ -200,12 +223,18 @@ Event = (
     | Forbidden
     | NotLetIn
     | Withdrawn
+    | Resumed
+    | NotResumed
+    | Arrived
     | Rejected
     | Left
 )
 
 Admit = Callable[[str | None], Grant | None]
 """What somebody gets who shows this token, or none; None: it is not let in."""
+
+Resume = Callable[[str, Grant, int], "TcpAgent | None"]
+"""Who was here before with this session's secret, if whoever shows it has the same token and is of the same type."""
 
 STRANGER_HELD_BYTES = 64 << 10
 """What may wait of somebody who has yet to show a token: less than of an agent."""
@@ -240,12 +269,19 @@ class TcpAgent:
         admit: Admit | None = None,
         stranger: bool = False,
         recipient: Recipient | None = None,
+        resume: Resume | None = None,
     ) -> None:
         """``credit`` is what an earlier connection left, if there was one; ``closed_groups`` are not to be chosen.
         ``admit`` judges the token in the first configuration; without it whoever comes is let in. ``stranger``: a
-        token is wanted, and until it is shown less may be said."""
+        token is wanted, and until it is shown less may be said. ``resume`` finds who comes back with a session's
+        secret; without it nobody is expected back."""
         self._closed_groups = closed_groups
         self._admit = admit
+        self._resume = resume
+        self.returns = False
+        """Whether the agent says that it comes back when its connection ends."""
+        self.heard = 0
+        """How many frames of its session have come: all but the first configuration on each connection."""
         self.grant: Grant = OPEN
         self._rights: Rights | None = None
         self._permitted: dict[tuple[bytes, int, str, str], str | None] = {}
@@ -324,8 +360,11 @@ class TcpAgent:
         decoder, limited, shared = self._decoder, self._limits.frames_per_s, self.grant.credit
         for frame in decoder.advance(size):
             if isinstance(frame, WireError):
+                self.heard += self.state is ONLINE
                 self._reject(frame, 1, events)
                 continue
+            if self.state is ONLINE:
+                self.heard += frame.count
             try:
                 if (limited and not self._covered(frame, now)) or (
                     shared is not None and not shared.take(frame.count, now)
@@ -386,7 +425,7 @@ class TcpAgent:
         if self.state is GREETED:
             return [self._leave(f"no configuration within {self._limits.handshake_timeout_s:g} s")]
         if now >= self._heard_at + self._limits.idle_timeout_s:
-            return [self._leave(f"silent for {self._limits.idle_timeout_s:g} s")]
+            return [self._leave(f"silent for {self._limits.idle_timeout_s:g} s")._replace(silent=True)]
         return self._judge_partial(now)
 
     def _judge_partial(self, now: float) -> list[Event]:
@@ -401,8 +440,12 @@ class TcpAgent:
     def lost(self) -> None:
         """The connection has ended."""
         self.state = GONE
-        self._admit = None  # it knows the connection: a circle, which would keep a frame's megabytes for a while
+        self._forget_owner()
         self.recipient.lost()
+
+    def _forget_owner(self) -> None:
+        """It knows the connection: a circle, which would keep a frame's megabytes for a while."""
+        self._admit = self._resume = None
 
     # -- frames --------------------------------------------------------------------------------------------------
 
@@ -484,6 +527,8 @@ class TcpAgent:
                 self._configure(management, events)
                 return
             if isinstance(management, Heartbeat):
+                if management.received is not None:
+                    events.append(Arrived(management.received))
                 return
             if isinstance(management, GoOffline):
                 self._go_offline(management, events)
@@ -519,6 +564,8 @@ class TcpAgent:
             raise NotAllowed(f"a configured agent of type {self.agent_type} cannot become type {kind}")
         if self.state is GREETED and not self._let_in(configuration, events):
             return
+        if self.state is GREETED:
+            self._look_for_session(configuration, events)
         same = configuration.extensions == self.extensions
         if group in self._closed_groups:
             self._reject(NotAllowed(f"group {group} is not to be chosen from there (gateway.groups)"), 1, events)
@@ -557,7 +604,6 @@ class TcpAgent:
         if self._admit is None:
             return True
         grant = self._admit(configuration.token)
-        self._admit = None
         rights = grant.rights if grant is not None else None
         is_robot = configuration.agent_type != UNITY
         if grant is None or (is_robot and rights is not None and not rights.has("robot")):
@@ -566,6 +612,41 @@ class TcpAgent:
             return False
         self.grant, self._rights = grant, grant.rights
         return True
+
+    def _look_for_session(self, configuration: Configuration, events: list[Event]) -> None:
+        """Be who was here before, if the agent shows that it is."""
+        resume, shown = self._resume, configuration.session
+        self._forget_owner()
+        if shown is None or not configuration.extensions or resume is None:
+            return
+        self.returns = True
+        if not shown:
+            return
+        former = resume(shown, self.grant, configuration.agent_type)
+        if former is None:
+            events.append(NotResumed())
+            return
+        events.append(Resumed(former, self.agent_id, self.credit, configuration.received))
+        self._take_over(former, events)
+
+    def _take_over(self, former: TcpAgent, events: list[Event]) -> None:
+        """Have all that was the other's own. What the token permits is judged anew."""
+        self.agent_id, self.former_ids = former.agent_id, former.former_ids
+        self.connection_number, self.heard = former.connection_number, former.heard
+        self.agent_type, self.group, self.functionality = former.agent_type, former.group, former.functionality
+        self.extensions = former.extensions
+        self.drops += former.drops
+        self.corrected += former.corrected
+        self.credit, self._stops, self.recipient = former.credit, former._stops, former.recipient
+        self._registered, self._refused_at = former._registered, former._refused_at
+        self._judge = Judge(self.agent_type, self.agent_id)
+        former.state, self.state = GONE, ONLINE
+        if self._held:  # who knows sessions says nothing before
+            self.drops["before_configuration"] += sum(frame.count for frame in self._held)
+            self._held.clear()
+        if self.grant.rights != former.grant.rights:
+            events += self.rights_change(self.grant)
+        self._decoder.runs = not self._limits.frames_per_s and self.grant.credit is None
 
     def rights_change(self, grant: Grant) -> list[Event]:
         """The agent's token has other rights from now on. What is not permitted any more ends."""

@@ -13,9 +13,13 @@ GRACE_S = 2.0
 ROBOT = AgentInfo(1, 7, 3, "a1")
 
 agents = st.sampled_from(
-    [AgentInfo(*fields) for fields in ((1, 1, 0, "a"), (1, 1, 1, "a"), (1, 1, 0, "b"), (1, 2, 0, "a"), (2, 1, 1, "a"))]
+    [
+        *(AgentInfo(*fields) for fields in ((1, 1, 0, "a"), (1, 1, 1, "a"), (1, 1, 0, "b"), (1, 2, 0, "a"))),
+        AgentInfo(2, 1, 1, "a"),
+        AgentInfo(1, 1, 0, "a", asleep=1),
+    ]
 )
-"""Few, so that much happens to each: two groups of one session, two sessions with one id."""
+"""Few, so that much happens to each: two groups of one session, two sessions with one id, and one who sleeps."""
 
 steps = st.lists(
     st.tuples(st.just("alive"), agents)
@@ -58,7 +62,7 @@ class Story:
             self.now += float(value or 0)
         else:
             changes = self.directory.tick(self.now)
-        for agent, online in changes:
+        for agent, online, _ in changes:
             if online:
                 self.told[agent.key] = agent
             else:
@@ -283,3 +287,28 @@ def test_one_session_cannot_fill_the_directory() -> None:
     assert directory.token(key(AgentInfo(3, 1, 0, "a")), False, 0.0)
     assert directory.token(key(AgentInfo(2, 2, 0, "a")), True, 0.0)
     assert not directory.token(key(AgentInfo(2, 3, 0, "a")), True, 0.0)
+
+
+def test_who_sleeps_is_online_and_does_not_leave() -> None:
+    """Asleep and awake again is told as that and as nothing else, in whatever order the token before it ends; who does
+    not wake up leaves once."""
+    story = Story()
+    awake = AgentInfo(2, 7, 3, "a", 5)
+    asleep = awake._replace(asleep=1)
+    assert AgentInfo.parse(asleep.presence) == asleep
+    assert AgentInfo.parse(awake.presence) == awake
+    assert story.happen("alive", awake) == [Change(awake, online=True)]
+    assert story.happen("alive", asleep) == [Change(asleep, online=True, same=True)]
+    assert story.happen("ended", awake) == []
+    assert story.happen("alive", awake) == [Change(awake, online=True, same=True)]
+    assert story.happen("ended", asleep) == []
+    assert story.happen("alive", asleep) == [Change(asleep, online=True, same=True)]
+    assert story.happen("ended", awake) == []
+    once_more = asleep._replace(asleep=2)
+    assert story.happen("alive", once_more) == [Change(once_more, online=True, same=True)]
+    assert story.happen("ended", asleep) == []
+    asleep = once_more
+    regrouped = asleep._replace(group=4)
+    assert story.happen("alive", regrouped) == [Change(regrouped, online=True)]
+    assert story.happen("ended", asleep) == []
+    assert story.happen("ended", regrouped) == [Change(regrouped, online=False)]

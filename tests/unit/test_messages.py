@@ -74,10 +74,16 @@ NAMES_OF_FIELDS = {
 OURS = {
     "InterfaceNodeRefused": {"robotId", "nodeType", "nodeName", "tosName", "reason"},
     "AccessRefused": {"kind", "reason", "requestId"},
+    "SessionOpened": {"session", "resumeS"},
+    "SessionResumed": {"agentId", "received", "gap"},
 }
 """What existing programs do not have."""
 
-OUR_KEYS = {"AgentclientConfigurer": {"extensions", "token"}, "InterfaceNodeAdder": {"unityCdr"}}
+OUR_KEYS = {
+    "AgentclientConfigurer": {"extensions", "token", "session", "received"},
+    "HeartbeatHandler": {"received"},
+    "InterfaceNodeAdder": {"unityCdr"},
+}
 """Keys that existing programs do not write, and existing routers ignore."""
 
 DEEP = 2000
@@ -103,7 +109,7 @@ def values(annotation: Any) -> st.SearchStrategy[Any]:
         return st.just(msgspec.UNSET) | values(get_args(annotation)[0])
     if type(None) in get_args(annotation):
         return st.none() | st.one_of(*[values(kind) for kind in get_args(annotation) if kind is not type(None)])
-    return {str: st.text(max_size=20), bool: st.booleans()}[annotation]
+    return {str: st.text(max_size=20), bool: st.booleans(), float: st.floats(0, 1e6)}[annotation]
 
 
 def structs(kind: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
