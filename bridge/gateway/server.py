@@ -45,13 +45,10 @@ from macs_zenoh.protocol.messages import (
     UNITY,
     AccessRefused,
     AddNode,
-    AgentsGone,
     DataRefused,
-    GoneAgent,
     Metadata,
     NodeRefused,
     NodeType,
-    OnlineReply,
     Refusal,
     RemoveNode,
     encode_data,
@@ -97,6 +94,7 @@ from .listeners import Listeners
 from .memory import Memory
 from .renumbering import Renumbering
 from .robot_ids import RobotIds
+from .roll import Roll
 from .sleepers import Sleepers
 from .stead import Stead
 from .waiting import NAMED_S, WaitingRoom
@@ -142,8 +140,6 @@ class Gateway:
         named = "robots and groups named in registrations"
         self._named = Budget(named, each=NAMED_EACH, per_address=NAMED_PER_ADDRESS, total=NAMED_IN_ALL)
         self._credits: Credits[str] = Credits(settings.max_frames_per_s)
-        self._online_reply = b""
-        """Who is online, as the answer to whoever asks; empty when that has changed."""
         self._memory = Memory(settings.outbox_bytes, settings.max_frame_bytes)
         self._numbers = 0
         self._received_bytes = self._sent_bytes = 0
@@ -172,6 +168,7 @@ class Gateway:
         self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged)
         self._delivery = Delivery(self.agents, self.directory, self._layout, stead, judged, forwarding.afar)
         self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
+        self._roll = Roll(self._presence, self.agents)
         self._sleepers = Sleepers(
             settings.resume_s,
             self.agents,
@@ -368,10 +365,14 @@ class Gateway:
                 stranger=connection.stranger,
                 recipient=Recipient(partial(self._registered_there, connection), self.settings.robot_packages),
                 resume=self._sleepers.resume_for(connection) if self.settings.resume_s else None,
+                members=self._robots_in,
             )
             self.agents.enter(agent_id, connection)
             self._forwarding.enter(connection)
             connection.greet(peer)
+
+    def _robots_in(self, group: int) -> list[int]:
+        return [agent.id for agent in self.directory.of_type(ROS) if agent.group == group]
 
     def _is_elsewhere(self, agent_id: int) -> bool:
         return self.directory.is_elsewhere(agent_id, self.mesh.zid)
@@ -391,7 +392,7 @@ class Gateway:
 
     def _id_changes(self, connection: Connection) -> None:
         """A connection is about to have another id."""
-        self._online_reply = b""
+        self._roll.changed()
         self._forwarding.forget(connection)
         self._delivery.forget()
 
@@ -410,7 +411,7 @@ class Gateway:
             what = "%s is a Zenoh program: it wants a router, and this is a gateway"
             self._drops.once("zenoh_program", what, connection.address)
         self._forwarding.leave(connection)
-        self._online_reply = b""
+        self._roll.changed()
         self._drops += connection.all_drops()
         self._received_bytes += connection.received_bytes
         self._sent_bytes += connection.sent_bytes
@@ -691,7 +692,7 @@ class Gateway:
         if before is not None:
             loop.call_later(OVERLAP_S, before.close)
         self._delivery.forget()
-        self._online_reply = b""
+        self._roll.changed()
 
     def _regroup(self, connection: Connection) -> None:
         """An agent is in another group. Of many changes others see the first at once, and then the last."""
@@ -707,13 +708,7 @@ class Gateway:
             log.debug("%s is in group %d", connection, connection.peer.group)
 
     def _answer_online(self, connection: Connection, request_id: int) -> None:
-        if not self._online_reply:
-            ids = {kind: {agent.id for agent in self._presence.elsewhere(kind)} for kind in (ROS, UNITY)}
-            for own in self.agents.online():  # what we know ourselves comes back through the mesh a moment later
-                ids.setdefault(own.key[0], set()).add(own.agent_id)
-            reply = OnlineReply(ros_agent_ids=sorted(ids[ROS]), unity_agent_ids=sorted(ids[UNITY]))
-            self._online_reply = encode_data(reply)
-        connection.send_call(to_agent(self._online_reply, request_id=request_id))
+        connection.send_call(to_agent(self._roll.answer(connection), request_id=request_id))
 
     # -- subscriptions -------------------------------------------------------------------------------------------
 
@@ -753,15 +748,8 @@ class Gateway:
         return connection is not None and connection.peer.connection_number == agent.epoch
 
     def _tell(self, changes: list[Change]) -> None:
-        self._online_reply = b""
-        gone = [
-            GoneAgent(*change.agent.key) for change in changes if not (change.online or self._is_here(change.agent))
-        ]
-        if gone:
-            message = to_agent(AgentsGone(gone))
-            for connection in self.agents.online():
-                connection.recipient.gone(gone)
-                connection.send_call(message)
+        self._roll.changed()
+        self._roll.tell_gone(change.agent for change in changes if not (change.online or self._is_here(change.agent)))
         for change in changes:
             try:
                 self._robots.presence(change)

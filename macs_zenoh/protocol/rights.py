@@ -98,6 +98,12 @@ class Rights(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """Whether its agent may be in a group; 0 is none."""
         return group == 0 or self.groups == ANY or group in self.groups
 
+    def sees(self, robot: int, group: int) -> bool:
+        """Whether it may know that a robot of this group is online: one that it can name, by id or by group."""
+        if self.robots == ANY or robot in self.robots:
+            return True
+        return group != 0 and (self.groups == ANY or group in self.groups)
+
     def of_registration(self, node: AddNode | RemoveNode, robots: Iterable[int], groups: Iterable[int]) -> str | None:
         """Why an agent may not register on, or leave, a node of these robots and groups of robots; None: it may."""
         why = self._named(ROS, robots, groups)

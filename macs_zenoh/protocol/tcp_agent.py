@@ -61,7 +61,7 @@ from .messages import (
 from .recency import QUESTIONS
 from .recipient import Recipient, to_agent
 from .rights import OPEN, Grant, Rights
-from .wire import MACS, MAX_FRAME_BYTES, Frame, Frames, Header, Layout
+from .wire import MACS, MAX_FRAME_BYTES, Frame, Frames, Header, Layout, encode_frame, parse_frame
 
 
 class State(Enum):
@@ -270,14 +270,16 @@ class TcpAgent:
         stranger: bool = False,
         recipient: Recipient | None = None,
         resume: Resume | None = None,
+        members: Callable[[int], Collection[int]] | None = None,
     ) -> None:
         """``credit`` is what an earlier connection left, if there was one; ``closed_groups`` are not to be chosen.
         ``admit`` judges the token in the first configuration; without it whoever comes is let in. ``stranger``: a
         token is wanted, and until it is shown less may be said. ``resume`` finds who comes back with a session's
-        secret; without it nobody is expected back."""
+        secret; without it nobody is expected back. ``members`` has the robots in a group."""
         self._closed_groups = closed_groups
         self._admit = admit
         self._resume = resume
+        self._members = members
         self.returns = False
         """Whether the agent says that it comes back when its connection ends."""
         self.heard = 0
@@ -371,7 +373,7 @@ class TcpAgent:
                 ):
                     self._too_fast(frame, now, events)
                 elif self.state is ONLINE and not frame.has_management:
-                    events.append(self._sent(frame))
+                    self._send(frame, events)
                     continue
                 else:
                     self._frame(frame, events)
@@ -495,7 +497,7 @@ class TcpAgent:
             return False  # who is held to a rate sends no runs
         if not is_press(Metadata.decode(frame.metadata), frame.body) or not self._stops.take(1, now):
             return False
-        events.append(self._sent(frame))
+        self._send(frame, events)
         return True
 
     def _management(self, frame: Frames) -> Management | Custom:
@@ -542,7 +544,7 @@ class TcpAgent:
                     raise
                 return
         elif self.state is ONLINE:
-            events.append(self._sent(frame))
+            self._send(frame, events)
             return
         self._hold(frame)
 
@@ -741,7 +743,6 @@ class TcpAgent:
         key = refused.node_type, refused.node_name
         if key in self._registered:
             self._refused_at.setdefault(key, set()).add(refused.robot_id)
-            self._permitted.clear()
 
     def _permit(self, frame: Frames, metadata: Metadata, rights: Rights) -> None:
         """Whether a frame for others may go on: judged once for each destination and node. Raises NotPermitted."""
@@ -751,19 +752,39 @@ class TcpAgent:
         except KeyError:
             registered = self._registered.get((metadata.node_type, metadata.node_name))
             name = registered.node.tos_name if registered and isinstance(registered.node, AddNode) else None
-            why = rights.of_frame(frame.header, metadata, name) or self._refusal_there(frame.header, metadata)
+            why = rights.of_frame(frame.header, metadata, name)
             if len(self._permitted) >= self.PERMITTED:
                 self._permitted.clear()
             self._permitted[about] = why
         if why is not None:
             raise NotPermitted(why)
 
-    def _refusal_there(self, header: Header, metadata: Metadata) -> str | None:
-        """Whether a robot that would get a message has refused its node; in a group it may be any."""
-        refused = self._refused_at.get((metadata.node_type, metadata.node_name))
-        if not refused or (not header.groups and header.agent_type and refused.isdisjoint(header.ids)):
-            return None
-        return f"robot {min(refused)} refused this node"
+    def _around(self, sent: Sent, refused: set[int]) -> list[Event]:
+        """What becomes of a message whose node these robots have refused: of a group the others get it, by their ids.
+        Raises NotPermitted."""
+        header, events = sent.frame.header, list[Event]()
+        members = self._members_of(header)
+        if header.agent_type == UNITY or (header.agent_type and refused.isdisjoint(members.union(header.ids))):
+            return [sent]
+        inside = sorted(refused.intersection(members))
+        reason = f"robot {(inside or sorted(refused))[0]} refused this node"
+        others = sorted(members.union(header.ids) - refused)
+        if not header.agent_type or not others or not refused.isdisjoint(header.ids):
+            raise NotPermitted(reason)
+        layout, slots = self._layout, self._layout.id_slots
+        for single in sent.frame.each():
+            for begin in range(0, len(others), slots):
+                frame = encode_frame(ROS, others[begin : begin + slots], message=single.message, layout=layout)
+                events.append(Sent(parse_frame(frame, layout), sent.metadata, sent.readable))
+        return [*events, Forbidden(sent.metadata, tuple(inside), reason)]
+
+    def _members_of(self, header: Header) -> set[int]:
+        """The robots in the groups that a message is for; where nobody knows them, all that have refused anything."""
+        if not header.groups:
+            return set()
+        if self._members is None:
+            return set().union(*self._refused_at.values())
+        return {robot for group in header.groups for robot in self._members(group)}
 
     def _stream(self, stream: StreamData, frame: Frame) -> Streamed:
         if self.agent_type != ROS:
@@ -771,11 +792,15 @@ class TcpAgent:
         sent = self._judged(frame)
         return Streamed(sent.frame, sent.metadata, sent.readable, stream.targets())
 
-    def _sent(self, frame: Frames) -> Sent:
+    def _send(self, frame: Frames, events: list[Event]) -> None:
         sent = self._judged(frame)
         if self._rights is not None:
-            self._permit(sent.frame, sent.metadata, self._rights)
-        return sent
+            metadata = sent.metadata
+            self._permit(sent.frame, metadata, self._rights)
+            if self._refused_at and (refused := self._refused_at.get((metadata.node_type, metadata.node_name))):
+                events += self._around(sent, refused)
+                return
+        events.append(sent)
 
     def _judged(self, frame: Frames) -> Sent:
         raw = frame.metadata

@@ -41,6 +41,7 @@ from macs_zenoh.protocol.messages import (
     UNITY,
     AccessRefused,
     AddNode,
+    AgentsGone,
     Configuration,
     NodeRefused,
     NodeType,
@@ -323,6 +324,42 @@ async def test_changed_rights_hold_at_once(start_door: StartDoor, robots: list[A
         await anna.send(b"three", to=ROS, ids=[1])
         await until(lambda: b"three" in heard)
         assert heard == [b"one", b"three"]
+
+
+async def test_a_token_knows_of_its_own_robots_only(start_door: StartDoor, router: str) -> None:
+    """Who is online, and who leaves: of robots those that it names, by id or by group; without a token, all."""
+    door = await start_door(tls_without_token="everybody")
+    tokens = {
+        "one": door.tokens.make("one", may=["see"], robots=[1]),
+        "four": door.tokens.make("four", may=["see"], groups=[4]),
+        "any": door.tokens.make("any", may=["see"], robots="any"),
+        "none": door.tokens.make("none", may=["see"]),
+        "without": None,
+    }
+    sees = {"one": [1], "four": [2], "any": [1, 2], "none": [], "without": [1, 2]}
+    async with AsyncExitStack() as stack:
+        headsets = {
+            name: await stack.enter_async_context(await door.come("plain", token)) for name, token in tokens.items()
+        }
+        async with (
+            join(ROS, id=1, group=3, settings=patient(router)),
+            join(ROS, id=2, group=4, settings=patient(router)),
+        ):
+            await until(lambda: door.gateway.directory.ids(ROS) == [1, 2])
+            for _ in range(2):  # an answer that is remembered is the token's own
+                for name, headset in headsets.items():
+                    online = await headset.online()
+                    assert online.ros_agent_ids == sees[name], name
+                    assert len(online.unity_agent_ids) == len(tokens)
+        await until(lambda: door.gateway.directory.ids(ROS) == [])
+        for name, headset in headsets.items():
+            await headset.online()
+            gone = []
+            while len(headset._inbox):
+                message = await headset.receive(5)
+                if message.metadata.message_manager == AgentsGone.manager:
+                    gone += [agent.agent_id for agent in decode_data(AgentsGone, message.data).agents]
+            assert sorted(gone) == sees[name], name
 
 
 async def test_loopback_needs_no_token_unless_it_is_said(start_door: StartDoor) -> None:

@@ -1019,6 +1019,32 @@ def test_rights_hold_for_what_was_registered() -> None:
     assert errors(peer.receive(node_data("nd__a_b"), 0.0)) == []
 
 
+def test_a_robot_that_refused_a_node_takes_it_from_no_other_of_its_group() -> None:
+    """Those of a group that have not get a message by their ids, however many they are, and its sender is told of the
+    one; where none of them has, it goes to the group as ever. The others are those that are in the group just then."""
+    groups = {3: [1, *range(20, 35)], 4: [2]}
+    rights = Rights(may=["command", "send"], robots=[1, 2], groups=[3, 4], topics=["/a_b"])
+    peer = TcpAgent(7, 42, 0.0, limits=LIMITS, admit=lambda _: Grant("g", rights), members=groups.__getitem__)
+    peer.receive(shown("good") + registered("/a_b", [1, 2]), 0.0)
+    peer.registration_refused(NodeRefused(1, 2, "nd__a_b", "/a_b", "no such type"))
+    *sent, forbidden = peer.receive(node_data("nd__a_b", (), (3,)), 0.0)
+    headers = [event.frame.header for event in sent if isinstance(event, Sent)]
+    assert [header.ids for header in headers] == [tuple(range(20, 30)), tuple(range(30, 35))]
+    assert not any(header.groups for header in headers)
+    assert isinstance(forbidden, Forbidden)
+    assert forbidden.robots == (1,)
+    assert [type(event) for event in peer.receive(node_data("nd__a_b", (), (4,)), 0.0)] == [Sent]
+    groups[4].append(1)
+    (sent_on, _) = peer.receive(node_data("nd__a_b", (), (4,)), 0.0)
+    assert isinstance(sent_on, Sent)
+    assert sent_on.frame.header.ids == (2,)
+    groups[4] = [1]
+    assert errors(peer.receive(node_data("nd__a_b", (), (4,)), 0.0)) == [NotPermitted]
+    assert errors(peer.receive(node_data("nd__a_b", (1,), (3,)), 0.0)) == [NotPermitted]
+    groups[3].remove(1)
+    assert [type(event) for event in peer.receive(node_data("nd__a_b", (), (3,)), 0.0)] == [Sent]
+
+
 def test_changed_rights_take_back_what_they_do_not_permit() -> None:
     """Registrations, the group and what was remembered as permitted end with the right to them."""
     peer = guarded(Rights(may=["command"], robots=[1], groups=[3]))
