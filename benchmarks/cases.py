@@ -45,12 +45,10 @@ def connect(stage: Stage, path: str, from_port: int, to_port: int, receivers: in
     """Two workers on a path, which is then known to carry messages whole."""
     receiver, there = stage.worker("headset", to_port, receivers, group)
     sender, here = stage.worker("headset", from_port, 1, 0)
-    pair = Pair(path, sender, receiver, here["ids"][0], there["ids"], group)
-    _prove(pair)
-    return pair
+    return proved(Pair(path, sender, receiver, here["ids"][0], there["ids"], group))
 
 
-def _prove(pair: Pair) -> None:
+def proved(pair: Pair) -> Pair:
     """Send until something arrives, as agents need a moment to see each other; then compare every byte."""
     everybody = len(pair.receiver_ids)
     length = pair.sender.ask("message_bytes", size=1)["message_bytes"]
@@ -68,6 +66,7 @@ def _prove(pair: Pair) -> None:
         good = pair.receiver.answer()["good"]
         if good != 2 * everybody:
             raise ProgramFailed(f"{pair.path}: {good} of {2 * everybody} messages of {size} bytes arrived whole")
+    return pair
 
 
 def stream(plan: Plan, pair: Pair, size: int) -> Run:
@@ -172,7 +171,7 @@ def latency(stage: Stage, plan: Plan) -> Iterator[Figure]:
     pairs = [connect(stage, "one gateway", near, near), connect(stage, "two gateways", near, far)]
     zenoh = _raw_zenoh_round_trip(stage, plan, router, size, count)
     tcp = _raw_tcp_round_trip(stage, plan, size, count)
-    runs = {f"headset to headset, {pair.path}": _round_trip(plan, pair, size, count) for pair in pairs}
+    runs = {f"headset to headset, {pair.path}": measured_round_trip(plan, pair, size, count) for pair in pairs}
     runs["headset to agent"] = _agent_round_trip(stage, plan, router, near, size, count)
     values = in_turn(plan.rounds, {"zenoh": zenoh, "tcp": tcp, **runs})
     both = [a + b for a, b in zip(values["zenoh"], values["tcp"], strict=True)]
@@ -181,7 +180,8 @@ def latency(stage: Stage, plan: Plan) -> Iterator[Figure]:
     yield Figure("round trip, raw Zenoh", values["zenoh"], values["tcp"], "raw TCP", "us")
 
 
-def _round_trip(plan: Plan, pair: Pair, size: int, count: int) -> Run:
+def measured_round_trip(plan: Plan, pair: Pair, size: int, count: int) -> Run:
+    """The median time of a message and its answer, in µs."""
     length = {
         "there": pair.sender.ask("message_bytes", size=size)["message_bytes"],
         "back": pair.receiver.ask("message_bytes", size=size)["message_bytes"],

@@ -1,7 +1,8 @@
 """A worker that is one or more headsets on blocking sockets: sends, receives, echoes, registers.
 
 ``python -m benchmarks.headset PORT COUNT GROUP`` connects COUNT headsets to a gateway, or to the plain relay, on
-127.0.0.1; with ``robot`` behind it they are existing robot programs. ``python -m benchmarks.headset sink`` is the far
+127.0.0.1; with ``robot`` behind it they are existing robot programs, with ``tls CA`` or ``websocket CA`` they come by
+TLS or WebSocket. ``python -m benchmarks.headset sink`` is the far
 end for one such worker in place of a gateway.
 """
 
@@ -31,7 +32,7 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, split_message
 
-from . import sequence
+from . import sequence, ways
 from .worker import serve
 
 RECEIVE_BYTES = 1 << 20
@@ -58,10 +59,9 @@ class Headset:
         self._next_beat = time.monotonic() + BEAT_S
 
     @classmethod
-    def join(cls, port: int, group: int, *, robot: bool = False) -> Headset:
+    def join(cls, port: int, group: int, *, robot: bool = False, way: str = "plain", authority: str = "") -> Headset:
         """Connect and configure: a gateway counts this headset, or robot program, from now on."""
-        sock = socket.create_connection(("127.0.0.1", port))
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock = ways.connect(port, way, authority)
         decoder = MessageDecoder()
         while not (messages := decoder.feed(sock.recv(65536))):
             pass
@@ -323,7 +323,9 @@ def main() -> None:
         return
     port, count, group = map(int, sys.argv[1:4])
     robot = sys.argv[4:] == ["robot"]
-    workers = Headsets([Headset.join(port, group, robot=robot) for _ in range(count)])
+    way, authority = sys.argv[4:6] if len(sys.argv) > 5 else ("plain", "")
+    joined = [Headset.join(port, group, robot=robot, way=way, authority=authority) for _ in range(count)]
+    workers = Headsets(joined)
     names: tuple[str, ...] = ("send", "message_bytes", "register", "check", "receive", "ping", "echo")
     names = (*names, "prepare", "prepare_topic", "send_prepared", "receive_sequence")
     works = {name: getattr(workers, name) for name in names}

@@ -166,14 +166,14 @@ class Stage:
         self._start("router", "-m", "bridge", "router", "-l", f"tcp/127.0.0.1:{port}").line()
         return port
 
-    def gateway(self, router_port: int) -> int:
+    def gateway(self, router_port: int, *options: str) -> int:
         """Start ``macs gateway``; returns its port on 127.0.0.1."""
         under: list[str] = []
         if self._profile_into is not None:
             under = ["-m", "cProfile", "-o", str(self._profile_into / f"gateway-{self._gateways}.prof")]
         self._gateways += 1
         connect = f"tcp/127.0.0.1:{router_port}"
-        gateway = self._start("gateway", *under, *GATEWAY, "--port", "0", "-e", connect)
+        gateway = self._start("gateway", *under, *GATEWAY, "--port", "0", "-e", connect, *options)
         return _port_in(gateway.line())
 
     def relay(self) -> int:

@@ -531,7 +531,7 @@ class Connection(asyncio.BufferedProtocol):
         self._account()
         if self._pauses:
             transport.pause_reading()
-        self._looked = False
+        self._looked, self._read_by = False, math.inf
         self._schedule()
 
     def _give_to(self, successor: Connection) -> asyncio.Transport:

@@ -30,6 +30,7 @@ from bridge.ros.requests import control, status
 from bridge.ros.rules import Rules
 from bridge.ros.safety import EmergencyStop
 from bridge.ros.session import RosSession
+from bridge.ros.sleepers import stop_sleepers
 from bridge.ros.stop_line import StopLine
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh import managers
@@ -69,9 +70,6 @@ SESSIONS = 8192
 NO_STOP = "this robot has no emergency stop yet, and nobody can act on it until it has"
 STOP_AGAIN_S = 2.0
 """Pause between attempts to have an emergency stop, where its topic has another type."""
-ON_ITS_WAY_S = 0.2
-"""What somebody sent whose connection has ended has come by then."""
-
 STOP_MESSAGES_S = 0.1
 """How long ROS nodes get, at the end, to take the last messages: what a writer that ends has sent is lost unread."""
 
@@ -140,7 +138,7 @@ class RobotAgent:
         if settings.stop_topic and not await self._open_stop(settings.stop_topic, logging.ERROR):
             self._stop_later = asyncio.create_task(self._until_stop(settings.stop_topic))
         self.agent.on_presence(self._presence)
-        self.agent.on_asleep(self._fell_asleep)
+        stop_sleepers(self.agent, self.nodes)
         self.agent.on_id(self._id_changed)
         self.agent.mesh.on_link(self._link)
         self._last_words = self.agent.mesh.last_words(self.nodes.last_words)
@@ -404,15 +402,6 @@ class RobotAgent:
         elif before is not None:  # whether it was seen to leave or not: what it had is not the next one's
             self._forget(agent_key, for_good=True)
         self.nodes.arrived(agent_key)
-
-    def _asleep(self, agent: AgentInfo) -> None:
-        """Whose connection has ended moves nothing: nor does what is still on its way."""
-        if agent.asleep and self.agent.directory.get(*agent.key) == agent:
-            self.nodes.fell_asleep(Registrant(agent.type, agent.id))
-
-    def _fell_asleep(self, agent: AgentInfo) -> None:
-        self._asleep(agent)
-        asyncio.get_running_loop().call_later(ON_ITS_WAY_S, self._asleep, agent)
 
     def _forget(self, gone: Registrant, *, for_good: bool = False) -> None:
         self.nodes.forget(gone, for_good=for_good)
