@@ -160,6 +160,8 @@ class WebPort:
             if not response.prepared:
                 response.headers.setdefault("Cache-Control", "no-store")
                 response.headers["X-Content-Type-Options"] = "nosniff"
+                if origin in self._settings.web_origins:  # a listed page may use our modules, and read what is told
+                    response.headers["Access-Control-Allow-Origin"] = str(origin)
             return response
 
         return middle

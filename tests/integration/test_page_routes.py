@@ -100,6 +100,15 @@ async def test_files_are_ours_and_come_once(start_gateway: StartGateway, session
         assert (await one.get(outside)).status == 404
 
 
+async def test_a_listed_page_may_use_our_modules(start_gateway: StartGateway, session: aiohttp.ClientSession) -> None:
+    """A page whose origin the settings name may import and read what is here; others may not even ask."""
+    one = Browser(session, await start_gateway(web_port=0, web_origins=["https://hall.example.org"]))
+    listed = await one.get("/macs.js", Origin="https://hall.example.org")
+    assert listed.headers["Access-Control-Allow-Origin"] == "https://hall.example.org"
+    assert (await one.get("/macs.js", Origin="https://evil.example")).status == 403
+    assert "Access-Control-Allow-Origin" not in (await one.get("/macs.js")).headers
+
+
 @pytest.mark.parametrize("there", [True, False])
 async def test_without_libraries_the_page_says_what_to_do(
     start_gateway: StartGateway, session: aiohttp.ClientSession, monkeypatch: pytest.MonkeyPatch, there: bool

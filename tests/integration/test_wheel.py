@@ -97,6 +97,9 @@ def test_wheel_and_sdist_have_the_shipped_files(built: Path) -> None:
     wanted += [f"bridge/data/interfaces/{name}" for name in INTERFACES]
     wanted += [f"bridge/conformance/vectors/{name}.json" for name in FILES]
     wanted += ["bridge/py.typed", "macs_zenoh/py.typed"]
+    page = ROOT / "bridge" / "page" / "static"  # with what npm brought, where it has been here
+    wanted += [f"bridge/page/static/{path.relative_to(page)}" for path in page.rglob("*") if path.is_file()]
+    wanted += ["bridge/page/npm/package-lock.json"]
     assert [name for name in wanted if name not in in_wheel] == []
     assert [name for name in wanted if name not in in_sdist] == []
 
