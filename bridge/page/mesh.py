@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -17,6 +18,7 @@ from macs_zenoh.protocol.directory import Directory, published
 from macs_zenoh.protocol.keyexpr import LEASE, PING
 from macs_zenoh.protocol.messages import ROS, UNITY
 from macs_zenoh.protocol.rights import Grant
+from macs_zenoh.versions import installed
 
 from .fresh import Fresh
 from .robots import Robots, may_see
@@ -57,8 +59,9 @@ class Picture:
         self._pings: dict[str, Fresh[dict[str, Any]]] = {}
         self._room = asyncio.Semaphore(PINGS_AT_ONCE)
 
-    def now(self, visitor: Grant, address: str) -> dict[str, Any]:
-        """All of it, as far as it is known and the visitor may know; the rest is asked for meanwhile."""
+    def now(self, visitor: Grant, address: str, drops: Mapping[str, int]) -> dict[str, Any]:
+        """All of it, as far as it is known and the visitor may know; the rest is asked for meanwhile. ``address`` and
+        ``drops`` are this gateway's own."""
         agents = [agent for agent in self._directory if agent.type in (ROS, UNITY)]
         robots = [agent for agent in agents if agent.type == ROS]
         seen = [agent.id for agent in robots if may_see(visitor, agent.id)]
@@ -68,11 +71,13 @@ class Picture:
         return {
             "time": time.time(),
             "own": self._mesh.zid,
-            "address": address,
             "linked": self._mesh.linked,
             "routers": self._shown_routers(sessions),
             "gateways": sorted(gateways),
-            "sessions": self._shown_sessions(sessions),
+            "sessions": {
+                **self._shown_sessions(sessions),
+                self._mesh.zid: {"address": address, "version": installed("macs-zenoh"), "drops": dict(drops)},
+            },
             "robots": [
                 {"id": agent.id, "group": agent.group, "session": agent.zid, **_state(states.get(agent.id))}
                 for agent in robots
@@ -125,14 +130,7 @@ class Picture:
             answer = await self._mesh.query(PING.of(zid=zid), b"", timeout_s=PING_S)
             took_ms = (time.perf_counter() - began) * 1000
         said, _ = ping.decode(answer)
-        lost = sum(said.drops.values())
-        return {
-            "roundTripMs": took_ms,
-            "address": said.address,
-            "version": said.macs,
-            "lost": lost,
-            "drops": said.drops,
-        }
+        return {"roundTripMs": took_ms, "address": said.address, "version": said.macs, "drops": said.drops}
 
     async def _ask_gateways(self) -> set[str]:
         leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every())]

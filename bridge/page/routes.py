@@ -94,7 +94,8 @@ class Page:
         )
 
     async def _mesh(self, _: web.Request, visitor: Grant) -> web.StreamResponse:
-        return _json(self._picture.now(visitor, self._site.gateway.address))
+        gateway = self._site.gateway
+        return _json(self._picture.now(visitor, gateway.address, gateway.drops))
 
     async def _robot(self, request: web.Request, visitor: Grant) -> web.StreamResponse:
         robot = int(request.match_info["robot"])

@@ -89,7 +89,8 @@ async def test_it_conforms_in_node() -> None:
 
 @needs_browser
 @pytest.mark.timeout(240)
-async def test_it_conforms_in_chromium() -> None:
-    """The same in a browser."""
-    script = [sys.executable, str(HERE / "browser_headset.py"), "ws://127.0.0.1:{port}/macs"]
+@pytest.mark.parametrize("where", ["page", "worker"])
+async def test_it_conforms_in_chromium(where: str) -> None:
+    """The same in a browser, in a page and in a worker."""
+    script = [sys.executable, str(HERE / "browser_headset.py"), "ws://127.0.0.1:{port}/macs", where]
     proven(await judged(" ".join(script)))

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import signal
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -65,9 +66,13 @@ class Heard:
 
     def __init__(self) -> None:
         self.speeds: list[float] = []
+        self.stopped_at = 0.0
+        """When the first zero after another command came."""
 
     async def listen(self, peer: Peer) -> None:
         def take(twist: Any) -> None:
+            if twist.linear.x == 0 and self.last:
+                self.stopped_at = time.monotonic()
             self.speeds.append(twist.linear.x)
 
         await peer.session.run(lambda: peer.session.node.create_subscription(Twist, "/cmd_vel", take, 1000))
@@ -162,17 +167,20 @@ LETTING_GO = {
 async def test_it_stops_however_it_is_let_go(site: Site) -> None:
     """Released, blurred, hidden, cut, hung or closed while it drives: a zero follows, from the page or from the
     robot's dead-man, nothing that drives after it, and it has to be taken hold of anew."""
+    took: dict[str, float] = {}
     async with heard_at(site) as heard:
         for name, script in LETTING_GO.items():
             page = await site.with_robot()
             heard.speeds.clear()
             await hold(page)
             await until(lambda: len(heard.speeds) > 5 and heard.last > 0)
+            began = time.monotonic()
             if script:
                 await page.value(script)
             else:
                 await page.page.mouse.up()
             await until(lambda: heard.last == 0.0)
+            took[name] = (heard.stopped_at - began) * 1000
             after = len(heard.speeds)
             await page.page.mouse.move(300, 300)  # the button may be down still
             await asyncio.sleep(0.5)
@@ -182,8 +190,12 @@ async def test_it_stops_however_it_is_let_go(site: Site) -> None:
         heard.speeds.clear()
         await hold(page)
         await until(lambda: len(heard.speeds) > 5 and heard.last > 0)
+        began = time.monotonic()
         await page.page.close(run_before_unload=False)
         await until(lambda: heard.last == 0.0)
+        took["page_closed"] = (heard.stopped_at - began) * 1000
+    print(f"a zero came after {', '.join(f'{name} {ms:.0f} ms' for name, ms in took.items())}")
+    assert min(took[name] for name in ("released", "window_blurred", "tab_hidden")) <= 100
 
 
 async def test_a_network_that_stands_still_gets_no_more_commands(site: Site) -> None:

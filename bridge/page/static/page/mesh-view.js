@@ -130,22 +130,22 @@ export class MeshView {
     }
     gateways.forEach((zid, at) => {
       const here = place(at, gateways.length, COLUMNS.gateways);
-      const { roundTripMs, address } = sessions[zid] ?? {};
+      const { roundTripMs, address, drops } = sessions[zid] ?? {};
       for (const router of routersOf(zid)) links.append(line(here, routerAt.get(router.zid), "gateway", roundTripMs));
       this.#headsets(links, marks, here, behind.get(zid) ?? []);
-      marks.append(mark(here, "gateway", zid === own ? "this gateway" : "gateway", address ?? picture.address));
+      marks.append(mark(here, "gateway", zid === own ? "this gateway" : "gateway", address ?? "", lostOf(drops)));
     });
     robots.forEach((robot, at) => {
       const column = Math.floor(at / 24);
       const inColumn = Math.min(24, robots.length - column * 24);
       const here = place(at % 24, inColumn, COLUMNS.robots - (columns - 1) * 40 + column * 70);
-      const { roundTripMs, lost } = sessions[robot.session] ?? {};
+      const { roundTripMs, drops } = sessions[robot.session] ?? {};
       for (const router of routersOf(robot.session)) {
         const from = robots.length > 24 ? "faint" : "robot";
         links.append(line(routerAt.get(router.zid), here, from, robots.length > 24 ? undefined : roundTripMs));
       }
-      const kind = robot.stopped ? "robot stopped" : lost ? "robot losing" : "robot";
-      marks.append(mark(here, kind, `Robot ${robot.id}`, robot.stopped ? "stopped" : ""));
+      const kind = robot.stopped ? "robot stopped" : "robot";
+      marks.append(mark(here, kind, `Robot ${robot.id}`, robot.stopped ? "stopped" : "", lostOf(robot.drops, drops)));
     });
     this.picture.setAttribute("viewBox", `0 0 ${WIDTH} ${height}`);
     this.picture.setAttribute("aria-label", this.summary.textContent);
@@ -182,15 +182,25 @@ function line(from, to, kind, roundTripMs) {
   return svg("g", {}, path, text);
 }
 
-function mark({ x, y }, kind, title, note) {
-  const group = svg("g", { class: kind });
+function mark({ x, y }, kind, title, note, lost) {
+  const group = svg("g", { class: lost ? `${kind} losing` : kind });
   group.append(svg("rect", { x: x - 58, y: y - 17, width: 116, height: 34, rx: 9 }));
   group.append(svg("text", { x, y: note ? y - 1 : y + 4 }, title));
   if (note) group.append(svg("text", { class: "note", x, y: y + 12 }, note));
+  if (lost) group.append(svg("text", { class: "note lost", x, y: y + 29 }, lost.length > 26 ? `${lost.slice(0, 25)}…` : lost));
+  if (lost) group.append(svg("title", {}, `${title} lost: ${lost}`));
   return group;
+}
+
+/** What was lost, by name; empty when nothing was. */
+function lostOf(...drops) {
+  const found = drops.flatMap((each) => Object.entries(each ?? {})).filter(([, count]) => count);
+  return found.map(([name, count]) => `${name} ${count}`).join(", ");
 }
 
 /** Round trips as they are shown: what nobody sees is no reason to draw. */
 function rounded(sessions) {
-  return Object.entries(sessions).map(([zid, { roundTripMs }]) => [zid, roundTripMs === undefined ? "" : digits(roundTripMs)]);
+  return Object.entries(sessions).map(([zid, { roundTripMs, drops }]) => {
+    return [zid, roundTripMs === undefined ? "" : digits(roundTripMs), drops];
+  });
 }
