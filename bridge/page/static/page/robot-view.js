@@ -181,6 +181,7 @@ class Shown {
         if (this.ended) return;
         if (answer !== null && !answer.error) take(answer);
         this.problem = answer?.error ?? "";
+        this.#tellFacts();
       }
       await new Promise((resolve) => setTimeout(resolve, ms));
     }
