@@ -6,6 +6,8 @@
 
 const BUCKET_MS = 250;
 const BUCKETS = 8;
+/** Who has just begun is not taken for quick. */
+const LEAST_MS = 1000;
 
 /** How much comes, over the last two seconds, in a fixed amount of memory. */
 export class Rate {
@@ -32,7 +34,7 @@ export class Rate {
   now(now) {
     if (this.lastAt === null) return { hz: 0, bytesPerS: 0, ageMs: null };
     this.#turn(now);
-    const overS = Math.max(BUCKET_MS, Math.min(BUCKETS * BUCKET_MS, now - this.since)) / 1000;
+    const overS = Math.max(LEAST_MS, Math.min(BUCKETS * BUCKET_MS, now - this.since)) / 1000;
     const sum = (list) => list.reduce((all, each) => all + each, 0);
     return { hz: sum(this.#counts) / overS, bytesPerS: sum(this.#sizes) / overS, ageMs: now - this.lastAt };
   }
