@@ -86,9 +86,8 @@ async def test_a_service_may_answer_later(session: RosSession, peer: Peer) -> No
 
     service, respond = await session.run(serve)
     client = await peer.session.run(lambda: peer.session.node.create_client(SetBool, "/set"))
-    while not client.service_is_ready():
+    while not (client.service_is_ready() and session.node.count_clients("/set")):  # the service finds out later
         await asyncio.sleep(0.01)
-    await asyncio.sleep(0.2)  # the service finds out later than its client
     calls = [client.call_async(SetBool.Request(data=value)) for value in (True, False)]
     while len(open_calls) < 2:
         await asyncio.sleep(0.01)
