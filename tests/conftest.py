@@ -37,6 +37,7 @@ ALONE = (
 
 SOAK = (
     "tests/attack/",
+    "tests/conformance/test_conformance.py::test_right_and_wrong_routers_are_told_apart",
     "tests/network/",
     "tests/integration/test_deploy_doc.py",
     "tests/integration/test_limits.py::test_a_thousand_headsets",
