@@ -176,6 +176,12 @@ def log_to_stderr(form: str | None = None) -> None:
         prefix_logs("", form)
 
 
+def catch_up() -> None:
+    """Wait until what was logged is written, but not for long: what is written next to the log belongs behind it."""
+    for handler in logging.getLogger().handlers:
+        handler.flush()
+
+
 def prefix_logs(prefix: str, form: str | None = None) -> None:
     """Put ``prefix`` before each line of our own log, as before those of other programs on the same terminal."""
     form = form or os.environ.get(FORMAT, TEXT)

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
+from bridge import logs
 from bridge.cli import completion, options, output, running
 from macs_zenoh.errors import ConfigError, MacsError, UsageError
 from macs_zenoh.plain import plain
@@ -201,6 +202,7 @@ def _run(words: Sequence[str]) -> int:
 
 
 def _fail(verb: str, error: Exception, code: int) -> int:
+    logs.catch_up()  # the last line says why
     text = str(error)
     output.note(plain(text if text.startswith(f"macs {verb}: ") else f"macs {verb}: {text}"))
     return code

@@ -9,8 +9,13 @@ import re
 import subprocess
 import sys
 from datetime import datetime
+from pathlib import Path
 
+import pytest
+
+from bridge import cli
 from bridge.logs import PlainFormatter, Written
+from macs_zenoh.errors import Unreachable
 from tests.support.processes import ROOT
 
 LINES = 3000
@@ -105,3 +110,21 @@ def test_a_log_can_be_json() -> None:
         }
         assert "OSError: no" in second["exception"]
         assert all(line.isprintable() for line in lines)
+
+
+def test_why_a_verb_failed_stands_behind_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was logged before is written before, though a thread writes it."""
+    path = tmp_path / "stderr"
+    with path.open("a") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        handler = Written(stream)
+        logging.getLogger().addHandler(handler)
+        try:
+            for number in range(500):
+                logging.getLogger("macs.test").warning("line %d", number)
+            assert cli._fail("ls", Unreachable("tcp/x:1", "nobody listens there"), 1) == 1
+        finally:
+            logging.getLogger().removeHandler(handler)
+    *lines, last = path.read_text().splitlines()
+    assert lines == [f"line {number}" for number in range(500)]
+    assert last == "macs ls: tcp/x:1 cannot be reached: nobody listens there"
