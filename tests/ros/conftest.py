@@ -21,6 +21,7 @@ import macs_zenoh
 from bridge.interfaces import build
 from bridge.ros.agent import RobotAgent, open_robot
 from bridge.ros.session import RosSession
+from bridge.ros.topics import PublisherNode
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
 from tests.support.isolation import worker_number
@@ -63,6 +64,13 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Messages with every kind of field: the module that has them."""
     _installed("macs_kinds_msgs", tmp_path_factory)
     return importlib.import_module("macs_kinds_msgs.msg")
+
+
+@pytest.fixture(autouse=True)
+def _patient_publishers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot's new publisher has the time of a busy machine to find the subscriptions that are there: the first
+    command would be lost otherwise, and no test sends it twice."""
+    monkeypatch.setattr(PublisherNode, "MATCH_S", 10.0)
 
 
 @pytest.fixture

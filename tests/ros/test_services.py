@@ -26,7 +26,7 @@ from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, encode_data, node_name
 from macs_zenoh.protocol.reading import Message
 from tests.support.delays import Delays
-from tests.support.ros_peer import Peer, adding, removing
+from tests.support.ros_peer import Peer, adding, reaches, removing
 from tests.support.waiting import PATIENCE_S, get, until
 
 DEADLINE_S = 0.5
@@ -430,7 +430,7 @@ async def test_a_thousand_calls_with_every_third_unanswered(
     caller = await caller_of(nodes, peer, "/every_third")
     await nodes.add(adding("/talk", node_type=NodeType.PUBLISHER))
     heard = await peer.subscription(String, "/talk")
-    await peer.sees("/talk", publishers=1, subscriptions=1)
+    await reaches(nodes, "/talk")
 
     def answer(to: Registrant, metadata: Metadata, data: bytes) -> None:
         if metadata.request_id % 3:

@@ -35,7 +35,7 @@ from macs_zenoh.protocol.messages import Metadata, NodeType, node_name
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.wire import encode_frame, encode_message, parse_frame
 from tests.ros import unity_serializer
-from tests.support.ros_peer import Peer, adding, command
+from tests.support.ros_peer import Peer, adding, command, reaches
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, get, until
 
@@ -229,7 +229,7 @@ async def test_a_command_without_fields_reaches_ros(nodes: InterfaceNodes, peer:
     """Take off and land are std_msgs/Empty: ROS gets the byte that it needs, whoever left it out."""
     received = await peer.subscription(Empty, "/takeoff")
     await nodes.add(adding("/takeoff", "std_msgs/Empty", node_type=2, unity_cdr=True))
-    await peer.sees("/takeoff", publishers=1, subscriptions=1)
+    await reaches(nodes, "/takeoff")
     for data in (NOTHING, NOTHING + b"\0", bytes(serialize_message(Empty()))):
         nodes.deliver(command("/takeoff", data, "std_msgs/Empty"))
         assert await get(received) == Empty()
@@ -241,7 +241,7 @@ async def test_a_trajectory_keeps_its_times(nodes: InterfaceNodes, peer: Peer) -
     message = JointTrajectory(joint_names=["a", "b", "c"], points=[POINT])
     received = await peer.subscription(JointTrajectory, "/arm")
     await nodes.add(adding("/arm", "trajectory_msgs/JointTrajectory", node_type=2, unity_cdr=True))
-    await peer.sees("/arm", publishers=1, subscriptions=1)
+    await reaches(nodes, "/arm")
     nodes.deliver(command("/arm", unity_serializer.write(message)))
     assert await get(received) == message
 

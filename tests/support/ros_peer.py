@@ -12,7 +12,9 @@ from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
+from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.session import RosSession
+from bridge.ros.topics import PublisherNode
 from macs_zenoh.agent import Agent
 from macs_zenoh.mesh import Sample
 from macs_zenoh.protocol.keyexpr import STREAM
@@ -59,6 +61,14 @@ class Peer:
         await until(
             lambda: node.count_publishers(topic) == publishers and node.count_subscribers(topic) == subscriptions
         )
+
+
+async def reaches(nodes: InterfaceNodes, topic: str) -> None:
+    """Wait until what the robot publishes on a topic arrives: ROS loses what a publisher says before it has found its
+    subscriptions, whatever these know."""
+    node = nodes.on_topic(NodeType.PUBLISHER, topic)
+    assert isinstance(node, PublisherNode)
+    await until(lambda: node._publisher.get_subscription_count())
 
 
 async def known(robot: RosSession, *services: str) -> None:
