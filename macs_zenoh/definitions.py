@@ -1,4 +1,4 @@
-"""What `rosbags` leaves out of the text of a ROS definition: defaults of fields, and wstring. Pure."""
+"""What `rosbags` leaves out of ROS definitions: services, defaults of fields, and wstring. Pure."""
 
 from __future__ import annotations
 
@@ -12,6 +12,22 @@ from .errors import UsageError
 WIDE_PACKAGE = "macs_wide"
 WIDE = re.compile(rf"{WIDE_PACKAGE}/msg/W(?P<limit>\d*)")
 """Instead of wstring: a structure of its UTF-16 units, which is the same in CDR; with its limit if it has any."""
+
+SERVICES = {
+    "std_srvs/SetBool": "bool data\n---\nbool success\nstring message\n",
+    "std_srvs/Trigger": "---\nbool success\nstring message\n",
+    "std_srvs/Empty": "---\n",
+    "action_msgs/CancelGoal": (
+        "action_msgs/GoalInfo goal_info\n---\nint8 return_code\naction_msgs/GoalInfo[] goals_canceling\n"
+    ),
+    "type_description_interfaces/GetTypeDescription": (
+        "string type_name\nstring type_hash\nbool include_type_sources true\n---\nbool successful\n"
+        "string failure_reason\ntype_description_interfaces/TypeDescription type_description\n"
+        "type_description_interfaces/TypeSource[] type_sources\n"
+        "type_description_interfaces/KeyValue[] extra_information\n"
+    ),
+}
+"""Services that everybody uses; rosbags has messages only."""
 
 _FIELD = re.compile(r"\s*(?P<type>(?:[^\s=]|<=)+)\s+(?P<name>[a-zA-Z]\w*)(?P<rest>\s.*)?")
 _WIDE_TYPE = re.compile(r"wstring(?:<=(?P<limit>\d+))?(?P<array>(?:\[.*\])?)")

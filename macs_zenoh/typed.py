@@ -32,13 +32,6 @@ from .errors import MissingExtra, UsageError, WireError
 
 MESSAGE_TYPE_PARTS = 3  # pkg, msg, Name
 
-_BUILT_IN_SERVICES = {
-    "std_srvs/SetBool": "bool data\n---\nbool success\nstring message\n",
-    "std_srvs/Trigger": "---\nbool success\nstring message\n",
-    "std_srvs/Empty": "---\n",
-}
-"""Definitions that everybody uses and that rosbags does not have (it brings messages only)."""
-
 _DEFAULTS: dict[tuple[str, str], object] = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
     ("sensor_msgs/msg/NavSatStatus", "status"): -2,
@@ -163,6 +156,16 @@ class Types:
             raise BadCdr(name, str(error)) from error
         return self._plain_message(name, message, max_bytes)
 
+    def fields(self, type_name: str) -> Sequence[tuple[str, Any]]:
+        """A type's fields in their order, as `rosbags` has them. Raises UnknownType."""
+        name = self._known(type_name)
+        return [field for field in self._store.fielddefs[name][1] if field[0] != _FILLER]
+
+    def add(self, type_name: str, text: str) -> None:
+        """Know a message, or a part of a service or action, by its definition. Raises UnknownType."""
+        package, short, _ = _parse(type_name)
+        self._register(f"{package}/msg/{short}", text)
+
     def _trimmed(self, name: str, cdr: bytes | bytearray | memoryview) -> bytes | bytearray | memoryview:
         """Without what rclpy leaves behind a message of some types, for which it asks for more room than they take."""
         if len(cdr) <= _SLACK_BYTES or bytes(cdr[:2]) != b"\x00\x01" or not self._may_have_slack(name):
@@ -217,7 +220,7 @@ class Types:
     def _load_parts(self, package: str, kind: str, name: str) -> None:
         """The messages that a service or an action consists of."""
         path = self._find(package, kind, name)
-        text = path.read_text(encoding="utf-8") if path else _BUILT_IN_SERVICES.get(f"{package}/{name}")
+        text = path.read_text(encoding="utf-8") if path else definitions.SERVICES.get(f"{package}/{name}")
         if text is None:
             raise UnknownType(f"{package}/{name}")
         parts = [[]]  # type: list[list[str]]

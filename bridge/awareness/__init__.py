@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-import bridge.ros  # noqa: F401 - says what to do where there is no rclpy
+import bridge.ros.installed  # noqa: F401 - says what to do where there is no rclpy
 from macs_zenoh.errors import MacsError
 
 

@@ -26,6 +26,7 @@ NAMES = (
     "router",
     "gateway",
     "agent",
+    "rmw-zenoh",
     "headset",
     "awareness",
     "ls",
@@ -60,7 +61,7 @@ class Verbs(Mapping[str, ModuleType]):
     def __getitem__(self, name: str) -> ModuleType:
         if name not in NAMES:
             raise KeyError(name)
-        return importlib.import_module(f"{__name__}.{name}")
+        return importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
 
     def __iter__(self) -> Iterator[str]:
         return iter(NAMES)

@@ -12,6 +12,7 @@ from bridge.cli.running import STOP_WITH_STDIN, say_ready
 
 def robot() -> int:
     """Be the demo robot until SIGTERM, or until ``macs up`` is gone."""
+    import bridge.ros.installed  # noqa: F401 - says what to do where there is no rclpy
     from bridge.ros import demo
 
     if os.environ.pop(STOP_WITH_STDIN, None):

@@ -257,7 +257,12 @@ def _details(robot: RobotReport) -> list[Block]:
         return [f"  tells nothing: {robot.problem}" if robot.problem else f"  {silent}"]
     domain = "?" if status.ros_domain is None else str(status.ros_domain)
     lines: list[Block] = [
-        _facts(("ROS node", status.ros_node), ("ROS domain", domain), ("emergency stop", _stop(status)))
+        _facts(
+            ("ROS node", status.ros_node),
+            ("ROS domain", domain),
+            ("emergency stop", _stop(status)),
+            *([("agent", status.beside)] if isinstance(status.beside, str) else []),
+        )
     ]
     # the stop has a node of its own, which concerns people only when somebody has registered it
     nodes = [node for node in status.nodes if node.role != "emergency stop" or node.registrants]

@@ -10,19 +10,18 @@ import asyncio
 import logging
 import struct
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import msgspec
 from msgspec import structs
-from rclpy.serialization import deserialize_message, serialize_message
 
 from bridge.ros.graph import SEND_GOAL
-from bridge.ros.interface import InterfaceNode, Registrant, Robot, first_line, ros_errors
+from bridge.ros.interface import InterfaceNode, Registrant, Robot
 from bridge.ros.servers import ABSENT_S, Search
+from bridge.ros.side import ActionType, Goals, GoalTold, Side, first_line
 from bridge.ros.stream import cdr_problem
-from bridge.ros.types import resolve
-from bridge.ros.unity_cdr import Parts, TooManyParts, UnityCdr, readable
+from bridge.ros.unity_cdr import TooManyParts, readable
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import ROS, ActionVerb, AddNode, NodeType
 from macs_zenoh.protocol.reading import Message
@@ -63,7 +62,7 @@ class Goal:
     """CDR, or the reason in UTF-8 when there is no result."""
     finished_at: float | None = None
     cancel_wanted: bool = False
-    handle: Any = None
+    accepted: bool = False
     former: Registrant | None = None
     """Who had it when it left. It goes on hearing of the goal if it comes back before another has its id."""
 
@@ -79,14 +78,12 @@ class ActionNode(InterfaceNode):
 
     def __init__(self, robot: Robot, request: AddNode) -> None:
         super().__init__(robot, request)
-        self._client: Any = None
-        self._types: Any = None
-        self._goal_cdr: UnityCdr | None = None
-        self._parts: Parts | None = None
+        self._client: Goals | None = None
+        self._types: ActionType | None = None
         self._goals: dict[bytes, Goal] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._watching: asyncio.TimerHandle | None = None
-        self._search = Search(lambda: self._client is not None and self._client.server_is_ready())
+        self._search = Search(lambda: self._client is not None and self._client.is_ready())
         self._seen_at = 0.0
         self._accept_s = robot.rules.call_timeout_s(self.topic)
         self._loop = asyncio.get_running_loop()
@@ -96,29 +93,23 @@ class ActionNode(InterfaceNode):
         return bool(self.registrants) or bool(self._goals)
 
     @classmethod
-    def resolve(cls, node: Any, name: str) -> str:
+    def resolve(cls, side: Side, name: str) -> str:
         """ROS remaps each of an action's services by itself; goals go where this one leads."""
-        resolved = str(node.resolve_service_name(name + SEND_GOAL))
+        resolved = side.service_name(name + SEND_GOAL)
         if not resolved.endswith(SEND_GOAL):
             raise Refused(f"{name[:80]}: its goals are remapped to {resolved}, which is no action")
         return resolved.removesuffix(SEND_GOAL)
 
     def known_names(self) -> list[str]:
-        services = self.robot.session.node.get_service_names_and_types()
+        services = self.robot.session.services()
         return [name.removesuffix(SEND_GOAL) for name, _ in services if name.endswith(SEND_GOAL)]
 
     def open(self) -> None:
-        node = self.robot.session.node
-        goals = dict(node.get_service_names_and_types()).get(self.topic + SEND_GOAL, [])
+        side = self.robot.session
+        goals = dict(side.services()).get(self.topic + SEND_GOAL, [])
         self.interface.check(self.topic, {of_type.removesuffix("_SendGoal") for of_type in goals})
-        self._types = resolve(str(self.interface), "action")
-        self._goal_cdr = UnityCdr.of(self._types.Goal)
-        self._parts = Parts.of(self._types.Goal)
-        # 12 MB, of which robots without actions need nothing
-        from rclpy.action import ActionClient
-
-        with ros_errors(self.request.tos_name):
-            self._client = ActionClient(node, self._types, self.request.tos_name)
+        self._types = side.action(self.interface, self.topic)
+        self._client = side.goals(self._types, self.request.tos_name)
 
     async def settle(self) -> None:
         await self._found(self.MATCH_S)
@@ -133,7 +124,7 @@ class ActionNode(InterfaceNode):
     def close(self) -> None:
         client, self._client = self._client, None
         if client is not None:
-            client.destroy()
+            client.close()
 
     def left(self, agent: Registrant) -> None:
         for goal in list(self._goals.values()):
@@ -200,13 +191,15 @@ class ActionNode(InterfaceNode):
         if goal is not None:  # asked again, for want of an answer
             if goal.owner is None:
                 self._adopt(goal, message)
-            self._tell(goal, ActionVerb.ACCEPTED, int(goal.handle is not None))
+            self._tell(goal, ActionVerb.ACCEPTED, int(goal.accepted))
             return
         goal = self._asked(message, goal_id)
         goal.group = self.robot.group_of(sender)
         body = message.data[ID_BYTES:]
         try:
-            body = readable(self._goal_cdr, self._parts, body, self.robot.rules.settings.max_message_parts)
+            of = self._types.goal if self._types is not None else None
+            if of is not None:
+                body = readable(of.unity, of.parts, body, self.robot.rules.settings.max_message_parts)
         except TooManyParts as error:
             self._reject(goal, f"the goal of {len(body)} bytes is too much: {error}")
             return
@@ -271,26 +264,27 @@ class ActionNode(InterfaceNode):
             return
         try:
             await self.robot.session.run(lambda: self._send_goal(goal, body))
-        except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is
+        except Exception as error:  # noqa: BLE001 - the middleware's, whatever it is
             self._drop(goal, f"the goal is no {self.interface}: {first_line(error)}")
             return
         self._watch()
         await asyncio.sleep(self._accept_s)
-        if goal.handle is None and goal.finished_at is None and goal.id in self._goals:
+        if not goal.accepted and goal.finished_at is None and goal.id in self._goals:
             self._drop(goal, f"{self.topic} did not accept the goal within {self._accept_s:g} s")
 
     async def _found(self, within_s: float) -> bool:
         self._seen_at = self._loop.time()
         return await self._search.found(within_s)
 
-    def _accepted(self, goal: Goal, handle: Any) -> None:
-        if goal.id not in self._goals:  # it came too late
-            self.robot.session.submit(handle.cancel_goal_async)
+    def _accepted(self, goal: Goal, accepted: bool) -> None:
+        if goal.id not in self._goals:
+            if accepted:  # it came too late
+                self.robot.session.submit(lambda: self._send_cancel(goal))
             return
-        if not handle.accepted:
+        if not accepted:
             self._drop(goal, f"{self.topic} rejected the goal")
             return
-        goal.handle, goal.status = handle, ACCEPTED
+        goal.accepted, goal.status = True, ACCEPTED
         self._tell(goal, ActionVerb.ACCEPTED, 1)
         if goal.cancel_wanted:
             self._cancel(goal)
@@ -303,14 +297,17 @@ class ActionNode(InterfaceNode):
     def _finished(self, goal: Goal, status: int, result: bytes) -> None:
         if goal.finished_at is not None:
             return
-        goal.status, goal.result, goal.finished_at, goal.handle = status, result, time.monotonic(), None
+        goal.status, goal.result, goal.finished_at, goal.accepted = status, result, time.monotonic(), False
         self._tell(goal, ActionVerb.RESULT, status, result)
         self._watch()
+
+    def _failed(self, goal: Goal, reason: str) -> None:
+        self._finished(goal, ABORTED, reason.encode())
 
     def _cancel(self, goal: Goal) -> None:
         if goal.finished_at is not None:
             self._tell(goal, ActionVerb.CANCEL, 0, b"the goal has finished")
-        elif goal.handle is None:
+        elif not goal.accepted:
             goal.cancel_wanted = True
         else:
             self.robot.session.submit(lambda: self._send_cancel(goal))
@@ -340,7 +337,7 @@ class ActionNode(InterfaceNode):
             return
         kept_s = self.robot.rules.settings.result_timeout_s
         now = self._loop.time()
-        if self._client.server_is_ready():
+        if self._client.is_ready():
             self._seen_at = now
         gone = now - self._seen_at > GONE_S
         for goal in list(self._goals.values()):
@@ -364,60 +361,39 @@ class ActionNode(InterfaceNode):
         if self.held_since(goal.stops):  # pressed while the goal waited for the action
             self._loop.call_soon_threadsafe(self._drop, goal, self.stop_reason())
             return
-        message = deserialize_message(body, self._types.Goal)
-        tell = self._loop.call_soon_threadsafe
 
-        def fed_back(feedback: Any) -> None:
-            tell(self._fed_back, goal, bytes(serialize_message(feedback.feedback)))
+        def told(callback: Callable[..., None]) -> Callable[..., None]:
+            def tell(*what: object) -> None:
+                self._loop.call_soon_threadsafe(callback, goal, *what)
 
-        def accepted(future: Any) -> None:
-            handle = self._outcome(goal, future)
-            if handle is not None:
-                tell(self._accepted, goal, handle)
-                if handle.accepted:
-                    handle.get_result_async().add_done_callback(finished)
+            return tell
 
-        def finished(future: Any) -> None:
-            response = self._outcome(goal, future)
-            if response is not None:
-                tell(self._finished, goal, int(response.status), bytes(serialize_message(response.result)))
-
-        uuid = self._types.Impl.SendGoalService.Request().goal_id
-        uuid.uuid = list(goal.id)
-        self._client.send_goal_async(message, fed_back, uuid).add_done_callback(accepted)
-
-    def _outcome(self, goal: Goal, future: Any) -> Any:
-        """What a future of rclpy gave, None when it failed, which is told."""
-        try:
-            return future.result()
-        except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is
-            reason = first_line(error).encode()
-            self._loop.call_soon_threadsafe(self._finished, goal, ABORTED, reason)
-            return None
+        self._client.send(
+            goal.id,
+            body,
+            GoalTold(told(self._accepted), told(self._fed_back), told(self._finished), told(self._failed)),
+        )
 
     def _send_cancel(self, goal: Goal, times: int = 1) -> None:
-        if goal.handle is None or self._client is None:
+        if self._client is None or goal.finished_at is not None:
             self._loop.call_soon_threadsafe(self._tell, goal, ActionVerb.CANCEL, 0, b"the goal has finished")
             return
 
         answered = False
 
-        def cancelling(future: Any) -> None:
+        def cancelling(code: int | None, cancels: bool, problem: str) -> None:
             nonlocal answered
             answered = True
-            response = self._outcome(goal, future)
-            if response is None:
-                done = False
-            else:  # it may be the question before this one that it took, whose answer was lost
-                done = bool(response.goals_canceling) or (times > 1 and response.return_code == TERMINATED)
-            reason = b"" if done else b"the action does not cancel it"
+            # it may be the question before this one that it took, whose answer was lost
+            done = cancels or (times > 1 and code == TERMINATED)
+            reason = b"" if done else problem.encode() or b"the action does not cancel it"
             self._loop.call_soon_threadsafe(self._tell, goal, ActionVerb.CANCEL, int(done), reason)
 
         def look() -> None:
             if not answered and goal.finished_at is None and times < CANCEL_TIMES:
                 self._send_cancel(goal, times + 1)
 
-        goal.handle.cancel_goal_async().add_done_callback(cancelling)
+        self._client.cancel(goal.id, cancelling)
         self.robot.session.later(CANCEL_AGAIN_S, look)
 
 

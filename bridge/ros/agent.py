@@ -16,24 +16,22 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import TypeVar
 
-import macs_zenoh
 from bridge.audit import open_audit, who
 from bridge.metrics.endpoint import watched_at
-from bridge.ros import parameters
 from bridge.ros.checked import CheckedSettings
 from bridge.ros.definitions import Definitions, offered_types
 from bridge.ros.figures import watched
-from bridge.ros.graph import NamesAndTypes, Offers
+from bridge.ros.graph import Offers
 from bridge.ros.interface import Registrant, Robot
+from bridge.ros.mirrors import Mirrors
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.requests import control, status
 from bridge.ros.rules import Rules
 from bridge.ros.safety import EmergencyStop
-from bridge.ros.session import RosSession
+from bridge.ros.side import NamesAndTypes, Side
 from bridge.ros.sleepers import stop_sleepers
 from bridge.ros.stop_line import StopLine
 from bridge.settings import RobotSettings, Settings
-from macs_zenoh import managers
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError, Refused, WireError
 from macs_zenoh.handles import Handle
@@ -41,7 +39,7 @@ from macs_zenoh.locked_out import locked_out
 from macs_zenoh.managers import Asker, Managers
 from macs_zenoh.mesh import Mesh, now_s
 from macs_zenoh.protocol.directory import AgentInfo
-from macs_zenoh.protocol.guard import Guard, Limits
+from macs_zenoh.protocol.guard import Guard
 from macs_zenoh.protocol.keyexpr import type_name, type_number
 from macs_zenoh.protocol.messages import AddNode, FunctionalityRequest, Metadata, RemoveNode, decode_data, encode_data
 from macs_zenoh.protocol.reading import Message
@@ -80,7 +78,7 @@ class RobotAgent:
     def __init__(
         self,
         agent: Agent,
-        session: RosSession,
+        session: Side,
         settings: RobotSettings,
         managers: Managers | None = None,
         guard: Guard | None = None,
@@ -115,15 +113,16 @@ class RobotAgent:
             lambda count: robot.drops.note("audit_lost", "", "the record of who did what is not whole", count),
         )
         self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
-        self.checked = CheckedSettings(robot.rules, robot.drops)
+        self.checked = CheckedSettings(session, robot.rules, robot.drops)
         self.offers = Offers(robot, self.streams.publish, self._graph_changed)
-        self._definitions = Definitions()
+        self._definitions = Definitions(session.definition)
         self._answering: dict[asyncio.Task[None], Registrant] = {}
         self._sessions: dict[Registrant, tuple[str, int]] = {}
         """Who has an id, or had it last."""
         self.stop_line: StopLine | None = None
         self._stop_later: asyncio.Task[None] | None = None
         self._last_words: Handle | None = None
+        self._mirrors: Mirrors | None = None
 
     def _graph_changed(self, topics: NamesAndTypes, services: NamesAndTypes) -> None:
         """In the ROS thread."""
@@ -154,6 +153,8 @@ class RobotAgent:
             self.agent.serve(verb, handler)
         self.agent.serve("stop", self._stopped, first=self._stop, stand_in=True)
         self.agent.on_message(self._receive)
+        if settings.mirror:
+            self._mirrors = Mirrors(self.nodes.robot, self.agent)
         self._let_stop()
         if self._guard is not None:
             self._guard.on_dropped = self.nodes.drops.note
@@ -213,6 +214,8 @@ class RobotAgent:
             self._guard.on_command = _ignore
         self.agent.on_message(_ignore)
         self.offers.close()
+        if self._mirrors is not None:
+            self._mirrors.close()
         if self._stop_later is not None:
             self._stop_later.cancel()
         for answer in self._answering:
@@ -443,32 +446,16 @@ async def open_robot(
 
     Raises Unreachable when ROS cannot start; ConfigError; what `macs_zenoh.join` raises.
     """
-    own = managers.load(settings.robot.managers)
+    import bridge.ros.installed  # noqa: F401 - says what to do where there is no rclpy
+    from bridge.ros import parameters
+    from bridge.ros.joined import joined  # which needs this
+    from bridge.ros.session import RosSession
+
     session = await asyncio.to_thread(RosSession, NODE_NAME, domain_id=domain_id, ros_args=ros_args)
     try:
         settings = await session.run(lambda: parameters.apply(session.node, settings))
-        robot = settings.robot
-        guard = Guard(
-            Limits(robot.max_commands_per_s, robot.max_requests_per_s, robot.max_command_age_s),
-            Layout(settings.mesh.id_slots, settings.mesh.group_slots),
-        )
-        async with macs_zenoh.join(
-            "ros",
-            id=robot.id,
-            group=robot.group,
-            settings=settings.mesh,
-            traffic=settings.traffic,
-            guard=guard,
-            on_waiting=on_waiting,
-        ) as agent:
-            ros_agent = RobotAgent(agent, session, robot, own, guard, emergency_stop)
-            await ros_agent.start()
-            log.info("robot %d serves %s", agent.id, session.full_name)
-            try:
-                yield ros_agent
-            finally:
-                await ros_agent.close()
-                await asyncio.sleep(STOP_MESSAGES_S)
+        async with joined(settings, session, on_waiting=on_waiting, emergency_stop=emergency_stop) as robot:
+            yield robot
     finally:
         await asyncio.to_thread(session.close)
 

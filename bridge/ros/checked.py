@@ -6,24 +6,21 @@ by the headset.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
-from bridge.ros import fields
 from bridge.ros.interface import Drops
 from bridge.ros.rules import Rules
-from bridge.ros.types import resolve
+from bridge.ros.side import NamesAndTypes, Side
+from bridge.ros.types import InterfaceName
 from macs_zenoh.errors import Refused
 
 KNOWN = 4096
 """Names that are remembered as looked at."""
 
-NamesAndTypes = Iterable[tuple[str, list[str]]]
-
 
 class CheckedSettings:
     """What is wrong in the messages of the rules, as far as the graph tells their types. In the ROS thread."""
 
-    def __init__(self, rules: Rules, drops: Drops) -> None:
+    def __init__(self, side: Side, rules: Rules, drops: Drops) -> None:
+        self._side = side
         self._rules = rules
         self._drops = drops
         self._seen: set[tuple[str, str]] = set()
@@ -51,11 +48,14 @@ class CheckedSettings:
 
     def _try(self, name: str, of_type: str, interface: str, message: dict[str, object], what: str) -> None:
         try:
-            kind = resolve(of_type, interface)
+            parsed = InterfaceName.parse(of_type, interface)
+            kind = (
+                self._side.message(parsed, name) if interface == "msg" else self._side.service(parsed, name).response
+            )
         except Refused:  # not installed here: whoever registers it hears that
             return
         try:
-            fields.filled(kind.Response if interface == "srv" else kind, message, what)
+            kind.filled(message, what)
         except Refused as refusal:
             self.wrong[name] = refusal.reason
             self._drops.note("wrong_settings", name, refusal.reason)

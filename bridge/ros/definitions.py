@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,9 @@ _IDL_FIELD = re.compile(r"sequence<(?P<item>.+?)(?:, (?P<most>\d+))?>|(?P<array>
 class Definitions:
     """Of one robot; each type is read once. Reads files: not for the loop's thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, of: Callable[[InterfaceName], Definition] | None = None) -> None:
+        """``of``: where they are read, unless they are installed."""
+        self._read = of or installed_definition
         self._known: dict[str, Definition] = {}
         """Only types that are installed get in here."""
 
@@ -72,8 +74,13 @@ class Definitions:
         if known is None:
             kind = name.split("/")[1]
             parsed = InterfaceName.parse(name, kind if kind in ("msg", "srv", "action") else "msg")
-            known = self._known[name] = Definition(_text(parsed), _hash(parsed))
+            known = self._known[name] = self._read(parsed)
         return known
+
+
+def installed_definition(name: InterfaceName) -> Definition:
+    """Of an interface that is installed here. Raises Refused."""
+    return Definition(_text(name), _hash(name))
 
 
 def offered_types(offered: Offered) -> list[str]:

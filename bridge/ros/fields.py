@@ -7,12 +7,8 @@ from typing import Any
 
 from rclpy.serialization import serialize_message
 
+from bridge.ros.side import REASON_FIELDS
 from macs_zenoh.errors import Refused
-
-REASON_FIELDS = frozenset(
-    {"message", "error", "error_message", "error_msg", "error_string", "status_message", "reason"}
-)
-"""Text fields in which services say what went wrong, by the habits of ROS packages (std_srvs: ``message``)."""
 
 
 def filled(kind: type[Any], values: Mapping[str, Any], what: str) -> Any:

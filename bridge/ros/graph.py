@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Any
-
-from rclpy.node import NodeNameNonExistentError
-from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
 from bridge.ros import qos
 from bridge.ros.interface import PublishStream, Registrant, Robot
 from bridge.ros.rules import Rules
+from bridge.ros.side import NamesAndTypes, Side
 from bridge.ros.stream import StreamFraming
 from macs_zenoh.errors import MacsError, WireError
 from macs_zenoh.protocol.messages import ROS, FunctionalityRequest, Metadata, decode_data, encode_data
@@ -41,24 +38,18 @@ SETTLE_LOOKS = 3
 FOLLOWERS = 4096
 """Agents that are told of changes; of more, those that asked last."""
 
-NamesAndTypes = list[tuple[str, list[str]]]
-
 SEND_GOAL = "/_action/send_goal"
 """What the goal service of an action is called, after the action; its type is the action's with ``_SendGoal``."""
 
 
-def offers(node: Any, rules: Rules | None = None) -> Offered:
-    """The graph around ``node`` now: what others subscribe, publish and serve, as far as ``rules`` expose it.
+def offers(side: Side, rules: Rules | None = None) -> Offered:
+    """The graph around our node now: what others subscribe, publish and serve, as far as ``rules`` expose it.
 
     Each name with its type (``geometry_msgs/msg/Twist``); the first by alphabet where a topic has several. To be
     called in the ROS thread.
     """
     rules = rules or Rules()
-    own = (node.get_name(), node.get_namespace())
-    others = [other for other in set(node.get_node_names_and_namespaces()) if other != own]
-    subscribers = _gather(node.get_subscriber_names_and_types_by_node, others)
-    publishers = _gather(node.get_publisher_names_and_types_by_node, others)
-    services = _gather(node.get_service_names_and_types_by_node, others)
+    subscribers, publishers, services = side.found()
     actions = {
         name.removesuffix(SEND_GOAL): of_type.removesuffix("_SendGoal")
         for name, of_type in services.items()
@@ -78,33 +69,25 @@ def offers(node: Any, rules: Rules | None = None) -> Offered:
         publishers,
         visible(services),
         visible(actions),
-        {topic: _qos_of(node, topic) for topic in sorted({*subscribers, *publishers})},
+        {topic: _qos_of(side, topic) for topic in sorted({*subscribers, *publishers})},
     )
 
 
-def _gather(ask: Callable[[str, str], NamesAndTypes], nodes: Iterable[tuple[str, str]]) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for name, namespace in nodes:
-        try:
-            entries = ask(name, namespace)
-        except NodeNameNonExistentError:  # it left between the two questions
-            continue
-        for topic, types in entries:
-            if types:
-                found[topic] = min(types)
-    return found
-
-
 def _is_plumbing(name: str, of_type: str) -> bool:
-    return name in PLUMBING_TOPICS or bool(topic_or_service_is_hidden(name)) or of_type.startswith(PLUMBING_PACKAGES)
+    return name in PLUMBING_TOPICS or _is_hidden(name) or of_type.startswith(PLUMBING_PACKAGES)
 
 
-def _qos_of(node: Any, topic: str) -> TopicQos:
-    publishers = [endpoint.qos_profile for endpoint in node.get_publishers_info_by_topic(topic)]
+def _is_hidden(name: str) -> bool:
+    """As ROS's own tools hide it."""
+    return any(level.startswith("_") for level in name.split("/"))
+
+
+def _qos_of(side: Side, topic: str) -> TopicQos:
+    publishers = [publisher.qos for publisher in side.publishers(topic)]
     if publishers:
         profile = qos.for_subscription(publishers, 1)
     else:
-        subscriptions = [endpoint.qos_profile for endpoint in node.get_subscriptions_info_by_topic(topic)]
+        subscriptions = [subscription.qos for subscription in side.subscriptions(topic)]
         profile = qos.for_publisher(subscriptions, 1, latched=False)
     return TopicQos(profile.reliability.name.lower(), profile.durability.name.lower())
 
@@ -139,7 +122,7 @@ class Offers:
         loop = asyncio.get_running_loop()
         if self._read is None or (self._read.done() and loop.time() > self._read_at + FRESH_S):
             session = self._robot.session
-            self._read = loop.create_task(session.run(lambda: offers(session.node, self._robot.rules)))
+            self._read = loop.create_task(session.run(lambda: offers(session, self._robot.rules)))
             self._read_at = loop.time()
         return await asyncio.shield(self._read)
 
@@ -163,13 +146,11 @@ class Offers:
             self._read.cancel()
 
     async def _look(self) -> None:
-        node = self._robot.session.node
+        side = self._robot.session
         looks = 0
         while True:
             try:
-                graph = await self._robot.session.run(
-                    lambda: (node.get_topic_names_and_types(), node.get_service_names_and_types())
-                )
+                graph = await side.run(lambda: (side.topics(), side.services()))
                 if graph != self._graph:
                     self._graph, looks = graph, SETTLE_LOOKS
                     await self._robot.session.run(partial(self._on_graph, *graph))

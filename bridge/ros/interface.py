@@ -8,10 +8,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
-
-from rclpy.exceptions import NameValidationException
-from rclpy.type_support import NoTypeSupportImportedException
+from typing import ClassVar
 
 from bridge.audit import NO_AUDIT, Audit
 from bridge.ros.alarms import Alarms
@@ -19,7 +16,7 @@ from bridge.ros.early import NodeKey
 from bridge.ros.refusals import Refusals
 from bridge.ros.rules import Rules
 from bridge.ros.safety import EmergencyStop
-from bridge.ros.session import RosSession
+from bridge.ros.side import Side
 from bridge.ros.types import InterfaceName
 from macs_zenoh.config import Priority
 from macs_zenoh.errors import HeldByAnother, Refused
@@ -72,7 +69,7 @@ class Robot:
     """What interface nodes work with.
 
     Attributes:
-        session: the ROS node and its thread.
+        session: the ROS graph, and our node in it.
         agent_id: the robot's id on the mesh now.
         publish_stream: puts a frame on the mesh.
         prioritise_stream: sets the priority of a node's frames; None: the usual one.
@@ -92,7 +89,7 @@ class Robot:
         tracing: what is noted of messages that are traced.
     """
 
-    session: RosSession
+    session: Side
     agent_id: int
     publish_stream: PublishStream
     layout: Layout = MACS
@@ -119,7 +116,7 @@ class Robot:
 
 
 class InterfaceNode(ABC):
-    """One interface node: its registrants, and its rclpy entity between `open` and `close`."""
+    """One interface node: its registrants, and what it has on the ROS graph between `open` and `close`."""
 
     NODE_TYPE: ClassVar[NodeType]
     ROLE: ClassVar[str]
@@ -157,15 +154,14 @@ class InterfaceNode(ABC):
         return full_name(self.robot, type(self), name)
 
     @classmethod
-    def resolve(cls, node: Any, name: str) -> str:
-        """The same, as rclpy resolves it for what this node makes."""
-        return str(node.resolve_service_name(name) if cls.INTERFACE == "srv" else node.resolve_topic_name(name))
+    def resolve(cls, side: Side, name: str) -> str:
+        """The same, for what this node makes."""
+        return side.service_name(name) if cls.INTERFACE == "srv" else side.topic_name(name)
 
     def known_names(self) -> list[str]:
         """Names of all that ROS has of what this node works on. In the ROS thread."""
-        node = self.robot.session.node
-        known = node.get_service_names_and_types() if self.INTERFACE == "srv" else node.get_topic_names_and_types()
-        return [name for name, _ in known]
+        side = self.robot.session
+        return [name for name, _ in (side.services() if self.INTERFACE == "srv" else side.topics())]
 
     @property
     def held(self) -> bool:
@@ -234,14 +230,14 @@ class InterfaceNode(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Create the rclpy entity. In the ROS thread. Raises Refused."""
+        """Have it on the ROS graph. In the ROS thread. Raises Refused."""
 
     async def settle(self) -> None:  # noqa: B027 - only some nodes have to wait
         """Wait, on the loop and not for long, until the entity can do its work."""
 
     @abstractmethod
     def close(self) -> None:
-        """Destroy the rclpy entity, if there is one. In the ROS thread."""
+        """Have it there no more. In the ROS thread."""
 
     @abstractmethod
     def receive(self, message: Message) -> None:
@@ -298,31 +294,9 @@ _NODE_NAME = re.compile(r"[A-Za-z0-9_]{1,260}")
 
 def full_name(robot: Robot, kind: type[InterfaceNode], name: str) -> str:
     """What a name from the network means on this robot: what rules, control and nodes go by. Raises Refused."""
-    with ros_errors(name[:80]):
-        return kind.resolve(robot.session.node, name)
+    return kind.resolve(robot.session, name)
 
 
 def key_of(request: AddNode | RemoveNode) -> NodeKey:
     """The interface node that a registration is about."""
     return NodeKey(request.node_type, request.node_name)
-
-
-class ros_errors:  # noqa: N801 - reads like the context manager that it is
-    """Turns rclpy's errors about a topic into a refusal that a person understands."""
-
-    def __init__(self, topic: str) -> None:
-        self._topic = topic
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, RuntimeError | NameValidationException | NoTypeSupportImportedException):
-            # rcl adds "at /path/in/its/sources" and a second line that points at the letter
-            problem = str(error).splitlines()[0].split(", at ")[0]
-            raise Refused(f"{self._topic!r} cannot be used on this robot: {problem}") from error
-
-
-def first_line(error: Exception) -> str:
-    """What an error says, without the places in C++ that it came through."""
-    text = str(error).splitlines()
-    return text[0].split(", at ")[0] if text else type(error).__name__

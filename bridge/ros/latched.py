@@ -2,7 +2,7 @@
 
 A ROS subscription gets a transient local topic's last messages when it is made, and never again. So for registrants
 that come to a subscription that exists, another one is made, for a moment; what it gets goes to those that have not
-had it. rclpy does not tell whose a message is, but no two have both the time and the number that their publisher gave.
+had it. ROS does not tell whose a message is, but no two have both the time and the number that their publisher gave.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
-from rclpy.qos import DurabilityPolicy
+from msgspec import structs
 
 from bridge.ros import qos
 from bridge.ros.interface import Registrant
-from bridge.ros.session import RosSession
+from bridge.ros.side import Closable, Events, OnRaw, Side
+from macs_zenoh.protocol.rmw_zenoh.qos import Durability, Qos
 
 Receivers = frozenset[tuple[int, int]]
 """Registrants, as (agent type, agent id)."""
@@ -25,7 +25,7 @@ Message = tuple[Any, Any]
 
 
 def message_of(info: Mapping[str, Any]) -> Message:
-    """Which message it is, by what rclpy knows about it."""
+    """Which message it is, by what ROS knows about it."""
     return info["source_timestamp"], info["publication_sequence_number"]
 
 
@@ -71,10 +71,10 @@ class Newcomers:
 
     def __init__(
         self,
-        session: RosSession,
-        subscribe: Callable[[Any, Callable[..., None], SubscriptionEventCallbacks | None], Any],
-        publishers: Callable[[], list[Any]],
-        profile: Callable[[Iterable[Any]], Any],
+        session: Side,
+        subscribe: Callable[[Qos, OnRaw, Events | None], Closable],
+        publishers: Callable[[], list[Qos]],
+        profile: Callable[[Iterable[Qos]], Qos],
         tell: Callable[[bytes, Mapping[str, Any], Receivers], bool],
     ) -> None:
         """``subscribe`` with a profile, a callback and events; ``publishers`` gives the profiles of the topic's;
@@ -114,13 +114,8 @@ class Newcomers:
         if not latching or not waiting:
             return
         catching = _Catching(waiting, self._tell)
-        events = SubscriptionEventCallbacks(matched=catching.matched, use_default_callbacks=False)
-        profile = self._profile(latching)
-        profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        try:
-            catching.subscription = self._subscribe(profile, catching.take, events)
-        except UnsupportedEventTypeError:  # of some middlewares
-            catching.subscription = self._subscribe(profile, catching.take, None)
+        profile = structs.replace(self._profile(latching), durability=Durability.TRANSIENT_LOCAL)
+        catching.subscription = self._subscribe(profile, catching.take, Events(matched=catching.matched))
         self._open.append(catching)
         self._session.later(self.LOOK_S, lambda: self._look(catching, 0.0))
 
@@ -136,7 +131,8 @@ class Newcomers:
 
     def _end(self, catching: _Catching) -> None:
         self._open.remove(catching)
-        self._session.intake.unsubscribe(catching.subscription)
+        if catching.subscription is not None:
+            catching.subscription.close()
         if self._waiting:
             self._session.submit(self._catch_up)
 
@@ -155,10 +151,10 @@ class _Catching:
         self._newcomers = newcomers
         self._tell = tell
         self._left = self.MESSAGES
-        self.subscription: Any = None
+        self.subscription: Closable | None = None
         self.busy = True
 
-    def matched(self, _change: Any) -> None:
+    def matched(self, _count: int, _change: int) -> None:
         self.busy = True
 
     def take(self, cdr: bytes, info: Mapping[str, Any]) -> None:

@@ -1,7 +1,8 @@
 """The interface nodes of a robot: what headsets have registered, by node type and topic.
 
-`InterfaceNodes` belongs to the event loop; rclpy's entities are made and destroyed in the ROS thread. Commands come in
-Zenoh's threads (`macs_zenoh.protocol.guard`), so that nothing that the loop is busy with can hold them up, nor a stop.
+`InterfaceNodes` belongs to the event loop; what is on the ROS graph is made and destroyed in the ROS thread. Commands
+come in Zenoh's threads (`macs_zenoh.protocol.guard`), so that nothing that the loop is busy with can hold them up, nor
+a stop.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from functools import partial
 from bridge.ros.actions import ActionNode, tell_no_goal
 from bridge.ros.early import ASKING, EarlyMessages, NodeKey
 from bridge.ros.failures import tell_failure
-from bridge.ros.graph import NamesAndTypes
-from bridge.ros.interface import InterfaceNode, Registrant, Robot, first_line, full_name, key_of
+from bridge.ros.interface import InterfaceNode, Registrant, Robot, full_name, key_of
 from bridge.ros.places import Places
 from bridge.ros.rights import Rights
 from bridge.ros.served import ServiceNode
 from bridge.ros.services import ClientNode
+from bridge.ros.side import NamesAndTypes, first_line
 from bridge.ros.stop import StopNode
 from bridge.ros.subscriber import SubscriberNode
 from bridge.ros.topics import PublisherNode

@@ -1,4 +1,4 @@
-"""Quality of service taken from a topic's other endpoints, so that every topic can be joined as it is.
+"""Quality of service taken from a topic's other endpoints, so that every topic can be joined as it is. Pure.
 
 Facts used (ROS 2 design, "QoS policies"): a subscription matches when every policy that it requests is at most what
 the publisher offers; best effort < reliable, volatile < transient local, and a shorter deadline is the stronger one.
@@ -7,12 +7,11 @@ the publisher offers; best effort < reliable, volatile < transient local, and a 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
-from rclpy.duration import Duration
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from msgspec import structs
 
 from bridge.settings import TopicRule
+from macs_zenoh.protocol.rmw_zenoh.qos import ENDLESS_NS, Durability, Liveliness, Qos, Reliability
 
 DEFAULT_DEPTH = 10
 MAX_DEPTH = 1000
@@ -24,77 +23,65 @@ def depth_of(buffer_size: int) -> int:
     return min(buffer_size, MAX_DEPTH) or DEFAULT_DEPTH
 
 
-def for_subscription(publishers: Iterable[Any], depth: int) -> QoSProfile:
-    """What a subscription must request to match all ``publishers`` (their QoS profiles), and no less.
+def for_subscription(publishers: Iterable[Qos], depth: int) -> Qos:
+    """What a subscription must request to match all ``publishers``, and no less.
 
     One best-effort publisher makes it best effort; all of them must be transient local to ask for the last messages.
     """
     offered = list(publishers)
-    best_effort = any(qos.reliability == ReliabilityPolicy.BEST_EFFORT for qos in offered)
-    latched = bool(offered) and all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
+    best_effort = any(qos.reliability == Reliability.BEST_EFFORT for qos in offered)
+    latched = bool(offered) and all(map(is_latched, offered))
+    return Qos(
         depth=depth,
-        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        reliability=Reliability.BEST_EFFORT if best_effort else Reliability.RELIABLE,
+        durability=Durability.TRANSIENT_LOCAL if latched else Durability.VOLATILE,
     )
 
 
-def for_publisher(subscriptions: Iterable[Any], depth: int, *, latched: bool) -> QoSProfile:
-    """What a publisher must offer to match all ``subscriptions`` (their QoS profiles).
+def for_publisher(subscriptions: Iterable[Qos], depth: int, *, latched: bool) -> Qos:
+    """What a publisher must offer to match all ``subscriptions``.
 
     Reliable always: it serves best-effort subscriptions too. A stricter deadline or liveliness is taken over.
     """
     requested = list(subscriptions)
-    latched = latched or any(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in requested)
-    manual = any(qos.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC for qos in requested)
-    profile = QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
+    latched = latched or any(map(is_latched, requested))
+    manual = any(qos.liveliness == Liveliness.MANUAL_BY_TOPIC for qos in requested)
+    return Qos(
         depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        liveliness=LivelinessPolicy.MANUAL_BY_TOPIC if manual else LivelinessPolicy.AUTOMATIC,
+        durability=Durability.TRANSIENT_LOCAL if latched else Durability.VOLATILE,
+        liveliness=Liveliness.MANUAL_BY_TOPIC if manual else Liveliness.AUTOMATIC,
+        deadline_ns=_shortest(qos.deadline_ns for qos in requested),
+        lease_ns=_shortest(qos.lease_ns for qos in requested),
     )
-    if deadline := _shortest(qos.deadline for qos in requested):
-        profile.deadline = deadline
-    if lease := _shortest(qos.liveliness_lease_duration for qos in requested):
-        profile.liveliness_lease_duration = lease
-    return profile
 
 
-def is_latched(profile: QoSProfile) -> bool:
+def is_latched(qos: Qos) -> bool:
     """Whether a publisher holds its last messages for subscriptions that come later."""
-    return bool(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+    return qos.durability == Durability.TRANSIENT_LOCAL
 
 
-def for_each_of(publishers: int, profile: QoSProfile) -> QoSProfile:
+def for_each_of(publishers: int, qos: Qos) -> Qos:
     """A subscription's profile with room for what each of so many publishers latches, not only one of them."""
-    if is_latched(profile):
-        profile.depth = min(profile.depth * max(1, publishers), max(MAX_DEPTH, profile.depth))
-    return profile
+    if not is_latched(qos):
+        return qos
+    return structs.replace(qos, depth=min(qos.depth * max(1, publishers), max(MAX_DEPTH, qos.depth)))
 
 
-def overridden(profile: QoSProfile, rule: TopicRule) -> QoSProfile:
+def overridden(qos: Qos, rule: TopicRule) -> Qos:
     """The profile with what a robot's settings ask for."""
-    if rule.reliability is not None:
-        profile.reliability = ReliabilityPolicy[rule.reliability.upper()]
-    if rule.durability is not None:
-        profile.durability = DurabilityPolicy[rule.durability.upper()]
-    if rule.depth is not None:
-        profile.depth = rule.depth
-    return profile
+    return structs.replace(
+        qos,
+        reliability=Reliability[rule.reliability.upper()] if rule.reliability is not None else qos.reliability,
+        durability=Durability[rule.durability.upper()] if rule.durability is not None else qos.durability,
+        depth=rule.depth if rule.depth is not None else qos.depth,
+    )
 
 
-def same(one: QoSProfile, other: QoSProfile) -> bool:
+def same(one: Qos, other: Qos) -> bool:
     """Whether two profiles made here ask for the same."""
-    return bool(one.reliability == other.reliability and one.durability == other.durability)
+    return one.reliability == other.reliability and one.durability == other.durability
 
 
-_ENDLESS_NS = (1 << 62) - 1
-"""Middlewares report "no deadline" as their own largest duration, hundreds of years."""
-
-
-def _shortest(durations: Iterable[Any]) -> Duration | None:
-    """The shortest real duration, None when there is none (0 and endless mean: no such policy)."""
-    real = [duration.nanoseconds for duration in durations if 0 < duration.nanoseconds < _ENDLESS_NS]
-    return Duration(nanoseconds=min(real)) if real else None
+def _shortest(durations: Iterable[int]) -> int:
+    """The shortest real duration (0 and endless mean: no such policy)."""
+    return min((duration for duration in durations if 0 < duration < ENDLESS_NS), default=ENDLESS_NS)

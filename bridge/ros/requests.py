@@ -10,6 +10,7 @@ import time
 from collections.abc import Mapping
 
 import msgspec
+from msgspec import UNSET
 
 from bridge.audit import who
 from bridge.ros.interface import Registrant, full_name
@@ -57,6 +58,7 @@ def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int])
     state = RobotStatus(
         ros_node=ros_name,
         ros_domain=nodes.robot.session.domain,
+        beside=nodes.robot.session.beside or UNSET,
         stopped=stop.stopped,
         stop=StopStatus(
             by=stop.by,

@@ -23,9 +23,13 @@ class Rules:
     def __init__(self, settings: RobotSettings | None = None) -> None:
         self.settings = settings or RobotSettings()
         self._merged: dict[str, TopicRule] = {}
+        self.mirrored: set[str] = set()
+        """Names under which this robot's graph has what is another robot's: not offered again."""
 
     def exposes(self, name: str) -> bool:
         """Whether agents may use, and see, what has this name."""
+        if name in self.mirrored:
+            return False
         if name == self.settings.stop_topic:
             return True
         allowed = any(matches(pattern, name) for pattern in self.settings.expose)

@@ -10,20 +10,16 @@ import asyncio
 import math
 import time
 from collections import deque
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from msgspec import structs
-from rclpy.serialization import deserialize_message, serialize_message
 
-from bridge.ros import fields
-from bridge.ros.interface import InterfaceNode, Registrant, Robot, first_line, ros_errors
-from bridge.ros.rclpy_private import answer_later, waiting_requests
-from bridge.ros.servers import check_service_type, servers_elsewhere
-from bridge.ros.services import BURST, DEPTH
+from bridge.ros.interface import InterfaceNode, Registrant, Robot
+from bridge.ros.servers import check_service_type
+from bridge.ros.services import BURST
+from bridge.ros.side import NotOfType, Server, ServiceType, first_line
 from bridge.ros.stream import cdr_problem
-from bridge.ros.types import resolve
-from bridge.ros.unity_cdr import Parts, TooManyParts, UnityCdr, readable, to_unity
+from bridge.ros.unity_cdr import TooManyParts, readable, to_unity
 from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.protocol.messages import AddNode, CallFailure, NodeType, decode_data
 from macs_zenoh.protocol.reading import Message
@@ -44,9 +40,7 @@ class OpenCall(NamedTuple):
 class ServiceNode(InterfaceNode):
     """Type 4: a service that a headset runs, for ROS nodes on the robot. One registrant.
 
-    A request is passed on and answered later (`rclpy_private.answer_later`).
-
-    ROS has no word for a call that failed. The caller gets a response with every field zero (see `fields.failure`)
+    ROS has no word for a call that failed. The caller gets a response with every field zero (`MessageType.failure`)
     at the deadline, when the headset says that it failed, and when the headset leaves.
     """
 
@@ -55,8 +49,6 @@ class ServiceNode(InterfaceNode):
     INTERFACE = "srv"
     MAX_REGISTRANTS = 1
 
-    TURN = 64
-    """Requests taken in one turn of the executor."""
     LINGER_S = 0.25
     """How long a service stays after its last response: destroyed at once, it takes unread responses with it."""
 
@@ -65,12 +57,8 @@ class ServiceNode(InterfaceNode):
 
     def __init__(self, robot: Robot, request: AddNode) -> None:
         super().__init__(robot, request)
-        self._service: Any = None
-        self._types: Any = None
-        self._request_cdr: UnityCdr | None = None
-        self._response_cdr: UnityCdr | None = None
-        self._parts: Parts | None = None
-        self._respond: Callable[[Any, Any], None]
+        self._service: Server | None = None
+        self._types: ServiceType | None = None
         self._deadline_s = robot.rules.call_timeout_s(self.topic)
         self._open_calls: dict[int, OpenCall] = {}
         self._next_request = 0
@@ -86,20 +74,13 @@ class ServiceNode(InterfaceNode):
             raise Refused(f"{self.topic} is registered as {self.request.tos_name}; use that name")
 
     def open(self) -> None:
-        self._types = resolve(str(self.interface), "srv")
-        self._request_cdr = UnityCdr.of(self._types.Request)
-        self._response_cdr = UnityCdr.of(self._types.Response)
-        self._parts = Parts.of(self._types.Response)
-        fields.failure(self._types.Response, "", self.rule.error_response, "error_response")
-        node = self.robot.session.node
-        check_service_type(node, self.topic, self.interface)
-        if others := servers_elsewhere(node, self.topic):
+        side = self.robot.session
+        self._types = types = side.service(self.interface, self.topic)
+        types.response.failure("", self.rule.error_response, "error_response")
+        check_service_type(side, self.topic, self.interface)
+        if others := side.servers_elsewhere(self.topic):
             raise Refused(f"{self.topic} is served by {' and '.join(others)} on this robot")
-        with ros_errors(self.request.tos_name):
-            self._service = node.create_service(
-                self._types, self.request.tos_name, lambda request, response: request, qos_profile=DEPTH
-            )
-        self._respond = answer_later(self._service, self._take)
+        self._service = side.serve(types, self.request.tos_name, self._take)
 
     async def settle(self) -> None:
         self._watch()
@@ -111,10 +92,10 @@ class ServiceNode(InterfaceNode):
 
     def _look_for_others(self) -> None:
         """In the ROS thread."""
-        node = self.robot.session.node
+        side = self.robot.session
         if self._service is None or self._closing:
             return
-        others = servers_elsewhere(node, self.topic) if node.count_services(self.topic) > 1 else []
+        others = side.servers_elsewhere(self.topic) if side.count_servers(self.topic) > 1 else []
         self._loop.call_soon_threadsafe(self._looked, others)
 
     def _looked(self, others: list[str]) -> None:
@@ -151,7 +132,7 @@ class ServiceNode(InterfaceNode):
     def _destroy(self) -> None:
         service, self._service = self._service, None
         if service is not None:
-            self.robot.session.node.destroy_service(service)
+            service.close()
 
     def receive(self, message: Message) -> None:
         """The headset's answer."""
@@ -171,9 +152,10 @@ class ServiceNode(InterfaceNode):
                 reason = "it did not say why"
             self._fail(request_id, f"{sender} failed: {reason}")
             return
+        assert self._types is not None
         try:
-            most = self.robot.rules.settings.max_message_parts
-            answer = readable(self._response_cdr, self._parts, message.data, most)
+            most, expected = self.robot.rules.settings.max_message_parts, self._types.response
+            answer = readable(expected.unity, expected.parts, message.data, most)
         except TooManyParts as error:
             self._bad_answer(request_id, sender, f"{len(message.data)} bytes are too much: {error}")
             return
@@ -198,7 +180,7 @@ class ServiceNode(InterfaceNode):
             self._fail(request_id, f"{self.topic} takes no calls now")
             return
         if registrant in self.unity:
-            request = to_unity(self._request_cdr, request)
+            request = to_unity(self._types.request.unity if self._types else None, request)
         if (size := len(request)) > (limit := self.robot.rules.settings.max_frame_bytes):
             self.robot.drops.note("too_large", self.topic, f"a request of {size} bytes, more than {limit}")
             self._fail(request_id, f"the request has {size} bytes, more than {limit}")
@@ -230,26 +212,18 @@ class ServiceNode(InterfaceNode):
 
     # -- in the ROS thread ---------------------------------------------------------------------------------------
 
-    def _take(self, request: Any, header: Any) -> None:
-        self._pass_on(request, header)
-        for request, header in waiting_requests(self._service, self._types.Request, self.TURN):
-            self._pass_on(request, header)
-
-    def _pass_on(self, request: Any, header: Any) -> None:
-        self._loop.call_soon_threadsafe(self._ask, bytes(serialize_message(request)), header)
+    def _take(self, request: bytes, header: Any) -> None:
+        self._loop.call_soon_threadsafe(self._ask, request, header)
 
     def _send(self, request_id: int, sender: Registrant, header: Any, answer: bytes) -> None:
         try:
-            response = deserialize_message(answer, self._types.Response)
-        except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is
-            problem = first_line(error)
+            self._answer(answer, header)
+        except NotOfType as problem:
             about = f"{self.topic} from {sender}"
             self._loop.call_soon_threadsafe(
                 self.robot.drops.note, "bad_cdr", about, f"its answer is no {self.interface}: {problem}"
             )
             self._send_failure(header, f"the answer of {sender} is no {self.interface}: {problem}")
-            return
-        self._answer(response, header)
 
     def _send_failure(self, header: Any, reason: str) -> None:
         self._failed.append((header, reason))
@@ -258,9 +232,10 @@ class ServiceNode(InterfaceNode):
 
     def _send_failures(self) -> None:
         """A few at a time: many calls fail at once when a headset leaves."""
+        assert self._types is not None
         for header, reason in list(self._failed)[:BURST]:
             values = self.rule.error_response
-            self._answer(fields.failure(self._types.Response, reason, values, "error_response"), header)
+            self._answer(self._types.response.failure(reason, values, "error_response"), header)
         for _ in range(min(BURST, len(self._failed))):
             self._failed.popleft()
         if self._failed:
@@ -268,11 +243,14 @@ class ServiceNode(InterfaceNode):
         elif self._closing:
             self._end_when_read()
 
-    def _answer(self, response: Any, header: Any) -> None:
+    def _answer(self, response: bytes, header: Any) -> None:
+        """Raises NotOfType."""
         if self._service is None:
             return
         self._answered_at = time.monotonic()
         try:
-            self._respond(response, header)
-        except Exception as error:  # noqa: BLE001 - rclpy's, as when the caller is gone
+            self._service.answer(header, response)
+        except NotOfType:
+            raise
+        except Exception as error:  # noqa: BLE001 - the middleware's, as when the caller is gone
             self._loop.call_soon_threadsafe(self.robot.drops.note, "failed", self.topic, first_line(error))

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Any
 
-from rclpy.node import NodeNameNonExistentError
-
+from bridge.ros.side import Side
 from bridge.ros.types import InterfaceName
 
 ABSENT_S = 2.0
@@ -42,26 +40,8 @@ class Search:
         return True
 
 
-def check_service_type(node: Any, service: str, interface: InterfaceName) -> bool:
+def check_service_type(side: Side, service: str, interface: InterfaceName) -> bool:
     """Whether the service exists. Raises Refused when it has another type. In the ROS thread."""
-    types = dict(node.get_service_names_and_types()).get(service, [])
+    types = dict(side.services()).get(service, [])
     interface.check(service, types)
-    return bool(types) and node.count_services(service) > 0
-
-
-def servers_elsewhere(node: Any, service: str) -> list[str]:
-    """Full names of the other ROS nodes that have this service. In the ROS thread.
-
-    What has our own name is not among them: after a crash of ours ROS knows our old service for a while.
-    """
-    found = set()
-    for name, namespace in node.get_node_names_and_namespaces():
-        full = f"{namespace.rstrip('/')}/{name}"
-        if full != node.get_fully_qualified_name():
-            try:
-                services = node.get_service_names_and_types_by_node(name, namespace)
-            except NodeNameNonExistentError:  # it has left meanwhile
-                continue
-            if any(served == service for served, _ in services):
-                found.add(full)
-    return sorted(found)
+    return bool(types) and side.count_servers(service) > 0

@@ -9,18 +9,15 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Any
 
 from msgspec import structs
-from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message, serialize_message
 
 from bridge.ros.failures import CallFailed, answer_metadata, tell_failure
-from bridge.ros.interface import InterfaceNode, Registrant, Robot, first_line, ros_errors
+from bridge.ros.interface import InterfaceNode, Registrant, Robot
 from bridge.ros.servers import ABSENT_S, Search, check_service_type
+from bridge.ros.side import Client, NotOfType, ServiceType, first_line
 from bridge.ros.stream import cdr_problem
-from bridge.ros.types import resolve
-from bridge.ros.unity_cdr import Parts, TooManyParts, UnityCdr, readable, to_unity
+from bridge.ros.unity_cdr import TooManyParts, readable, to_unity
 from macs_zenoh.protocol.messages import AddNode, NodeType
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.robot_state import NodeStatus
@@ -33,8 +30,6 @@ BURST = 8
 more without a word (rmw_qos_profile_services_default). So not more than these go out at once."""
 PACE_S = 0.05
 """With so many requests unanswered, one more goes out so often: the service may well work on many at a time."""
-DEPTH = QoSProfile(depth=1000)
-"""Of our own ends, so that on them nothing is lost."""
 
 
 class ClientNode(InterfaceNode):
@@ -49,31 +44,24 @@ class ClientNode(InterfaceNode):
 
     def __init__(self, robot: Robot, request: AddNode) -> None:
         super().__init__(robot, request)
-        self._client: Any = None
-        self._service: Any = None
-        self._request_cdr: UnityCdr | None = None
-        self._response_cdr: UnityCdr | None = None
-        self._parts: Parts | None = None
+        self._client: Client | None = None
+        self._service: ServiceType | None = None
         self._exists = False
         self._deadline_s = robot.rules.call_timeout_s(self.topic)
         self._calls: dict[asyncio.Task[None], Message] = {}
-        self._search = Search(lambda: self._client is not None and self._client.service_is_ready())
+        self._search = Search(lambda: self._client is not None and self._client.is_ready())
         self._room = asyncio.Semaphore(BURST)
 
     def open(self) -> None:
-        self._service = resolve(str(self.interface), "srv")
-        self._request_cdr = UnityCdr.of(self._service.Request)
-        self._parts = Parts.of(self._service.Request)
-        self._response_cdr = UnityCdr.of(self._service.Response)
-        node = self.robot.session.node
-        self._exists = check_service_type(node, self.topic, self.interface)
-        with ros_errors(self.request.tos_name):
-            self._client = node.create_client(self._service, self.request.tos_name, qos_profile=DEPTH)
+        side = self.robot.session
+        self._service = side.service(self.interface, self.topic)
+        self._exists = check_service_type(side, self.topic, self.interface)
+        self._client = side.client(self._service, self.request.tos_name)
 
     def other_types(self) -> set[str]:
-        if self._client is None or self._client.service_is_ready():
+        if self._client is None or self._client.is_ready():
             return set()
-        known = dict(self.robot.session.node.get_service_names_and_types()).get(self.topic, [])
+        known = dict(self.robot.session.services()).get(self.topic, [])
         return set(known) - {str(self.interface)}
 
     async def settle(self) -> None:
@@ -88,7 +76,7 @@ class ClientNode(InterfaceNode):
     def close(self) -> None:
         client, self._client = self._client, None
         if client is not None:
-            self.robot.session.node.destroy_client(client)
+            client.close()
 
     def receive(self, message: Message) -> None:
         if self.held:
@@ -127,15 +115,17 @@ class ClientNode(InterfaceNode):
         else:
             asker = Registrant.of(message)
             if asker in self.unity:
-                response = to_unity(self._response_cdr, response)
+                response = to_unity(self._service.response.unity if self._service else None, response)
             if (size := len(response)) > (limit := self.robot.rules.settings.max_frame_bytes):
                 self._fail(message, CallFailed("failed", f"the response has {size} bytes, more than {limit}"))
                 return
             self.robot.send(asker, answer_metadata(self.robot.agent_id, message.metadata), response)
 
     async def _ask(self, data: bytes, stops: int) -> bytes:
+        assert self._service is not None
+        asked = self._service.request
         try:
-            request = readable(self._request_cdr, self._parts, data, self.robot.rules.settings.max_message_parts)
+            request = readable(asked.unity, asked.parts, data, self.robot.rules.settings.max_message_parts)
         except TooManyParts as error:
             raise CallFailed("invalid", f"the request of {len(data)} bytes is too much: {error}") from None
         problem = cdr_problem(request)
@@ -146,24 +136,28 @@ class ClientNode(InterfaceNode):
         loop = asyncio.get_running_loop()
         answer: asyncio.Future[bytes] = loop.create_future()
 
-        def settle(response: bytes | None, error: CallFailed | None) -> None:
+        def settle(response: bytes | None, problem: str) -> None:
             if answer.done():
                 return
-            if error is not None:
-                answer.set_exception(error)
-            elif response is not None:
+            if response is None:
+                answer.set_exception(CallFailed("failed", problem))
+            else:
                 answer.set_result(response)
 
         await self._room.acquire()
         release = _Once(self._room.release)
         pace = loop.call_later(PACE_S, release)
         try:
-            sent = await self.robot.session.run(lambda: self._send(request, stops, loop, settle))
+
+            def done(response: bytes | None, problem: str) -> None:
+                loop.call_soon_threadsafe(settle, response, problem)
+
+            forget = await self.robot.session.run(lambda: self._send(request, stops, done))
             try:
                 return await answer
             finally:
                 if self._client is not None:
-                    self._client.remove_pending_request(sent)
+                    forget()
         finally:
             pace.cancel()
             release()
@@ -178,32 +172,15 @@ class ClientNode(InterfaceNode):
 
     # -- in the ROS thread ---------------------------------------------------------------------------------------
 
-    def _send(
-        self,
-        request: bytes,
-        stops: int,
-        loop: asyncio.AbstractEventLoop,
-        settle: Callable[[bytes | None, CallFailed | None], None],
-    ) -> Any:
+    def _send(self, request: bytes, stops: int, done: Callable[[bytes | None, str], None]) -> Callable[[], None]:
         if self._client is None:
             raise CallFailed("refused", f"{self.topic} is no longer registered")
         if self.held_since(stops):  # pressed while the call waited for the service, or for its turn
             raise self._stopped()
         try:
-            sent = self._client.call_async(deserialize_message(request, self._service.Request))
-        except Exception as error:  # rclpy's, whatever it is
-            raise CallFailed("invalid", f"the request is no {self.interface}: {first_line(error)}") from error
-
-        def answered(future: Any) -> None:
-            try:
-                response = bytes(serialize_message(future.result()))
-            except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is
-                loop.call_soon_threadsafe(settle, None, CallFailed("failed", first_line(error)))
-            else:
-                loop.call_soon_threadsafe(settle, response, None)
-
-        sent.add_done_callback(answered)
-        return sent
+            return self._client.call(request, done)
+        except NotOfType as error:
+            raise CallFailed("invalid", f"the request is no {self.interface}: {error}") from error
 
 
 class _Once:

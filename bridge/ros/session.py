@@ -26,6 +26,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from bridge.ros.intake import Intake
+from bridge.ros.rclpy_side import RclpySide
 from macs_zenoh.errors import Unreachable
 
 log = logging.getLogger("macs.ros")
@@ -33,7 +34,7 @@ log = logging.getLogger("macs.ros")
 T = TypeVar("T")
 
 
-class RosSession:
+class RosSession(RclpySide):
     """A ROS node that works in its own thread until `close`; also a context manager.
 
     Args:

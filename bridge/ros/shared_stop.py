@@ -27,11 +27,12 @@ from typing import Any
 
 import msgspec
 from msgspec import Struct
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 
-from bridge.ros.interface import Robot, ros_errors
-from bridge.ros.types import resolve
+from bridge.ros.interface import Robot
+from bridge.ros.side import Closable, MessageType, Publisher
+from bridge.ros.types import InterfaceName
+from macs_zenoh.protocol.rmw_zenoh.cdr import read_text, written_text
+from macs_zenoh.protocol.rmw_zenoh.qos import Durability, Qos, Reliability
 
 log = logging.getLogger("macs.ros")
 
@@ -46,9 +47,9 @@ EXPLAINED_S = 0.1
 UNREAD = 256
 """More messages of our own do not wait to be read."""
 ASKED = (
-    QoSProfile(depth=KNOWN, durability=DurabilityPolicy.TRANSIENT_LOCAL),
-    QoSProfile(depth=KNOWN),
-    QoSProfile(depth=KNOWN, reliability=ReliabilityPolicy.BEST_EFFORT),
+    Qos(depth=KNOWN, durability=Durability.TRANSIENT_LOCAL),
+    Qos(depth=KNOWN),
+    Qos(depth=KNOWN, reliability=Reliability.BEST_EFFORT),
 )
 """What is asked of publishers on the topic of the stop: what they hold; reliable; anything."""
 
@@ -82,7 +83,7 @@ class SharedStop:
         self,
         robot: Robot,
         topic: str,
-        kind: type[Any],
+        kind: MessageType,
         on_state: Callable[[StopState], None],
         on_press: Callable[[], None],
     ) -> None:
@@ -98,31 +99,29 @@ class SharedStop:
         """When presses were published that have been heard: each comes by several subscriptions."""
         self._stopped_at = -math.inf
         """When another agent said last that the robot is stopped, and was believed."""
-        self._text: Any = None
-        self._publisher: Any = None
-        self._subscriptions: list[Any] = []
+        self._publisher: Publisher | None = None
+        self._subscriptions: list[Closable] = []
 
     def open(self) -> None:
         """Tell, and listen. In the ROS thread. Raises Refused."""
-        session, latched = self._robot.session, _latched(1)
-        self._text = resolve("std_msgs/msg/String")
-        with ros_errors(self._topic):
-            self._publisher = session.node.create_publisher(self._text, self._topic + AGENTS, latched)
-            self._subscriptions = [
-                session.intake.subscribe(self._text, self._topic + AGENTS, self._told, _latched(KNOWN)),
-                *(session.intake.subscribe(self._kind, self._topic, self._said, asked) for asked in ASKED),
-            ]
+        side = self._robot.session
+        text = side.message(InterfaceName.parse("std_msgs/String", "msg"), self._topic + AGENTS)
+        self._publisher = side.advertise(text, self._topic + AGENTS, _latched(1))
+        self._subscriptions = [
+            side.subscribe(text, self._topic + AGENTS, self._told, _latched(KNOWN)),
+            *(side.subscribe(self._kind, self._topic, self._said, asked) for asked in ASKED),
+        ]
 
     def close(self) -> None:
         """In the ROS thread."""
         publisher, self._publisher = self._publisher, None
         subscriptions, self._subscriptions = self._subscriptions, []
         for subscription in subscriptions:
-            self._robot.session.intake.unsubscribe(subscription)
+            subscription.close()
         if publisher is not None:
-            self._robot.session.node.destroy_publisher(publisher)
+            publisher.close()
 
-    def publish(self, publisher: Any, state: bytes) -> None:
+    def publish(self, publisher: Publisher, state: bytes) -> None:
         """Publish on the topic of the stop; our subscription to it knows that this is our own. From any thread."""
         published: list[float] = [time.time_ns(), math.inf]
         if state[4:5] == PRESSED:  # nothing else is taken for a press, and a press that comes meanwhile is a press
@@ -139,17 +138,17 @@ class SharedStop:
             state = StopState(
                 stop.session, self._robot.agent_id, stop.changes, stop.pressed, stop.by, stop.own, stop.heard
             )
-            publisher.publish(self._text(data=msgspec.json.encode(state).decode()))
+            publisher.publish(written_text(msgspec.json.encode(state)))
 
     @property
     def unheard(self) -> int:
         """Of how many agents on this graph nothing has been heard yet. From any thread."""
-        return max(0, int(self._robot.session.node.count_publishers(self._topic + AGENTS)) - 1 - len(self._agents))
+        return max(0, int(self._robot.session.count_publishers(self._topic + AGENTS)) - 1 - len(self._agents))
 
     @property
     def others(self) -> list[int]:
         """Ids of other robots whose agents work on this graph."""
-        if self._publisher is None or self._robot.session.node.count_publishers(self._topic + AGENTS) < 2:
+        if self._publisher is None or self._robot.session.count_publishers(self._topic + AGENTS) < 2:
             return []
         return sorted(set(self._agents.values()) - {self._robot.agent_id})
 
@@ -159,8 +158,8 @@ class SharedStop:
         try:
             if len(cdr) > STATE_BYTES:
                 raise msgspec.DecodeError(f"{len(cdr)} bytes")
-            state = msgspec.json.decode(deserialize_message(cdr, self._text).data, type=StopState)
-        except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is, or msgspec's
+            state = msgspec.json.decode(read_text(cdr), type=StopState)
+        except (ValueError, msgspec.MsgspecError) as error:
             self._robot.drops.note("bad_stop_state", self._topic + AGENTS, f"this is no state of an agent: {error}")
             return
         if state.session == self._robot.stop.session:
@@ -188,7 +187,7 @@ class SharedStop:
         if bytes(cdr[4:5]) != PRESSED or self._is_own(published_ns) or published_ns in self._heard:
             return
         self._heard.append(published_ns)
-        count = self._robot.session.node.count_publishers
+        count = self._robot.session.count_publishers
         agents = count(self._topic + AGENTS)
         if agents <= 1:
             self._on_press()
@@ -207,5 +206,5 @@ class SharedStop:
         return any(begun <= published_ns <= done for begun, done in list(self._own))
 
 
-def _latched(depth: int) -> QoSProfile:
-    return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+def _latched(depth: int) -> Qos:
+    return Qos(depth=depth, durability=Durability.TRANSIENT_LOCAL)

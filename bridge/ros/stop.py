@@ -12,23 +12,22 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
 
 from msgspec import UNSET, structs
-from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from bridge.audit import who
-from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
+from bridge.ros.interface import InterfaceNode, Registrant, Robot
 from bridge.ros.rules import names_agent
 from bridge.ros.shared_stop import A_NODE, SharedStop, StopState
+from bridge.ros.side import Publisher
 from bridge.ros.stream import cdr_problem
 from bridge.ros.topics import check_topic_type
-from bridge.ros.types import resolve
 from bridge.settings import WHO_STOPPED
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.protocol.messages import ROS, AddNode, NodeType, node_name
 from macs_zenoh.protocol.reading import Message
+from macs_zenoh.protocol.rmw_zenoh.qos import Durability, Qos
 from macs_zenoh.protocol.robot_state import NodeStatus
 
 log = logging.getLogger("macs.ros")
@@ -53,7 +52,7 @@ class StopNode(InterfaceNode):
             robot, AddNode(ROS, robot.agent_id, NodeType.PUBLISHER, node_name(topic), topic, "std_msgs/Bool")
         )
         self._on_stop = on_stop
-        self._publisher: Any = None
+        self._publisher: Publisher | None = None
         self._shared: SharedStop | None = None
         self._lock = threading.RLock()
         """Held while the stop changes and that is told: what is told last is what holds."""
@@ -65,12 +64,11 @@ class StopNode(InterfaceNode):
         return True
 
     def open(self) -> None:
-        node, topic = self.robot.session.node, self.request.tos_name
-        check_topic_type(node, topic, self.interface)
-        kind = resolve(str(self.interface))
-        with ros_errors(topic):
-            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            self._publisher = node.create_publisher(kind, topic, latched)
+        side = self.robot.session
+        check_topic_type(side, self.topic, self.interface)
+        kind = side.message(self.interface, self.topic)
+        latched = Qos(depth=1, durability=Durability.TRANSIENT_LOCAL)
+        self._publisher = side.advertise(kind, self.request.tos_name, latched)
         self._shared = SharedStop(self.robot, self.topic, kind, self._adopt, lambda: self.press(A_NODE))
         self._shared.open()
 
@@ -91,7 +89,7 @@ class StopNode(InterfaceNode):
         if self._shared is not None:
             self._shared.close()
         if publisher is not None:
-            self.robot.session.node.destroy_publisher(publisher)
+            publisher.close()
 
     def receive(self, message: Message) -> None:
         sender = Registrant.of(message)

@@ -13,22 +13,20 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
-
 from bridge.ros import qos
 from bridge.ros.gaps import Gaps
-from bridge.ros.intake import OnRaw
-from bridge.ros.interface import Registrant, Robot, ros_errors
+from bridge.ros.interface import Registrant, Robot
 from bridge.ros.latched import Newcomers, Receivers, Told, message_of
+from bridge.ros.side import Closable, Events, MessageType, OnRaw
 from bridge.ros.stream import Fanout
 from bridge.ros.topics import TOO_LARGE, TopicNode, check_topic_type
-from bridge.ros.types import resolve
-from bridge.ros.unity_cdr import UnityCdr, to_unity
+from bridge.ros.unity_cdr import to_unity
 from macs_zenoh.errors import MacsError
 from macs_zenoh.protocol.messages import AddNode, NodeType, StreamData
 from macs_zenoh.protocol.rate import Rate
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.recovery import SILENT_S
+from macs_zenoh.protocol.rmw_zenoh.qos import Qos
 from macs_zenoh.protocol.trace import ROS_SENT, TAKEN
 
 log = logging.getLogger("macs.ros")
@@ -42,9 +40,9 @@ class SubscriberNode(TopicNode):
 
     def __init__(self, robot: Robot, request: AddNode) -> None:
         super().__init__(robot, request)
-        self._subscription: Any = None
-        self._profile: Any = None
-        self._message: Any = None
+        self._subscription: Closable | None = None
+        self._profile = Qos()
+        self._message: MessageType | None = None
         self._rate = RateLimit(self.rule.max_hz) if self.rule.max_hz else None
         self._rate_lock = threading.Lock()
         self._gaps = Gaps()
@@ -80,11 +78,10 @@ class SubscriberNode(TopicNode):
             self._newcomers.welcome(registrants)
 
     def open(self) -> None:
-        self._message = resolve(str(self.interface))
-        both = UnityCdr.of(self._message)
-        self._translate = partial(to_unity, both) if both is not None else None
+        self._message = message = self.robot.session.message(self.interface, self.topic)
+        self._translate = partial(to_unity, message.unity) if message.unity is not None else None
         self.registrants_changed()  # before the first message comes
-        check_topic_type(self.robot.session.node, self.request.tos_name, self.interface)
+        check_topic_type(self.robot.session, self.topic, self.interface)
         self.robot.prioritise_stream(self.key.node_name, self.rule.priority)
         if self.robot.keep_stream(self.key.node_name, self.rule.cache):
             self.linger_s = SILENT_S
@@ -100,7 +97,7 @@ class SubscriberNode(TopicNode):
     def _unsubscribe(self) -> None:
         subscription, self._subscription = self._subscription, None
         if subscription is not None:
-            self.robot.session.intake.unsubscribe(subscription)
+            subscription.close()
 
     def retire(self) -> None:
         self.robot.keep_stream(self.key.node_name, None)
@@ -119,41 +116,30 @@ class SubscriberNode(TopicNode):
 
     # -- in the ROS thread ---------------------------------------------------------------------------------------
 
-    def _publishers(self) -> list[Any]:
-        found = self.robot.session.node.get_publishers_info_by_topic(self.request.tos_name)
-        return [endpoint.qos_profile for endpoint in found]
+    def _publishers(self) -> list[Qos]:
+        return [publisher.qos for publisher in self.robot.session.publishers(self.topic)]
 
-    def _profile_of(self, publishers: Iterable[Any]) -> Any:
+    def _profile_of(self, publishers: Iterable[Qos]) -> Qos:
         offered = list(publishers)
         profile = qos.for_subscription(offered, qos.depth_of(self.request.buffer_size))
         return qos.for_each_of(len(offered), qos.overridden(profile, self.rule))
 
-    def _subscribe_also(self, profile: Any, on_raw: OnRaw, events: SubscriptionEventCallbacks | None) -> Any:
+    def _subscribe_also(self, profile: Qos, on_raw: OnRaw, events: Events | None) -> Closable:
         """For newcomers."""
-        return self.robot.session.intake.subscribe(
-            self._message, self.request.tos_name, on_raw, profile, events=events
-        )
+        assert self._message is not None
+        return self.robot.session.subscribe(self._message, self.request.tos_name, on_raw, profile, events)
 
-    def _subscribe(self, profile: Any) -> None:
+    def _subscribe(self, profile: Qos) -> None:
         self._first = self._fanout.receivers if qos.is_latched(profile) else frozenset()
-        subscribe, topic = self.robot.session.intake.subscribe, self.request.tos_name
-        events = SubscriptionEventCallbacks(
-            matched=self._publisher_matched,
-            incompatible_qos=self._publisher_incompatible,
-            message_lost=self._lost,
-            use_default_callbacks=False,
-        )
-        with ros_errors(topic):
-            try:
-                self._subscription = subscribe(self._message, topic, self._pass_on, profile, events=events)
-            except UnsupportedEventTypeError:  # of some middlewares; then the QoS stays as it is
-                self._subscription = subscribe(self._message, topic, self._pass_on, profile)
+        # some middlewares tell nothing of these; then the QoS stays as it is
+        events = Events(self._publisher_matched, self._publisher_incompatible, self._lost)
+        self._subscription = self._subscribe_also(profile, self._pass_on, events)
         self._profile = profile
 
     # -- in the thread of the intake -----------------------------------------------------------------------------
 
     def _pass_on(self, cdr: bytes, info: Mapping[str, Any]) -> None:
-        """One message with what rclpy knows about it."""
+        """One message with what ROS knows about it."""
         if self.robot.tracing is not None and self.robot.tracing.marks:
             self.robot.tracing.note((ROS_SENT, info["source_timestamp"]), (TAKEN, time.time_ns()))
         if self._gaps.take(info["publication_sequence_number"]):
@@ -211,13 +197,13 @@ class SubscriberNode(TopicNode):
         self.robot.drops.note(TOO_LARGE, self.topic, reason)
         self._loop.call_soon_threadsafe(self.tell_registrants, TOO_LARGE, reason)
 
-    def _publisher_matched(self, change: Any) -> None:
-        self._gaps.publishers(change.current_count)
-        if change.current_count_change > 0:
+    def _publisher_matched(self, count: int, change: int) -> None:
+        self._gaps.publishers(count)
+        if change > 0:
             self._is_latched = True  # it may be
             self.robot.session.submit(self._follow)
 
-    def _publisher_incompatible(self, _change: Any) -> None:
+    def _publisher_incompatible(self) -> None:
         self.robot.session.submit(self._follow)
 
     def _follow(self) -> None:
@@ -235,10 +221,10 @@ class SubscriberNode(TopicNode):
             # one that does not latch is among them, so what a new one holds does not come by itself
             self._welcome(self._fanout.receivers)
 
-    def _lost(self, status: Any) -> None:
+    def _lost(self, count: int) -> None:
         """ROS itself counts what the network lost, not what it threw away for want of room."""
         if not self._gaps.counting:
-            self._note_lost(int(status.total_count_change))
+            self._note_lost(count)
 
     def _tell_gaps(self) -> None:
         if missing := self._gaps.missing():
@@ -283,5 +269,5 @@ class RateLimit:
         self._pace.take(1, due if now - due < self._period_s else now)
 
 
-def _describe(profile: Any) -> str:
+def _describe(profile: Qos) -> str:
     return f"{profile.reliability.name.lower()}, {profile.durability.name.lower()}".replace("_", " ")

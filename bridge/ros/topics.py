@@ -13,21 +13,19 @@ import math
 import threading
 import time
 from collections.abc import Iterable
-from typing import Any
 
 from msgspec import UNSET, UnsetType, structs
-from rclpy.event_handler import PublisherEventCallbacks, UnsupportedEventTypeError
-from rclpy.serialization import serialize_message
 
 from bridge.audit import who
-from bridge.ros import fields, qos
+from bridge.ros import qos
 from bridge.ros.alarms import Alarm
 from bridge.ros.carried import Carried
-from bridge.ros.interface import InterfaceNode, Registrant, Robot, ros_errors
+from bridge.ros.interface import InterfaceNode, Registrant, Robot
 from bridge.ros.rules import DEFAULT_HOLD_S
 from bridge.ros.safety import Control, DeadMan
+from bridge.ros.side import MessageType, Other, Publisher, Side
 from bridge.ros.stream import cdr_problem
-from bridge.ros.types import InterfaceName, least_cdr_bytes, resolve
+from bridge.ros.types import InterfaceName
 from bridge.ros.unity_cdr import TooManyParts, UnityCdr, to_ros
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import AddNode, NodeType
@@ -53,9 +51,9 @@ class TopicNode(InterfaceNode):
 
     def _others(self, *, publishers_first: bool) -> set[str]:
         """The types at the other end of the topic, or without one at ours; none when ours is among them."""
-        node, topic = self.robot.session.node, self.topic
-        publishers = types_of_others(node, node.get_publishers_info_by_topic(topic))
-        subscriptions = types_of_others(node, node.get_subscriptions_info_by_topic(topic))
+        side, topic = self.robot.session, self.topic
+        publishers = types_of_others(side, side.publishers(topic))
+        subscriptions = types_of_others(side, side.subscriptions(topic))
         found = (publishers or subscriptions) if publishers_first else (subscriptions or publishers)
         return set() if str(self.interface) in found else found
 
@@ -83,7 +81,7 @@ class PublisherNode(TopicNode):
         self._stopped_at = -math.inf
         self._watch: Alarm | None = None
         self._retired = False
-        self._publisher: Any = None
+        self._publisher: Publisher | None = None
         self._least_bytes = 4
         self._cdr: UnityCdr | None = None
         self._expected = 0
@@ -93,29 +91,24 @@ class PublisherNode(TopicNode):
         """Held while something is judged and published: no command that came before a stop message may follow it."""
 
     def open(self) -> None:
-        message = resolve(str(self.interface))
-        self._least_bytes = least_cdr_bytes(message)
-        self._cdr = UnityCdr.of(message)
+        side = self.robot.session
+        message = side.message(self.interface, self.topic)
+        self._least_bytes, self._cdr = message.least_bytes, message.unity
         if self.rule.deadman_message is not None:
-            self._stop_cdr = bytes(serialize_message(self._stop_message(message)))
-        node, topic = self.robot.session.node, self.request.tos_name
-        check_topic_type(node, topic, self.interface)
-        subscriptions = [endpoint.qos_profile for endpoint in node.get_subscriptions_info_by_topic(topic)]
+            self._stop_cdr = self._stop_message(message)
+        check_topic_type(side, self.topic, self.interface)
+        subscriptions = [subscription.qos for subscription in side.subscriptions(self.topic)]
         profile = qos.for_publisher(
             subscriptions, qos.depth_of(self.request.buffer_size), latched=self.request.is_latched
         )
         profile = qos.overridden(profile, self.rule)
         self._expected = len(subscriptions)
-        events = PublisherEventCallbacks(matched=self._subscription_matched, use_default_callbacks=False)
-        with ros_errors(topic):
-            try:
-                self._publisher = node.create_publisher(message, topic, profile, event_callbacks=events)
-            except UnsupportedEventTypeError:  # of some middlewares; then the time decides
-                self._publisher = node.create_publisher(message, topic, profile)
+        # where nothing matches, as with some middlewares, the time decides
+        self._publisher = side.advertise(message, self.request.tos_name, profile, self._subscription_matched)
 
-    def _stop_message(self, kind: type[Any]) -> Any:
+    def _stop_message(self, message: MessageType) -> bytes:
         try:
-            return fields.filled(kind, self.rule.deadman_message or {}, "deadman_message")
+            return message.filled(self.rule.deadman_message or {}, "deadman_message")
         except Refused as refusal:  # the headset cannot mend it
             self._loop.call_soon_threadsafe(self.robot.drops.note, "wrong_settings", self.topic, refusal.reason)
             raise
@@ -129,8 +122,8 @@ class PublisherNode(TopicNode):
             with contextlib.suppress(asyncio.TimeoutError):
                 await within(self._matched.wait(), self.MATCH_S)
 
-    def _subscription_matched(self, status: Any) -> None:
-        if status.current_count >= self._expected:
+    def _subscription_matched(self, count: int) -> None:
+        if count >= self._expected:
             self._loop.call_soon_threadsafe(self._matched.set)
 
     def retire(self) -> None:
@@ -146,11 +139,10 @@ class PublisherNode(TopicNode):
             publisher, self._publisher = self._publisher, None
         if publisher is None:
             return
-        node = self.robot.session.node
         if self._stopped_at + self.LINGER_S > time.monotonic():
-            self.robot.session.later(self.LINGER_S, lambda: node.destroy_publisher(publisher))
+            self.robot.session.later(self.LINGER_S, publisher.close)
         else:
-            node.destroy_publisher(publisher)
+            publisher.close()
 
     def receive(self, message: Message) -> None:
         try:  # before the lock, for which a stop message may wait
@@ -193,8 +185,9 @@ class PublisherNode(TopicNode):
 
     def _publish(self, cdr: bytes) -> bool:
         try:
+            assert self._publisher is not None
             self._publisher.publish(cdr)
-        except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is
+        except Exception as error:  # noqa: BLE001 - the middleware's, whatever it is
             self.robot.drops.note("failed", self.topic, f"ROS did not publish: {error}")
             return False
         return True
@@ -266,13 +259,11 @@ class PublisherNode(TopicNode):
         )
 
 
-def types_of_others(node: Any, endpoints: Iterable[Any]) -> set[str]:
+def types_of_others(side: Side, endpoints: Iterable[Other]) -> set[str]:
     """The types of these endpoints as far as they are other nodes'."""
-    own = (node.get_name(), node.get_namespace())
-    return {endpoint.topic_type for endpoint in endpoints if (endpoint.node_name, endpoint.node_namespace) != own}
+    return {endpoint.type for endpoint in endpoints if endpoint.node != side.full_name}
 
 
-def check_topic_type(node: Any, topic: str, interface: InterfaceName) -> None:
+def check_topic_type(side: Side, topic: str, interface: InterfaceName) -> None:
     """Raise Refused when the topic exists and carries another type. In the ROS thread."""
-    endpoints = [*node.get_publishers_info_by_topic(topic), *node.get_subscriptions_info_by_topic(topic)]
-    interface.check(topic, {endpoint.topic_type for endpoint in endpoints})
+    interface.check(topic, {endpoint.type for endpoint in (*side.publishers(topic), *side.subscriptions(topic))})

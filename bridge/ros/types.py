@@ -14,22 +14,13 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rosidl_parser import definition as idl  # type: ignore[import-untyped, import-not-found, unused-ignore]
-
+from bridge.ros.shapes import Array, Number, Sequence, Shape, Structure, Text
 from macs_zenoh.errors import Refused
 
 _NAME = re.compile(
     r"(?P<package>(?!\w*__)[a-z][a-z0-9_]{0,127}(?<!_))/(?:(?P<kind>msg|srv|action)/)?(?P<name>[A-Z][A-Za-z0-9]{0,127})"
 )
 _INDEX = Path("share", "ament_index", "resource_index", "rosidl_interfaces")
-
-PRIMITIVE_BYTES = {
-    **dict.fromkeys(("boolean", "octet", "char", "uint8", "int8"), 1),
-    **dict.fromkeys(("uint16", "int16", "wchar"), 2),
-    **dict.fromkeys(("uint32", "int32", "float"), 4),
-    **dict.fromkeys(("uint64", "int64", "double"), 8),
-    "long double": 16,
-}
 
 
 class InterfaceName(NamedTuple):
@@ -138,25 +129,31 @@ def _prefixes() -> list[Path]:
     return [*sourced, Path(sys.prefix)]
 
 
-def least_cdr_bytes(message: type[Any]) -> int:
-    """The fewest bytes that any CDR of this type can have, with its 4 byte encapsulation header.
-
-    Padding is not counted, and text and sequences count as empty, so no valid message is shorter, whoever wrote it.
-    For a type of fixed size (a Twist) it is nearly exact: a truncated command is caught without decoding.
-    """
-    return 4 + _least_bytes_of(message)
-
-
-def _least_bytes_of(message: type[Any]) -> int:
-    return sum(_least_bytes(slot) for slot in getattr(message, "SLOT_TYPES", ()))
+_PRIMITIVE_BYTES = {
+    **dict.fromkeys(("boolean", "octet", "char", "uint8", "int8"), 1),
+    **dict.fromkeys(("uint16", "int16", "wchar"), 2),
+    **dict.fromkeys(("uint32", "int32", "float"), 4),
+    **dict.fromkeys(("uint64", "int64", "double"), 8),
+    "long double": 16,
+}
+_BOXED = frozenset({"boolean", "octet", "char", "wchar"})
+"""rclpy has arrays of the other numbers."""
 
 
-def _least_bytes(slot: Any) -> int:
+def shape_of(message: type[Any]) -> Structure:
+    """What a message class consists of."""
+    return Structure(tuple(map(_shape, getattr(message, "SLOT_TYPES", ()))))
+
+
+def _shape(slot: Any) -> Shape:
+    from rosidl_parser import definition as idl  # type: ignore[import-untyped, import-not-found, unused-ignore]
+
     if isinstance(slot, idl.BasicType):
-        return PRIMITIVE_BYTES.get(slot.typename, 1)
+        return Number(_PRIMITIVE_BYTES.get(slot.typename, 1), slot.typename in _BOXED)
     if isinstance(slot, idl.NamespacedType):
-        package, kind = slot.namespaces
-        return _least_bytes_of(getattr(importlib.import_module(f"{package}.{kind}"), slot.name))
+        return shape_of(getattr(importlib.import_module(".".join(slot.namespaces)), slot.name))
     if isinstance(slot, idl.Array):
-        return int(slot.size) * _least_bytes(slot.value_type)
-    return 4  # a string or a sequence: its length, 0
+        return Array(_shape(slot.value_type), int(slot.size))
+    if isinstance(slot, idl.AbstractSequence):
+        return Sequence(_shape(slot.value_type))
+    return Text(wide=isinstance(slot, idl.AbstractWString))

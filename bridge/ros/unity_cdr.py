@@ -13,14 +13,10 @@ ROS's own finds other numbers in it, so types that have any of the three are tra
 
 from __future__ import annotations
 
-import importlib
 import struct
 from collections.abc import Callable
-from typing import Any
 
-from rosidl_parser import definition as idl  # type: ignore[import-untyped, import-not-found, unused-ignore]
-
-from bridge.ros.types import PRIMITIVE_BYTES
+from bridge.ros.shapes import Array, Number, Sequence, Shape, Structure, Text
 from macs_zenoh.protocol.limits import REQUEST_BYTES
 
 HEADER = b"\x00\x01\x00\x00"
@@ -44,7 +40,7 @@ _U32 = struct.Struct("<I")
 _Part = Callable[["_Copy"], None]
 
 
-class _Misfit(Exception):
+class Misfit(Exception):
     """The bytes are not of this type, or not in this form."""
 
 
@@ -59,8 +55,8 @@ class UnityCdr:
         self._copy = copy
 
     @staticmethod
-    def of(message: type[Any]) -> UnityCdr | None:
-        """For a message class, or None when Unity's serializer and ROS agree on it."""
+    def of(message: Structure) -> UnityCdr | None:
+        """For a type, or None when Unity's serializer and ROS agree on it."""
         return UnityCdr(_structure(message)) if _differs(message) else None
 
     def to_ros(self, cdr: bytes, most: int = PARTS) -> bytes:
@@ -73,13 +69,13 @@ class UnityCdr:
         try:
             self._copied(cdr, from_unity=False, to_unity=False, most=most)
             return cdr
-        except _Misfit:
+        except Misfit:
             pass
         except TooManyParts as error:  # in the other form the same bytes may be few numbers
             too_many = error
         try:
             return self._copied(cdr, from_unity=True, to_unity=False, most=most)
-        except _Misfit:
+        except Misfit:
             if too_many is not None:
                 raise too_many from None
             return cdr
@@ -88,14 +84,14 @@ class UnityCdr:
         """ROS's message as an existing headset reads it; None when it is not of this type."""
         try:
             return self._copied(cdr, from_unity=False, to_unity=True, strict=False)
-        except _Misfit:
+        except Misfit:
             return None
 
     def _copied(
         self, cdr: bytes, *, from_unity: bool, to_unity: bool, strict: bool = True, most: int | None = None
     ) -> bytes:
         if cdr[:_HEADER_BYTES] != HEADER:
-            raise _Misfit
+            raise Misfit
         copy = _Copy(cdr, from_unity=from_unity, to_unity=to_unity, strict=strict, most=most)
         self._copy(copy)
         copy.end()
@@ -110,9 +106,9 @@ class Parts:
         self._copy = copy
 
     @staticmethod
-    def of(message: type[Any]) -> Parts | None:
-        """For a message class, or None when no message of it has many."""
-        return Parts(_structure(message)) if any(map(_may_have_many, message.SLOT_TYPES)) else None
+    def of(message: Structure) -> Parts | None:
+        """For a type, or None when no message of it has many."""
+        return Parts(_structure(message)) if _may_have_many(message) else None
 
     def check(self, cdr: bytes, most: int = PARTS) -> None:
         """Raises TooManyParts, also for what is too large to be read without knowing."""
@@ -120,9 +116,9 @@ class Parts:
             return
         try:
             if cdr[:_HEADER_BYTES] != HEADER:
-                raise _Misfit
+                raise Misfit
             self._copy(_Copy(cdr, from_unity=False, to_unity=False, strict=False, most=most))
-        except _Misfit:
+        except Misfit:
             raise TooManyParts(f"{len(cdr)} bytes, and their parts cannot be counted") from None
 
 
@@ -151,6 +147,17 @@ def to_unity(both: UnityCdr | None, cdr: bytes) -> bytes:
     return unity + b"\0" if unity == HEADER else unity
 
 
+def behind_a_byte(message: Structure, cdr: bytes) -> tuple[int, bytes]:
+    """ROS's CDR of a byte and a message of this type: the byte, and the message by itself, which is aligned anew.
+    Raises Misfit."""
+    if cdr[:_HEADER_BYTES] != HEADER:
+        raise Misfit
+    copy = _Copy(cdr, from_unity=False, to_unity=False, strict=False, most=None)
+    (byte,) = copy.pass_over(1)
+    _structure(message)(copy)
+    return byte, bytes(copy.out)
+
+
 class _Copy:
     """Reads one form and writes the other. ``strict``: padding is zero, and nothing but padding follows the end.
     ``most``: parts that may be read; None: any."""
@@ -169,7 +176,7 @@ class _Copy:
         """Look at what is left."""
         rest = len(self._cdr) - self._at
         if self._strict and (rest and (self._from_unity or rest >= _LARGE or any(self._cdr[self._at :]))):
-            raise _Misfit
+            raise Misfit
 
     def spend(self, parts: int) -> None:
         """So many parts will be read. Once per sequence, so that it costs what is sent next to nothing."""
@@ -199,7 +206,7 @@ class _Copy:
         """How many items follow. None takes less than a byte, but for those of `nothing`."""
         count = self._length_in()
         if count > max(len(self._cdr), _MAX_NOTHINGS):
-            raise _Misfit
+            raise Misfit
         self._length_out(count)
         return count
 
@@ -236,7 +243,7 @@ class _Copy:
     def nothing(self) -> None:
         """A structure without fields."""
         if not self._from_unity and self._take(1)[0] and self._strict:
-            raise _Misfit
+            raise Misfit
         if not self._to_unity:
             self.out.append(0)
 
@@ -245,7 +252,7 @@ class _Copy:
         if text and not text[-1]:
             return text[:-1]
         if self._from_unity:
-            raise _Misfit
+            raise Misfit
         return text  # ROS reads one without its zero, too
 
     def _length_in(self) -> int:
@@ -259,41 +266,37 @@ class _Copy:
     def _align_in(self, size: int) -> None:
         padding = self._take(-(self._at - _HEADER_BYTES) % size)
         if self._strict and any(padding):
-            raise _Misfit
+            raise Misfit
 
     def _align_out(self, size: int) -> None:
         self.out += bytes(-(len(self.out) - _HEADER_BYTES) % size)
 
+    def pass_over(self, count: int) -> memoryview:
+        """So many bytes that are not written."""
+        return self._take(count)
+
     def _take(self, count: int) -> memoryview:
         begin, self._at = self._at, self._at + count
         if self._at > len(self._cdr):
-            raise _Misfit
+            raise Misfit
         return self._cdr[begin : self._at]
 
 
 # -- from a type to what copies it -----------------------------------------------------------------------------------
 
 
-def _differs(message: type[Any]) -> bool:
-    slots = message.SLOT_TYPES
-    return not slots or any(_slot_differs(slot) for slot in slots)
+def _differs(shape: Shape) -> bool:
+    if isinstance(shape, Structure):
+        return not shape.fields or any(map(_differs, shape.fields))
+    if isinstance(shape, Sequence) and isinstance(shape.item, Number):
+        return shape.item.size >= _LARGE
+    if isinstance(shape, Sequence | Array):
+        return _differs(shape.item)
+    return isinstance(shape, Text) and shape.wide
 
 
-def _slot_differs(slot: Any) -> bool:
-    if isinstance(slot, idl.AbstractWString):
-        return True
-    if isinstance(slot, idl.NamespacedType):
-        return _differs(_class_of(slot))
-    if isinstance(slot, idl.AbstractNestedType):
-        item = slot.value_type
-        if isinstance(item, idl.BasicType) and not isinstance(slot, idl.Array):
-            return PRIMITIVE_BYTES[item.typename] >= _LARGE
-        return _slot_differs(item)
-    return False
-
-
-def _structure(message: type[Any]) -> _Part:
-    parts = [_part(slot) for slot in message.SLOT_TYPES]
+def _structure(message: Structure) -> _Part:
+    parts = [_part(field) for field in message.fields]
     if not parts:
         return _Copy.nothing
 
@@ -304,24 +307,22 @@ def _structure(message: type[Any]) -> _Part:
     return copy_all
 
 
-def _part(slot: Any) -> _Part:
-    if isinstance(slot, idl.BasicType):
-        size = PRIMITIVE_BYTES[slot.typename]
+def _part(shape: Shape) -> _Part:
+    if isinstance(shape, Number):
+        size = shape.size
         return lambda copy: copy.values(size)
-    if isinstance(slot, idl.NamespacedType):
-        return _structure(_class_of(slot))
-    if isinstance(slot, idl.AbstractWString):
-        return _Copy.wide_text
-    if isinstance(slot, idl.Array):
-        return _array(slot.value_type, int(slot.size))
-    if isinstance(slot, idl.AbstractSequence):
-        return _sequence(slot.value_type)
-    return _Copy.text
+    if isinstance(shape, Structure):
+        return _structure(shape)
+    if isinstance(shape, Array):
+        return _array(shape.item, shape.count)
+    if isinstance(shape, Sequence):
+        return _sequence(shape.item)
+    return _Copy.wide_text if shape.wide else _Copy.text
 
 
-def _array(item: Any, count: int) -> _Part:
-    if isinstance(item, idl.BasicType):
-        size = PRIMITIVE_BYTES[item.typename]
+def _array(item: Shape, count: int) -> _Part:
+    if isinstance(item, Number):
+        size = item.size
         return lambda copy: copy.values(size, count)
     part = _part(item)
 
@@ -332,9 +333,9 @@ def _array(item: Any, count: int) -> _Part:
     return copy_items
 
 
-def _sequence(item: Any) -> _Part:
-    if isinstance(item, idl.BasicType):
-        size, each = PRIMITIVE_BYTES[item.typename], _OBJECTS * (item.typename in _MADE_OBJECTS)
+def _sequence(item: Shape) -> _Part:
+    if isinstance(item, Number):
+        size, each = item.size, _OBJECTS * item.boxed
         return lambda copy: copy.sequence_of_values(size, each)
     part, parts = _part(item), _parts_of(item)
 
@@ -347,30 +348,20 @@ def _sequence(item: Any) -> _Part:
     return copy_items
 
 
-_MADE_OBJECTS = frozenset({"boolean", "octet", "char", "wchar"})
-"""rclpy has arrays of the other numbers."""
+def _may_have_many(shape: Shape) -> bool:
+    if isinstance(shape, Sequence):
+        return not isinstance(shape.item, Number) or shape.item.boxed
+    if isinstance(shape, Array):
+        return _may_have_many(shape.item)
+    if isinstance(shape, Structure):
+        return any(map(_may_have_many, shape.fields))
+    return isinstance(shape, Text) and shape.wide
 
 
-def _may_have_many(slot: Any) -> bool:
-    if isinstance(slot, idl.AbstractSequence):
-        item = slot.value_type
-        return not isinstance(item, idl.BasicType) or item.typename in _MADE_OBJECTS
-    if isinstance(slot, idl.Array):
-        return _may_have_many(slot.value_type)
-    if isinstance(slot, idl.NamespacedType):
-        return any(map(_may_have_many, _class_of(slot).SLOT_TYPES))
-    return isinstance(slot, idl.AbstractWString)
-
-
-def _parts_of(slot: Any) -> int:
+def _parts_of(shape: Shape) -> int:
     """What one item of a sequence has at least."""
-    if isinstance(slot, idl.NamespacedType):
-        return 1 + sum(map(_parts_of, _class_of(slot).SLOT_TYPES))
-    if isinstance(slot, idl.Array) and not isinstance(slot.value_type, idl.BasicType):
-        return int(slot.size) * _parts_of(slot.value_type)
+    if isinstance(shape, Structure):
+        return 1 + sum(map(_parts_of, shape.fields))
+    if isinstance(shape, Array) and not isinstance(shape.item, Number):
+        return shape.count * _parts_of(shape.item)
     return 1
-
-
-def _class_of(slot: Any) -> type[Any]:
-    found: type[Any] = getattr(importlib.import_module(".".join(slot.namespaces)), slot.name)
-    return found

@@ -45,6 +45,7 @@ from macs_zenoh.protocol.keyexpr import (
     with_recovery,
 )
 from macs_zenoh.protocol.messages import NOBODY, OPERATOR, ROS, UNITY
+from macs_zenoh.protocol.rmw_zenoh.keyexpr import session_keys
 
 TYPES = {"robots": ROS, "gateways": UNITY, "operators": OPERATOR}
 
@@ -107,13 +108,20 @@ def rules(policy: Policy, client: Client) -> list[Rule]:
         ),
         Rule("sees who is there", ("liveliness_token",), (EGRESS,), distinct(seen)),
     ]
-    return [_in(policy.namespace, rule) for rule in found if rule.keys]
+    own = [_in(policy.namespace, rule) for rule in found if rule.keys]
+    if isinstance(client, Robot) and client.ros_namespace:
+        keys = distinct(session_keys(client.ros_namespace))  # in no other namespace
+        own.append(Rule("has ROS nodes", MESSAGES, (INGRESS, EGRESS), keys))
+    return own
 
 
 def link_rules(policy: Policy) -> list[Rule]:
     """Everything that one router may send another: what is forbidden to a client is stopped at the client's router."""
     keys = distinct([*with_recovery([EVERYTHING]), *ADMIN])
-    return [_in(policy.namespace, Rule("carries everything", MESSAGES, (INGRESS, EGRESS), keys))]
+    carried = [_in(policy.namespace, Rule("carries everything", MESSAGES, (INGRESS, EGRESS), keys))]
+    if ros := [key for robot in policy.robots if robot.ros_namespace for key in session_keys(robot.ros_namespace)]:
+        carried.append(Rule("carries what ROS nodes say", MESSAGES, (INGRESS, EGRESS), distinct(ros)))
+    return carried
 
 
 def linked(policy: Policy, router: Router) -> list[Router]:

@@ -26,6 +26,7 @@ from macs_zenoh.protocol.keyexpr import (
     WANTED,
 )
 from macs_zenoh.protocol.messages import ROS, UNITY
+from macs_zenoh.protocol.rmw_zenoh.keyexpr import probe_key
 
 MARK = "macs_check"
 """A topic, a verb and a message type of the check's own."""
@@ -125,6 +126,8 @@ class Attempts:
         yield "to all", BROADCAST.of(**sender), None, reached
         if isinstance(name, Robot):
             key = STREAM.of(type=ROS, id=name.id, node=MARK)
+            if name.ros_namespace and not self._policy.namespace:
+                yield "to its ROS nodes", probe_key(name.ros_namespace, MARK), None, [name]
             yield "on a stream", key, None, [other for other in here if self._policy.may(other, "see", name)]
         if (by := access.awareness_name(name)) is None:
             return

@@ -378,6 +378,10 @@ def _sections(policy: Policy, client: Client) -> list[str]:
     lines += ["# who may command it; who may only see it registers for its topics and for nothing else"]
     lines += [f"register_allow = {json.dumps(list(dict.fromkeys(commanders)))}"]
     lines += _believed(policy, client)
+    if client.ros_namespace:
+        lines += ["", "# `macs rmw-zenoh`: its nodes' sessions have this namespace, and this certificate"]
+        lines += ["[[rmw_zenoh.robots]]", f"id = {client.id}", f"group = {client.group}"]
+        lines += [f"session_namespace = {json.dumps(client.ros_namespace)}"]
     if client.awareness_name is not None:
         name = json.dumps(client.awareness_name, ensure_ascii=False)
         lines += ["", "[awareness]", f"name = {name}", f"id = {client.id}", "beside = true"]

@@ -46,6 +46,9 @@ KINDS = ("robots", "gateways", "operators")
 ALL = "all"
 RESERVED = {*KINDS, "routers", ALL, "ca"}
 
+RESERVED_KEYS = ("macs",)
+"""What the mesh's own keys begin with."""
+
 PORT = 7447
 
 SEE_VERBS = ("add_node", "remove_node", "offers", "definitions", "status")
@@ -96,6 +99,8 @@ class Robot(_Client, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """0: in no group."""
     awareness_name: AgentName | None = None
     """Its name in collective awareness; without one it takes no part in it."""
+    ros_namespace: Annotated[str, Meta(pattern=r"^([A-Za-z0-9_-]+)?$", max_length=63)] = ""
+    """The namespace of its ROS nodes' sessions, where they run rmw_zenoh: keys below it are this robot's alone."""
 
 
 class Gateway(_Client, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -311,6 +316,11 @@ def _check(policy: Policy) -> None:
             if robot.awareness_name is not None
         ),
     )
+    with_nodes = [robot for robot in policy.robots if robot.ros_namespace]
+    _once("ros_namespace", ((f"robots: {robot.name}", robot.ros_namespace) for robot in with_nodes))
+    for robot in with_nodes:
+        if robot.ros_namespace in (*RESERVED_KEYS, policy.namespace):
+            raise ConfigError(f"robots: {robot.name}.ros_namespace", f"{robot.ros_namespace} is the mesh's own")
     _once("block", ((f"gateways: {gateway.name}", block) for gateway in policy.gateways for block in gateway.blocks))
     for router in policy.routers:
         _check_router(router, policy)

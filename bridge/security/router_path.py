@@ -37,6 +37,7 @@ from macs_zenoh.protocol.keyexpr import (
     WANTED,
 )
 from macs_zenoh.protocol.messages import ROS, UNITY
+from macs_zenoh.protocol.rmw_zenoh.keyexpr import probe_key
 from macs_zenoh.protocol.wire import PROBE
 from macs_zenoh.sections import changed
 
@@ -139,6 +140,8 @@ class RouterPath:
             keys.add(UNICAST.every(**inbox_of(client)))
             if isinstance(client, Robot):
                 keys.add(STREAM.of(type=ROS, id=client.id, node=MARK))
+                if client.ros_namespace:
+                    keys.add(probe_key(client.ros_namespace, MARK))
                 if client.group:
                     keys.add(GROUP.every(group=client.group, type=ROS))
                 if client.awareness_name is not None:

@@ -1,6 +1,6 @@
 """A whole settings file: one section for each of our programs, beside what the library needs (`macs_zenoh.config`).
 
-It is TOML with up to five sections and a list of rules, one struct each::
+It is TOML with up to six sections and a list of rules, one struct each::
 
     [mesh]                                   # MeshSettings: every program on the mesh
     connect = ["tcp/192.168.1.10:7447"]
@@ -10,6 +10,9 @@ It is TOML with up to five sections and a list of rules, one struct each::
 
     [robot]                                  # RobotSettings: `macs agent`
     id = 7
+
+    [[rmw_zenoh.robots]]                     # RmwZenohSettings: `macs rmw-zenoh`, robots without anything installed
+    id = 8
 
     [awareness]                              # AwarenessSettings: `macs awareness`
     name = "drone0"
@@ -42,6 +45,7 @@ from .awareness import AwarenessSettings
 from .gateway import GatewaySettings
 from .operator import OperatorSettings
 from .record import RecordSettings
+from .rmw_zenoh import RmwZenohRobot, RmwZenohSettings
 from .robot import ROBOT_HIDES, WHO_STOPPED, RobotSettings, TopicRule
 
 __all__ = [
@@ -51,6 +55,8 @@ __all__ = [
     "GatewaySettings",
     "OperatorSettings",
     "RecordSettings",
+    "RmwZenohRobot",
+    "RmwZenohSettings",
     "RobotSettings",
     "Settings",
     "TopicRule",
@@ -65,6 +71,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     mesh: MeshSettings = MeshSettings()
     gateway: GatewaySettings = GatewaySettings()
     robot: RobotSettings = RobotSettings()
+    rmw_zenoh: RmwZenohSettings = RmwZenohSettings()
     awareness: AwarenessSettings = AwarenessSettings()
     operator: OperatorSettings = OperatorSettings()
     record: RecordSettings = RecordSettings()

@@ -13,6 +13,7 @@ from macs_zenoh.protocol.name_patterns import PATTERN
 from macs_zenoh.sections import AgentId, Bytes, GroupId, Seconds, Section, in_words
 
 from .agents import AgentPattern, names_agents
+from .mirror import MirrorRule
 
 NamePattern = Annotated[
     str,
@@ -152,6 +153,8 @@ class RobotSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """A new file is begun when it has so much; the older one is called ``….000001`` and so on."""
     audit_files: Annotated[int, Meta(ge=1, le=100_000)] = 20
     """So many older files are kept."""
+    mirror: list[MirrorRule] = []
+    """Topics and services of other robots in this robot's ROS graph, each a ``[[robot.mirror]]`` table."""
     rules: list[TopicRule] = []
     """What holds for topics, services and actions by name, each a ``[[robot.rules]]`` table."""
     groups: dict[str, list[AgentPattern]] = {}

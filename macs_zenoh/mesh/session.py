@@ -132,23 +132,7 @@ class Mesh:
         Raises ConfigError when Zenoh does not accept the configuration or a file of it is missing, Unreachable when a
         router cannot listen.
         """
-        zenoh.init_log_from_env_or("off" if quiet else LOGGED)  # RUST_LOG, as with Zenoh's own tools
-        check_files(zenoh_config(settings))  # once: a file that is being replaced ends nobody who waits
-        waiting = False
-        while True:
-            config = zenoh_config(settings)
-            try:
-                return cls(await _open(config), settings, traffic)
-            except zenoh.ZError as error:
-                problem = first_line(error)
-                if settings.mode != "client":
-                    raise Unreachable(", ".join(settings.listen) or "the mesh", problem) from error
-                if not problem.startswith("Unable to connect"):
-                    raise ConfigError("zenoh configuration", problem) from error
-                if not waiting:
-                    waiting = True
-                    (on_waiting or _log_waiting)(", ".join(settings.routers) or "a router")
-                await asyncio.sleep(settings.retry_max_ms / 1000)
+        return cls(await open_session(settings, on_waiting=on_waiting, quiet=quiet), settings, traffic)
 
     @classmethod
     async def open_once(cls, settings: MeshSettings, *, timeout_s: float) -> Mesh:
@@ -486,6 +470,29 @@ class Mesh:
             (self._loop.call_soon if here else self._loop.call_soon_threadsafe)(callback, *args)
         except RuntimeError:  # the loop is closed: the program is ending and nobody waits for this
             log.debug("the event loop has ended")
+
+
+async def open_session(
+    settings: MeshSettings, *, on_waiting: Callable[[str], None] | None = None, quiet: bool = False
+) -> zenoh.Session:
+    """A session of Zenoh's by these settings. See `Mesh.open`."""
+    zenoh.init_log_from_env_or("off" if quiet else LOGGED)  # RUST_LOG, as with Zenoh's own tools
+    check_files(zenoh_config(settings))  # once: a file that is being replaced ends nobody who waits
+    waiting = False
+    while True:
+        config = zenoh_config(settings)
+        try:
+            return await _open(config)
+        except zenoh.ZError as error:
+            problem = first_line(error)
+            if settings.mode != "client":
+                raise Unreachable(", ".join(settings.listen) or "the mesh", problem) from error
+            if not problem.startswith("Unable to connect"):
+                raise ConfigError("zenoh configuration", problem) from error
+            if not waiting:
+                waiting = True
+                (on_waiting or _log_waiting)(", ".join(settings.routers) or "a router")
+            await asyncio.sleep(settings.retry_max_ms / 1000)
 
 
 async def _open(config: zenoh.Config) -> zenoh.Session:

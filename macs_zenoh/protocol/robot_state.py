@@ -84,6 +84,8 @@ class RobotStatus(Struct, frozen=True):
     nodes: list[NodeStatus]
     drops: dict[str, int] = {}
     ros_domain: int | None = None
+    beside: str | UnsetType = UNSET
+    """What its agent cannot do for its safety, where that is a program beside the robot."""
 
 
 class TopicQos(Struct, frozen=True):

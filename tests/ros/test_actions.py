@@ -382,7 +382,7 @@ async def test_a_server_that_dies_aborts_its_goals(
     monkeypatch.setattr("bridge.ros.actions.GONE_S", 0.3)
     goal = await site.five.client.send_goal(7, site.goal(1000, 0.05))
     node = site.nodes.get(NodeType.ACTION, "nd__count")
-    monkeypatch.setattr(node._client, "server_is_ready", lambda: False)
+    monkeypatch.setattr(node._client, "is_ready", lambda: False)
     assert (await goal.result(PATIENCE_S)).status == ABORTED
 
 

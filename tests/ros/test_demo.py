@@ -136,7 +136,7 @@ async def test_the_demo_robot_shows_drives_and_ends(
     while (await get(poses)).pose.position.x < 0.05:
         commands.publish(twist)
     assert (await _call(peer, SetBool, "/set_lights", SetBool.Request(data=True))).message == "lights on"
-    offered = await peer.session.run(lambda: graph.offers(peer.session.node))
+    offered = await peer.session.run(lambda: graph.offers(peer.session))
     assert offered.subscribers == {"/cmd_vel": "geometry_msgs/msg/Twist"}
     assert offered.publishers == {
         "/battery": "sensor_msgs/msg/BatteryState",

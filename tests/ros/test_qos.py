@@ -8,6 +8,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSCompatibility, QoSP
 from rclpy.qos import qos_check_compatible as check
 
 from bridge.ros import qos
+from bridge.ros.rclpy_side import qos_of, rclpy_profile
 
 PLAIN = QoSProfile(depth=5)
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -29,7 +30,7 @@ MIXES += [[STRICT, STRICTER, LATCHED], [LATCHED, LATCHED_SENSOR]]
 @pytest.mark.parametrize("publishers", MIXES)
 def test_a_subscription_matches_all_publishers(publishers: list[QoSProfile]) -> None:
     """ROS itself finds what we ask for compatible with every publisher."""
-    profile = qos.for_subscription(publishers, 7)
+    profile = rclpy_profile(qos.for_subscription(map(qos_of, publishers), 7))
     assert profile.depth == 7
     assert all(check(offered, profile)[0] != QoSCompatibility.ERROR for offered in publishers)
 
@@ -38,7 +39,7 @@ def test_a_subscription_matches_all_publishers(publishers: list[QoSProfile]) -> 
 @pytest.mark.parametrize("latched", [True, False])
 def test_a_publisher_matches_all_subscriptions(subscriptions: list[QoSProfile], latched: bool) -> None:
     """ROS itself finds what we offer compatible with every subscription."""
-    profile = qos.for_publisher(subscriptions, 7, latched=latched)
+    profile = rclpy_profile(qos.for_publisher(map(qos_of, subscriptions), 7, latched=latched))
     assert profile.depth == 7
     assert all(check(profile, requested)[0] != QoSCompatibility.ERROR for requested in subscriptions)
     assert not latched or profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
@@ -59,7 +60,7 @@ def test_a_subscription_asks_for_as_much_as_there_is(
     publishers: list[QoSProfile], reliable: bool, latched: bool
 ) -> None:
     """Nothing that all publishers offer is given away."""
-    profile = qos.for_subscription(publishers, 7)
+    profile = rclpy_profile(qos.for_subscription(map(qos_of, publishers), 7))
     assert (profile.reliability == ReliabilityPolicy.RELIABLE) is reliable
     assert (profile.durability == DurabilityPolicy.TRANSIENT_LOCAL) is latched
 

@@ -20,7 +20,6 @@ from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.requests import control
 from bridge.ros.rules import Rules
-from bridge.ros.servers import servers_elsewhere
 from bridge.ros.session import RosSession
 from bridge.ros.topics import PublisherNode
 from bridge.settings import RobotSettings, Settings, TopicRule
@@ -408,12 +407,12 @@ async def test_what_a_node_of_the_robot_serves_no_headset_serves(session: RosSes
     sent = Sent()
     async with robot_nodes(session, sent) as nodes:
         service = await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/lights", _serve))
-        await until(lambda: "/peer" in servers_elsewhere(session.node, "/lights"))
+        await until(lambda: "/peer" in session.servers_elsewhere("/lights"))
         asked = adding("/lights", "std_srvs/SetBool", node_type=NodeType.SERVICE)
         with pytest.raises(Refused, match="/lights is served by /peer on this robot"):
             await nodes.add(asked)
         await peer.session.run(lambda: peer.session.node.destroy_service(service))
-        await until(lambda: not servers_elsewhere(session.node, "/lights"))
+        await until(lambda: not session.servers_elsewhere("/lights"))
         await nodes.add(asked)
         assert len(nodes) == 1
 

@@ -11,6 +11,7 @@ from std_msgs.msg import String
 
 from bridge.ros.checked import CheckedSettings
 from bridge.ros.interface import Drops
+from bridge.ros.rclpy_side import RclpySide
 from bridge.ros.rules import Rules
 from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
@@ -98,7 +99,7 @@ def test_each_message_is_compared_once_with_the_types_that_there_are() -> None:
         TopicRule(match="/good", deadman_message={"linear": {"x": 1}}),
         TopicRule(match="/set", error_response={"sucess": False}),
     ]
-    checked = CheckedSettings(Rules(RobotSettings(rules=rules)), drops)
+    checked = CheckedSettings(RclpySide(), Rules(RobotSettings(rules=rules)), drops)
     twist = ["geometry_msgs/msg/Twist"]
     for _ in range(2):
         checked.look(

@@ -132,7 +132,7 @@ async def test_a_node_that_fails_stops_no_others_stop(nodes: InterfaceNodes, sto
     told, agents = await peer.subscription(Bool, TOPIC), await peer.subscription(String, TOPIC + AGENTS)
     for topic in ("/second", TOPIC, TOPIC + AGENTS):
         await until(lambda topic=topic: peer.session.node.count_publishers(topic) >= 1)
-    await until(lambda: stop._publisher.get_subscription_count() >= 2)
+    await until(lambda: stop._publisher._made.get_subscription_count() >= 2)
     first = nodes.get(NodeType.PUBLISHER, "nd__first")
     assert first is not None
     first.emergency_stop = fails  # type: ignore[method-assign]
@@ -150,7 +150,7 @@ async def test_other_agents_hear_of_a_stop_that_fails(
     """Whatever fails here, it holds for the graph."""
     agents = await peer.subscription(String, TOPIC + AGENTS)
     await until(lambda: peer.session.node.count_publishers(TOPIC + AGENTS) == 1)
-    await until(lambda: stop._shared._publisher.get_subscription_count() >= 2)  # type: ignore[union-attr]
+    await until(lambda: stop._shared._publisher._made.get_subscription_count() >= 2)  # type: ignore[union-attr]
     whole = getattr(stop, part)
     setattr(stop, part, fails if part == "_on_stop" else Publisher(stop, fails))
     with pytest.raises(RuntimeError, match="this one fails"):

@@ -21,6 +21,7 @@ from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from bridge.ros.topics import PublisherNode
+from bridge.ros.types import shape_of
 from bridge.ros.unity_cdr import PARTS, Parts, TooManyParts, UnityCdr, readable, to_ros
 from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.protocol.messages import CallFailure, Metadata, NodeType, decode_data, node_name
@@ -74,17 +75,17 @@ def test_large_arrays_of_numbers_have_few_parts(written: Any) -> None:
         JointTrajectory(joint_names=["joint"] * 7, points=[point] * 1000),
     ):
         kind = type(message)
-        read = readable(UnityCdr.of(kind), Parts.of(kind), bytes(written(message)))
+        read = readable(UnityCdr.of(shape_of(kind)), Parts.of(shape_of(kind)), bytes(written(message)))
         assert deserialize_message(read, kind) == message
-    assert Parts.of(Image) is None
+    assert Parts.of(shape_of(Image)) is None
 
 
 def test_many_parts_are_not_even_looked_at() -> None:
     """Nor in the form of Unity, nor where nothing has to be translated, nor in a byte order that nobody counts."""
     for cdr in (JOINTS, JOINTS[:-12] + bytes(4)):
         with pytest.raises(TooManyParts, match=f"more than {PARTS} parts"):
-            to_ros(UnityCdr.of(JointState), cdr)
-    parts = Parts.of(GetParameters.Request)
+            to_ros(UnityCdr.of(shape_of(JointState)), cdr)
+    parts = Parts.of(shape_of(GetParameters.Request))
     assert parts is not None
     for cdr in (NAMES, b"\x00\x00\x00\x00" + NAMES[4:]):
         with pytest.raises(TooManyParts):

@@ -14,7 +14,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from bridge.ros import types
-from bridge.ros.types import InterfaceName, least_cdr_bytes, resolve
+from bridge.ros.shapes import least_cdr_bytes
+from bridge.ros.types import InterfaceName, resolve, shape_of
 from macs_zenoh.errors import Refused
 
 
@@ -127,12 +128,12 @@ def test_a_name_is_written_in_both_ways() -> None:
 @pytest.mark.parametrize(("message", "least"), [(Twist, 52), (String, 8)])
 def test_the_least_size_of_known_types(message: type[Any], least: int) -> None:
     """A Twist is 6 doubles behind 4 bytes of header; a String may be its length alone."""
-    assert least_cdr_bytes(message) == least
+    assert least_cdr_bytes(shape_of(message)) == least
 
 
 def test_no_valid_message_is_below_the_least_size() -> None:
     """For every installed message type, the default message is at least as long as the least size says."""
-    sizes = {name: (least_cdr_bytes(kind), len(serialize_message(kind()))) for name, kind in _installed()}
+    sizes = {name: (least_cdr_bytes(shape_of(kind)), len(serialize_message(kind()))) for name, kind in _installed()}
     assert len(sizes) > 100
     assert not {name: size for name, size in sizes.items() if size[0] > size[1]}
 

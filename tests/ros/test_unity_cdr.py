@@ -25,7 +25,8 @@ from bridge.ros.agent import open_robot
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.session import RosSession
-from bridge.ros.types import least_cdr_bytes
+from bridge.ros.shapes import least_cdr_bytes
+from bridge.ros.types import shape_of
 from bridge.ros.unity_cdr import UnityCdr, to_ros, to_unity
 from bridge.settings import GatewaySettings, RobotSettings, Settings
 from macs_zenoh.config import MeshSettings
@@ -98,21 +99,21 @@ def test_what_a_headset_writes_is_what_ros_reads(messages: list[Any]) -> None:
     for message in messages:
         kind = type(message)
         sent = unity_serializer.write(message)
-        assert len(sent) >= least_cdr_bytes(kind), message
-        assert deserialize_message(to_ros(UnityCdr.of(kind), sent), kind) == message
+        assert len(sent) >= least_cdr_bytes(shape_of(kind)), message
+        assert deserialize_message(to_ros(UnityCdr.of(shape_of(kind)), sent), kind) == message
 
 
 def test_what_ros_writes_is_what_a_headset_reads(messages: list[Any]) -> None:
     """Every kind of message as rclpy writes it has its values in Unity's deserializer, and deafens none."""
     for message in messages:
-        sent = to_unity(UnityCdr.of(type(message)), bytes(serialize_message(message)))
+        sent = to_unity(UnityCdr.of(shape_of(type(message))), bytes(serialize_message(message)))
         assert unity_serializer.read(type(message), sent) == message
 
 
 def test_nothing_more_than_needed_follows_what_a_headset_reads(messages: list[Any]) -> None:
     """Of a type that is translated at all, it gets just what its own serializer would have written."""
     for message in messages:
-        both = UnityCdr.of(type(message))
+        both = UnityCdr.of(shape_of(type(message)))
         if both is not None:
             assert both.to_unity(bytes(serialize_message(message))) == unity_serializer.write(message)
 
@@ -120,7 +121,7 @@ def test_nothing_more_than_needed_follows_what_a_headset_reads(messages: list[An
 def test_what_ros_reads_already_stays_as_it_is(messages: list[Any]) -> None:
     """A newer headset writes what ROS writes, without anything behind it; it is not touched."""
     for message in messages:
-        both = UnityCdr.of(type(message))
+        both = UnityCdr.of(shape_of(type(message)))
         if both is not None:
             exact = both.to_ros(unity_serializer.write(message))
             assert both.to_ros(exact) == exact
@@ -134,7 +135,7 @@ def test_types_on_which_both_agree_cost_nothing() -> None:
         for entry in package.read_text().split():
             if entry.startswith("msg/") and entry.endswith(".msg"):
                 name = f"{package.name}/{entry[4:-4]}"
-                (agree if UnityCdr.of(types.resolve(name)) is None else differ).add(name)
+                (agree if UnityCdr.of(shape_of(types.resolve(name))) is None else differ).add(name)
     assert {"std_msgs/Empty", "sensor_msgs/JointState", "trajectory_msgs/JointTrajectory"} <= differ
     assert {"geometry_msgs/Twist", "sensor_msgs/Image", "sensor_msgs/PointCloud2", "nav_msgs/Odometry"} <= agree
     assert {"std_msgs/String", "sensor_msgs/LaserScan", "nav_msgs/OccupancyGrid", "std_msgs/Bool"} <= agree
@@ -155,7 +156,7 @@ def test_types_on_which_both_agree_cost_nothing() -> None:
 def test_what_is_no_message_stays_what_it_is(cdr: bytes, kinds: Any) -> None:
     """Bytes that fit neither form are left to whoever judges them, soon."""
     for kind in (JointState, kinds.Kinds):
-        both = UnityCdr.of(kind)
+        both = UnityCdr.of(shape_of(kind))
         assert both is not None
         assert both.to_ros(cdr) == cdr
         assert to_unity(both, cdr) == cdr or both.to_unity(cdr) is not None
@@ -166,12 +167,12 @@ def test_a_message_without_fields_is_not_taken_for_one_cut_short(kinds: Any) -> 
     what is cut short stays so."""
     metadata = Metadata(1, 7, 0, "", 1, "nd__nothing", "macs_kinds_msgs/Nothing")
     for kind, whole in ((kinds.Nothing, True), (Empty, True), (JointState, False)):
-        both = UnityCdr.of(kind)
+        both = UnityCdr.of(shape_of(kind))
         data = to_unity(both, bytes(serialize_message(kind())) if whole else NOTHING)
         frame = parse_frame(encode_frame(2, (5,), message=encode_message(metadata.encode(), data)))
         assert len(fitting(frame, Data.CDR, metadata)[0]) == whole
         assert not whole or unity_serializer.read(kind, data) == kind()
-    assert to_unity(UnityCdr.of(kinds.Nothing), NOTHING) == NOTHING
+    assert to_unity(UnityCdr.of(shape_of(kinds.Nothing)), NOTHING) == NOTHING
 
 
 async def test_a_type_of_ones_own_without_fields_reaches_an_existing_headset(

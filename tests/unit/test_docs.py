@@ -52,10 +52,12 @@ def test_the_design_page_names_modules_that_exist() -> None:
 
 def test_the_readme_has_every_verb() -> None:
     """Each verb of `macs` is in the table of commands."""
-    assert set(re.findall(r"`macs (\w+)", page("README.md").partition("## Commands")[2])) >= set(VERBS)
+    assert set(re.findall(r"`macs ([\w-]+)", page("README.md").partition("## Commands")[2])) >= set(VERBS)
 
 
-@pytest.mark.parametrize("name", ["docs/traffic.md", "docs/robot.md", "docs/reliable.md"])
+@pytest.mark.parametrize(
+    "name", ["docs/traffic.md", "docs/robot.md", "docs/reliable.md", "docs/rmw-zenoh.md", "docs/robots-together.md"]
+)
 def test_settings_on_a_page_are_settings(name: str) -> None:
     """Every example of settings on a page is accepted as it stands there."""
     examples = re.findall(r"^```toml\n(.*?)^```", page(name), re.MULTILINE | re.DOTALL)
@@ -75,7 +77,7 @@ def test_the_settings_file_explains_every_setting() -> None:
     """config/macs.toml has every field of every section, commented out, with its default if there is one."""
     text = page("config/macs.toml")
     shown = parse(re.sub(r"^#(?=\w+ = )", "", text, flags=re.MULTILINE))
-    for section in ("mesh", "gateway", "robot", "awareness"):
+    for section in ("mesh", "gateway", "robot", "rmw_zenoh", "awareness"):
         part = text.partition(f"\n[{section}]")[2].partition("\n[")[0]
         defaults = getattr(Settings(), section)
         assert set(re.findall(r"^#(\w+) = ", part, re.MULTILINE)) == set(defaults.__struct_fields__)

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 CORE = sorted((ROOT / "macs_zenoh").rglob("*.py"))
 BRIDGE = sorted((ROOT / "bridge").rglob("*.py"))
 
-PURE = sorted((ROOT / "macs_zenoh" / "protocol").glob("*.py"))
+PURE = sorted((ROOT / "macs_zenoh" / "protocol").rglob("*.py"))
 WITH_ZENOH = set((ROOT / "macs_zenoh" / "mesh").glob("*.py"))
 WITH_ASYNCIO = WITH_ZENOH | {
     ROOT / "macs_zenoh" / name
@@ -38,6 +38,7 @@ WITH_ASYNCIO = WITH_ZENOH | {
         "presses.py",
         "timeouts.py",
         "registration_calls.py",
+        "ros.py",
         "serving.py",
         "streams.py",
         "topics.py",

@@ -1,0 +1,83 @@
+"""Robots that run ROS 2's own Zenoh middleware, on the mesh with nothing installed on them.
+
+Their nodes and ours share a router. Each robot is on the mesh while its nodes are there, and headsets use it as any
+other robot: topics, services and actions, by id and by group. It needs no ROS:
+pip install 'macs-zenoh[rmw-zenoh]'.
+
+examples:
+  macs rmw-zenoh --id 7 --group 3 -e tcp/192.168.1.10:7447
+  macs rmw-zenoh --id 7 --domain 5 --node-namespace /robot7
+  macs rmw-zenoh --settings robots.toml
+  macs rmw-zenoh --all --dry-run
+
+what it prints:
+  ready: robot 7 (domain 0)
+
+With --all there is one robot for each ROS domain, or for each namespace that ends in a number where nodes are in such;
+--dry-run only lists them. docs/rmw-zenoh.md says what a program beside a robot can do for its safety, and what not."""
+
+from __future__ import annotations
+
+import argparse
+
+from bridge import memory
+from bridge.cli import options, running
+from bridge.settings import RmwZenohRobot, Settings
+from macs_zenoh.errors import UsageError
+from macs_zenoh.sections import changed
+
+SUMMARY = "robots that run rmw_zenoh, with nothing installed on them"
+
+LOOK_S = 2.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--id", type=int, help="id of the robot, 1 to 65535")
+    parser.add_argument("--group", type=int, default=0, help="group of the robot, 1 to 255 (default: 0, none)")
+    parser.add_argument("--domain", type=int, default=0, help="its ROS_DOMAIN_ID (default: 0)")
+    parser.add_argument(
+        "--node-namespace", default="/", metavar="NAMESPACE", help="namespace of its nodes, as /robot7"
+    )
+    parser.add_argument(
+        "--session-namespace", default="", metavar="NAME", help="namespace of its Zenoh sessions, as robot7"
+    )
+    parser.add_argument("--all", action="store_true", help="every robot that is seen when this starts, ids by rule")
+    parser.add_argument("--dry-run", action="store_true", help="only list the robots")
+    options.add_mesh_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    settings = options.settings(args)
+    if args.id is not None:
+        robot = RmwZenohRobot(
+            id=args.id,
+            group=args.group,
+            domain=args.domain,
+            node_namespace=args.node_namespace,
+            session_namespace=args.session_namespace,
+        )
+        settings = changed(settings, rmw_zenoh=changed(settings.rmw_zenoh, robots=[robot]))
+    if not settings.rmw_zenoh.robots and not args.all:
+        raise UsageError("which robots? Give --id, or [[rmw_zenoh.robots]] in --settings, or --all")
+    return running.until_stopped(lambda: _serve(settings, look=args.all, dry_run=args.dry_run))
+
+
+async def _serve(settings: Settings, *, look: bool, dry_run: bool) -> int:
+    from bridge.doctor.first import told_while_waiting
+    from bridge.rmw_zenoh import program
+
+    memory.give_back()
+    if look:
+        robots = await program.look(settings, within_s=LOOK_S)
+        settings = changed(settings, rmw_zenoh=changed(settings.rmw_zenoh, robots=robots))
+    robots = settings.rmw_zenoh.robots
+    if dry_run or not robots:
+        for line in program.shown(robots) or ["no robots: there are no ROS nodes on the router"]:
+            print(line, flush=True)  # noqa: T201
+        return 0 if robots else 1
+    await program.run(
+        settings,
+        on_waiting=told_while_waiting(settings.mesh),
+        on_ready=lambda robots: running.say_ready(", ".join(f"robot {robot.id} ({robot.place})" for robot in robots)),
+    )
+    return 0

@@ -1,0 +1,102 @@
+"""A client of an action out of the five parts that it has on the graph: three services and two topics.
+
+What ROS wraps around goals, feedback and results is read here; the action's own fields pass as they are, but for a
+result, which begins behind a byte and is aligned anew.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bridge.rmw_zenoh.ends import Typed, ZenohClient
+from bridge.rmw_zenoh.types import UnknownMessage
+from bridge.ros.shapes import Structure
+from bridge.ros.side import GoalTold, NotOfType, OnCancel
+from bridge.ros.unity_cdr import Misfit, behind_a_byte
+from macs_zenoh.mesh.ros_network import RESULT_S
+from macs_zenoh.protocol.rmw_zenoh.cdr import HEADER
+from macs_zenoh.protocol.rmw_zenoh.qos import Qos
+
+if TYPE_CHECKING:
+    from bridge.rmw_zenoh.session import ZenohSession
+
+ID_BYTES = 16
+STAMP_BYTES = 8
+FEEDBACK = Qos(depth=10)
+"""As rclpy's clients have it. The status topic is not needed: the result says how a goal ended."""
+KEPT = 1024
+"""Goals whose feedback is passed on; of more, the latest."""
+
+
+class ZenohGoals:
+    """`Goals` of one action."""
+
+    def __init__(self, session: ZenohSession, of_type: str, action: str, result: Structure) -> None:
+        self._result = result
+        self._told: dict[bytes, GoalTold] = {}
+        part = f"{action}/_action"
+        self._send = ZenohClient(session, f"{of_type}_SendGoal", f"{part}/send_goal")
+        self._cancel = ZenohClient(session, "action_msgs/srv/CancelGoal", f"{part}/cancel_goal")
+        self._get = ZenohClient(session, f"{of_type}_GetResult", f"{part}/get_result", RESULT_S)
+        message, topic = f"{of_type}_FeedbackMessage", f"{part}/feedback"
+        self._feedback = session.subscribe(Typed(message, UnknownMessage(message)), topic, self._fed_back, FEEDBACK)
+
+    def is_ready(self) -> bool:
+        """`Goals.is_ready`."""
+        return self._send.is_ready() and self._get.is_ready() and self._cancel.is_ready()
+
+    def send(self, goal_id: bytes, goal: bytes, told: GoalTold) -> None:
+        """`Goals.send`."""
+        if goal[:2] != HEADER[:2]:
+            raise NotOfType("it is not in little endian order, as goals are")
+        while len(self._told) >= KEPT:
+            del self._told[next(iter(self._told))]
+        self._told[goal_id] = told
+
+        def accepted(response: bytes | None, problem: str) -> None:
+            if response is None or len(response) <= len(HEADER):
+                self._told.pop(goal_id, None)
+                told.failed(problem or "the action's answer is cut off")
+                return
+            is_accepted = response[len(HEADER)] != 0
+            told.accepted(is_accepted)
+            if is_accepted:
+                self._get.call(HEADER + goal_id, finished)
+            else:
+                self._told.pop(goal_id, None)
+
+        def finished(response: bytes | None, problem: str) -> None:
+            self._told.pop(goal_id, None)
+            if response is None:
+                told.failed(problem)
+                return
+            try:
+                status, result = behind_a_byte(self._result, response)
+            except Misfit:
+                told.failed("the action's result is not of its type")
+                return
+            told.finished(status, result)
+
+        self._send.call(HEADER + goal_id + goal[len(HEADER) :], accepted)
+
+    def cancel(self, goal_id: bytes, done: OnCancel) -> None:
+        """`Goals.cancel`."""
+
+        def answered(response: bytes | None, problem: str) -> None:
+            if response is None or len(response) < 12:
+                done(None, False, problem or "the action's answer is cut off")
+            else:  # a code, and the goals that it cancels
+                done(response[4], int.from_bytes(response[8:12], "little") > 0, "")
+
+        self._cancel.call(HEADER + goal_id + bytes(STAMP_BYTES), answered)
+
+    def close(self) -> None:
+        """`Closable.close`."""
+        for part in (self._feedback, self._get, self._cancel, self._send):
+            part.close()
+
+    def _fed_back(self, cdr: bytes, _info: object) -> None:
+        begin = len(HEADER)
+        told = self._told.get(cdr[begin : begin + ID_BYTES])
+        if told is not None:
+            told.fed_back(cdr[:begin] + cdr[begin + ID_BYTES :])

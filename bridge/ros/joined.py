@@ -1,0 +1,56 @@
+"""A robot on the mesh, whoever speaks to its ROS graph."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import macs_zenoh
+from bridge.ros.agent import STOP_MESSAGES_S, RobotAgent
+from bridge.ros.safety import EmergencyStop
+from bridge.ros.side import Side
+from bridge.settings import Settings
+from macs_zenoh import managers
+from macs_zenoh.protocol.guard import Guard, Limits
+from macs_zenoh.protocol.wire import Layout
+
+log = logging.getLogger("macs.ros")
+
+
+@asynccontextmanager
+async def joined(
+    settings: Settings,
+    session: Side,
+    *,
+    on_waiting: Callable[[str], None] | None = None,
+    emergency_stop: EmergencyStop | None = None,
+) -> AsyncIterator[RobotAgent]:
+    """Join the mesh as the robot whose ROS graph this is, and serve until the end of the block.
+
+    Raises ConfigError; what `macs_zenoh.join` raises.
+    """
+    robot = settings.robot
+    own = managers.load(robot.managers)
+    guard = Guard(
+        Limits(robot.max_commands_per_s, robot.max_requests_per_s, robot.max_command_age_s),
+        Layout(settings.mesh.id_slots, settings.mesh.group_slots),
+    )
+    async with macs_zenoh.join(
+        "ros",
+        id=robot.id,
+        group=robot.group,
+        settings=settings.mesh,
+        traffic=settings.traffic,
+        guard=guard,
+        on_waiting=on_waiting,
+    ) as agent:
+        ros_agent = RobotAgent(agent, session, robot, own, guard, emergency_stop)
+        await ros_agent.start()
+        log.info("robot %d serves %s", agent.id, session.full_name)
+        try:
+            yield ros_agent
+        finally:
+            await ros_agent.close()
+            await asyncio.sleep(STOP_MESSAGES_S)
