@@ -56,10 +56,14 @@ async def watched(endpoint: str) -> AsyncIterator[list[Seen]]:
     config.insert_json5("connect/endpoints", f'["{endpoint}"]')
     session = await asyncio.to_thread(zenoh.open, config)
     try:
+        noted = zenoh.handlers.Callback(note, indirect=False)
         kept = [
-            declare(f"{domain}/**", zenoh.handlers.Callback(note, indirect=False))
+            declared
             for domain in (0, DOMAIN)
-            for declare in (session.declare_queryable, session.declare_subscriber)
+            for declared in (
+                session.declare_queryable(f"{domain}/**", noted, complete=True),
+                session.declare_subscriber(f"{domain}/**", noted),
+            )
         ]
         yield seen
         del kept

@@ -167,6 +167,9 @@ async def test_requests_and_replies_as_recorded(router: str) -> None:
             else:
                 client.call(bytes.fromhex(question["payload_hex"]), lambda response, problem: None)
             query = await get(queries)
+            while number > 1 and hexed(query.payload) == asked[0]["payload_hex"]:  # one more of the first
+                query.drop()
+                query = await get(queries)
             assert (hexed(query.payload), str(query.parameters)) == (question["payload_hex"], "")
             assert fixed(query.attachment.to_bytes()) == fixed(bytes.fromhex(question["attachment_hex"]))
             query.drop()

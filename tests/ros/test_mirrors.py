@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,9 +20,11 @@ from bridge.settings.mirror import MirrorRule
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, Refused
 from macs_zenoh.protocol.messages import AddNode, NodeType, node_name
+from tests.support.programs import Program
 from tests.support.ros_peer import Peer
 from tests.support.waiting import PATIENCE_S, get, until
 
+PAGE = Path(__file__).parents[2] / "docs" / "robots-together.md"
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -136,6 +140,28 @@ async def test_robots_that_mirror_each_other(router: str, domain: int) -> None:
             assert numbered == [f"{there} {number}" for number in range(100)]
         topics = dict(await peers[0].session.run(peers[0].session.node.get_topic_names_and_types))
         assert not [name for name in topics if name.count("robot") > 1 or name == "/robot1/pose"]
+
+
+async def test_the_page_s_three_robots(router: str, domain: int, tmp_path: Path) -> None:
+    """Programs with the settings of docs/robots-together.md, as it starts them: robot 1 hears robot 2's poses."""
+    example = re.findall(r"^```toml\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)[-1]
+    settings = tmp_path / "robots.toml"
+    settings.write_text(example, encoding="utf-8")
+    domains = [domain, domain + 60, domain + 120]
+    async with AsyncExitStack() as stack:
+        for number, each in enumerate(domains, start=1):
+            arguments = ("agent", "--id", str(number), "--settings", str(settings), "-e", router)
+            await stack.enter_async_context(Program(*arguments, env={"ROS_DOMAIN_ID": str(each)}))
+        first, second = [await stack.enter_async_context(peer(each)) for each in domains[:2]]
+        heard = await first.subscription(String, "/robot2/pose")
+        publisher = await second.publisher(String, "/pose")
+
+        def comes() -> bool:
+            publisher.publish(String(data="here"))
+            return not heard.empty()
+
+        await until(comes, PATIENCE_S, every_s=0.05)
+        assert heard.get_nowait().data == "here"
 
 
 @pytest.mark.parametrize(
