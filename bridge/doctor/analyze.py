@@ -284,6 +284,8 @@ def _mesh(facts: Facts) -> Iterator[Finding]:
     elif not conflicts:
         yield found("mesh_ok", agents=counted(count, "agent"), gateways=counted(gateways, "gateway"))
     yield from _namespaces(facts, bool(count))
+    if nodes := _keys(facts, "ros_nodes"):
+        yield found("ros_unnamed", count=counted(len(nodes), "ROS node"))
 
 
 def _blocks_twice(facts: Facts) -> Iterator[Finding]:

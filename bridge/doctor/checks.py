@@ -265,6 +265,12 @@ CHECKS: dict[str, Check] = {
         "nobody is online in the namespace {own}, but {count} in {namespace}",
         "use one --namespace everywhere",
     ),
+    "ros_unnamed": Check(
+        "mesh",
+        NOTE,
+        "{count} with rmw_zenoh and no session namespace: the keys do not say who sends",
+        "give each robot's sessions a namespace, which access rules can hold it to (docs/rmw-zenoh.md)",
+    ),
     # -- programs ------------------------------------------------------------------------------------------------
     "program_ok": Check("programs", OK, "macs-zenoh {macs}, {round_trip} there and back{throughput}, clock {clock}"),
     "program_silent": Check(

@@ -134,6 +134,8 @@ class Endpoint(msgspec.Struct, kw_only=True):
     names: list[str] = []
     elsewhere: list[str] = []
     """Presence keys in other namespaces."""
+    ros_nodes: list[str] = []
+    """ROS nodes that run rmw_zenoh and whose sessions are in no namespace: as ``/robot1/talker``."""
 
 
 class Program(msgspec.Struct, kw_only=True):

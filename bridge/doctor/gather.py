@@ -11,7 +11,7 @@ import asyncio
 import platform
 import time
 from collections.abc import Callable
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from typing import Any
 
 import msgspec
@@ -24,6 +24,7 @@ from macs_zenoh.mesh import Mesh, configuration
 from macs_zenoh.protocol import endpoints, keyexpr
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.keyexpr import LEASE, NAME, PING, PRESENCE
+from macs_zenoh.protocol.rmw_zenoh.keyexpr import BadToken, Node, every_token, parse_token
 
 from . import transport
 from .facts import Endpoint, Facts, Own, Program, RouterInfo, Session
@@ -181,12 +182,23 @@ class Probe:
         facts.leases = await tokens(first, LEASE.every(), self._timeout_s)
         facts.names = await tokens(first, NAME.every(), self._timeout_s)
         facts.elsewhere = await self._elsewhere(place.everywhere)
+        facts.ros_nodes = await self._ros_nodes(place.everywhere)
         facts.rights = await self._trial.rights(place)
         facts.presence = await tokens(first, PRESENCE.every(), self._timeout_s)
 
     async def _elsewhere(self, mesh: Mesh) -> list[str]:
         found = await tokens(mesh, keyexpr.everywhere(PRESENCE), self._timeout_s)
         return [key for key in found if keyexpr.namespace_of(PRESENCE, key) != self._own.namespace]
+
+    async def _ros_nodes(self, mesh: Mesh) -> list[str]:
+        """By their tokens: asking their keys anything ends such nodes."""
+        found = set()
+        for token in await tokens(mesh, every_token(), self._timeout_s):
+            with suppress(BadToken):
+                node = parse_token(token)
+                if isinstance(node, Node):
+                    found.add(node.full_name)
+        return sorted(found)
 
     async def _ask_router(self, mesh: Mesh, router: str) -> list[RouterInfo]:
         """What the admin space tells of all routers; of the one at this endpoint also with whom it is linked."""

@@ -280,6 +280,11 @@ def _(facts: Facts) -> None:
     facts.endpoints[0].elsewhere = ["site1/macs/live/ros/1/0/aa"]
 
 
+@makes("ros_unnamed", NOTE)
+def _(facts: Facts) -> None:
+    facts.endpoints[0].ros_nodes = ["/robot1/talker"]
+
+
 @makes("wrong_namespace", WARNING)
 def _(facts: Facts) -> None:
     facts.programs = facts.programs[1:]
