@@ -13,7 +13,6 @@ import asyncio
 import logging
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 
 from msgspec import structs
@@ -34,9 +33,9 @@ from .protocol.messages import (
     node_name,
 )
 from .protocol.registrations import AgentKey, Registrations, Robots, StreamKey, Task, removal
-from .protocol.routing import call
+from .protocol.routing import call_of
 from .protocol.turns import Turns
-from .protocol.wire import Layout
+from .protocol.wire import Layout, encode_message
 
 log = logging.getLogger("macs.registrations")
 
@@ -61,12 +60,19 @@ StreamChanges = list[tuple[StreamKey, set[AgentKey] | None]]
 """Topics of robots that somebody here is registered on since before, and who; None: nobody any more."""
 
 
-@dataclass(eq=False)
 class _Call:
-    task: Task
-    attempt: int = 0
-    running: asyncio.Task[None] | None = None
-    again: asyncio.TimerHandle | None = None
+    """One call, and how far it is."""
+
+    __slots__ = ("again", "asked", "attempt", "over", "task")
+
+    def __init__(self, task: Task, attempt: int) -> None:
+        self.task = task
+        self.attempt = attempt
+        self.asked = False
+        """Whether the robot was asked, and has not answered yet."""
+        self.over = False
+        """Whether it is not wanted any more."""
+        self.again: asyncio.TimerHandle | None = None
 
 
 class RobotCalls:
@@ -92,6 +98,8 @@ class RobotCalls:
         self._online: Robots = {agent.id: agent.group for agent in directory.of_type(ROS)}
         self._calls: dict[AgentKey, dict[CallKey, _Call]] = {}
         self._turns: dict[int, Turns[CallKey, _Call]] = {}
+        self._message: tuple[AddNode | RemoveNode | None, bytes] = (None, b"")
+        """What robots were told last, as a message."""
         self._closed = False
 
     def close(self) -> None:
@@ -99,9 +107,9 @@ class RobotCalls:
         self._closed = True
         for calls in self._calls.values():
             for wanted in calls.values():
-                for going_on in (wanted.running, wanted.again):
-                    if going_on is not None:
-                        going_on.cancel()
+                wanted.over = True
+                if wanted.again is not None:
+                    wanted.again.cancel()
         self._calls.clear()
         self._turns.clear()
 
@@ -127,7 +135,7 @@ class RobotCalls:
         self._registrations.leave(agent)
         self._streams_changed()
         for wanted in self._forget_calls(agent):
-            if wanted.running is not None and isinstance(wanted.task.node, AddNode):
+            if wanted.asked and isinstance(wanted.task.node, AddNode):
                 self._start(Task(wanted.task.robot_id, removal(wanted.task.node)))
 
     def find(self, agent: AgentKey, node_type: int, node_name: str) -> AddNode | None:
@@ -265,25 +273,25 @@ class RobotCalls:
 
     def _next(self, robot_id: int, turns: Turns[CallKey, _Call]) -> None:
         while not self._closed and (turn := turns.take()) is not None:
-            agent, _, wanted = turn
-            wanted.running = asyncio.get_running_loop().create_task(self._run(wanted))
-            wanted.running.add_done_callback(partial(self._has_run, robot_id, turns, agent))
+            self._run(turn[2], turns)
         if not turns.open and self._turns.get(robot_id) is turns:
             del self._turns[robot_id]
 
-    def _has_run(self, robot_id: int, turns: Turns[CallKey, _Call], agent: AgentKey, _: asyncio.Task[None]) -> None:
+    def _turn_over(self, robot_id: int, turns: Turns[CallKey, _Call], agent: AgentKey) -> None:
         turns.done(agent)
         self._next(robot_id, turns)
 
     def _end(self, wanted: _Call) -> None:
-        """A call is not wanted any more."""
+        """A call is not wanted any more: its answer, should there be one, says nothing."""
         agent, key = _keys(wanted.task)
-        if wanted.running is not None:
-            wanted.running.cancel()
+        robot_id = wanted.task.robot_id
+        wanted.over = True
         if wanted.again is not None:
             wanted.again.cancel()
-        if (turns := self._turns.get(wanted.task.robot_id)) is not None:
+        if (turns := self._turns.get(robot_id)) is not None:
             turns.drop(agent, key)
+            if wanted.asked:  # another's turn, when whoever ends this one is done
+                asyncio.get_running_loop().call_soon(self._turn_over, robot_id, turns, agent)
 
     def _forget_calls(self, agent: AgentKey) -> list[_Call]:
         """No call of this agent is wanted any more. Returns them."""
@@ -300,25 +308,45 @@ class RobotCalls:
         if not calls:
             self._calls.pop(agent, None)
 
-    async def _run(self, wanted: _Call) -> None:
-        task = wanted.task
+    def _run(self, wanted: _Call, turns: Turns[CallKey, _Call]) -> None:
+        wanted.asked = True
+        answered = partial(self._answered, wanted, turns)
         try:
-            await self._ask(task)
-            log.debug("%s: done", _What(task))
-            self._on_done(task)
-        except (Refused, OutOfRange) as refusal:  # by the robot, or here by a traffic rule
-            log.warning("%s was refused: %s", _What(task), refusal)
-            if isinstance(refusal, HeldByAnother):
-                self._registrations.refused(task, refusal.holder)
-            self.refuse(task.node, task.robot_id, str(refusal))
-        except Unreachable as error:
-            log.debug("%s: %s", _What(task), error)
-            wanted.running = None
+            self._mesh.ask(
+                *self._question(wanted.task), answered, timeout_s=CALL_TIMEOUT_S, traffic=Traffic.REGISTRATION
+            )
+        except Exception as error:  # noqa: BLE001 - it is judged with those that come later
+            asyncio.get_running_loop().call_soon(answered, error)
+
+    def _answered(self, wanted: _Call, turns: Turns[CallKey, _Call], answer: bytes | Exception) -> None:
+        if wanted.over or self._closed:
+            return
+        wanted.asked = False
+        try:
+            self._judge(wanted, answer)
+        except Exception:  # whatever an agent asked for, it must not be wanted for ever
+            log.exception("%s failed", _What(wanted.task))
+            self._is_over(wanted)
+        self._turn_over(wanted.task.robot_id, turns, _keys(wanted.task)[0])
+
+    def _judge(self, wanted: _Call, answer: bytes | Exception) -> None:
+        """What a call has come to."""
+        task = wanted.task
+        if isinstance(answer, Unreachable):
+            log.debug("%s: %s", _What(task), answer)
             pause_s = RETRY_S[min(wanted.attempt, len(RETRY_S) - 1)]
             wanted.again = asyncio.get_running_loop().call_later(pause_s, self._again, wanted)
             return
-        except Exception:  # whatever an agent asked for, it must not be wanted for ever
-            log.exception("%s failed", _What(task))
+        if isinstance(answer, (Refused, OutOfRange)):  # by the robot, or here by a traffic rule
+            log.warning("%s was refused: %s", _What(task), answer)
+            if isinstance(answer, HeldByAnother):
+                self._registrations.refused(task, answer.holder)
+            self.refuse(task.node, task.robot_id, str(answer))
+        elif isinstance(answer, Exception):
+            raise answer
+        else:
+            log.debug("%s: done", _What(task))
+            self._on_done(task)
         self._is_over(wanted)
 
     def _again(self, wanted: _Call) -> None:
@@ -337,12 +365,19 @@ class RobotCalls:
             log.warning("%s: the robot does not answer", _What(task))
 
     async def _ask(self, task: Task) -> None:
+        await self._mesh.query(*self._question(task), timeout_s=CALL_TIMEOUT_S, traffic=Traffic.REGISTRATION)
+
+    def _question(self, task: Task) -> tuple[str, bytes]:
+        """Key and frame of a call. The message is made once for the robots that one registration names."""
         node = task.node
         sender = (node.registrant_agent_type, node.registrant_agent_id)
+        told, message = self._message
+        if told is not node:
+            metadata = Metadata(*sender, message_manager=node.manager)
+            message = encode_message(metadata.encode(), encode_data(node))
+            self._message = node, message
         verb = "add_node" if isinstance(node, AddNode) else "remove_node"
-        metadata = Metadata(*sender, message_manager=node.manager)
-        key, frame = call((ROS, task.robot_id), verb, sender, encode_data(node), metadata, self._layout)
-        await self._mesh.query(key, frame, timeout_s=CALL_TIMEOUT_S, traffic=Traffic.REGISTRATION)
+        return call_of((ROS, task.robot_id), verb, sender, message, self._layout)
 
 
 def _keys(task: Task) -> tuple[AgentKey, CallKey]:

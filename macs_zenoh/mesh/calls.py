@@ -25,8 +25,44 @@ log = logging.getLogger("macs.mesh")
 WAITING = 1024
 """So many calls that no gate admits may wait to be looked at; what is more has no answer."""
 
+OnAnswer = Callable[[bytes | MacsError], None]
+"""Hears the answer to a call, or why there is none, on the loop."""
+
 HOLDER = re.compile(r"([0-9]{1,3})/([0-9]{1,5})")
 """Who has what was refused: agent type and id."""
+
+
+class _Asked:
+    """A query on its way, and who waits for its answer: for the first one, as several may serve a key."""
+
+    __slots__ = ("_answered", "_from_thread", "_key", "_on_answer", "_timeout_s")
+
+    def __init__(self, key: str, timeout_s: float, on_answer: OnAnswer, from_thread: Callable[..., None]) -> None:
+        self._key = key
+        self._timeout_s = timeout_s
+        self._on_answer: OnAnswer | None = on_answer
+        self._from_thread = from_thread
+        self._answered = False
+
+    def reply(self, reply: zenoh.Reply) -> None:
+        """In a thread of Zenoh's."""
+        keep_attached()
+        self._answered = True
+        if (ok := reply.ok) is not None:
+            self._from_thread(self._settle, ok.payload.to_bytes())
+        elif reply.err is not None:
+            self._from_thread(self._settle, _problem(self._key, reply.err.payload.to_bytes(), self._timeout_s))
+
+    def end(self) -> None:
+        """All have answered, in a thread of Zenoh's."""
+        if not self._answered:
+            self._from_thread(self._settle, NotServed(self._key))
+
+    def _settle(self, answer: bytes | MacsError) -> None:
+        """On the loop."""
+        on_answer, self._on_answer = self._on_answer, None
+        if on_answer is not None:
+            on_answer(answer)
 
 
 class Calls:
@@ -53,46 +89,35 @@ class Calls:
 
     async def query(self, key: str, payload: Payload, *, timeout_s: float, traffic: Traffic) -> bytes:
         """`Mesh.query`."""
+        done: asyncio.Future[bytes] = self._loop.create_future()
+
+        def settle(answer: bytes | MacsError) -> None:
+            if done.done():
+                return
+            if isinstance(answer, MacsError):
+                done.set_exception(answer)
+            else:
+                done.set_result(answer)
+
+        self.ask(key, payload, settle, timeout_s=timeout_s, traffic=traffic)
+        return await done
+
+    def ask(self, key: str, payload: Payload, on_answer: OnAnswer, *, timeout_s: float, traffic: Traffic) -> None:
+        """`Mesh.ask`."""
         shape = self._outgoing.policer.of(key)
         if shape is not None and (overrun := shape.too_large(len(payload))) is not None:
             raise OutOfRange(f"size of {key}", len(payload), 0, int(overrun.limit))
-        done: asyncio.Future[bytes] = self._loop.create_future()
-
-        def settle(answer: bytes | None, error: MacsError | None) -> None:
-            if done.done():
-                return
-            if error is not None:
-                done.set_exception(error)
-            elif answer is not None:
-                done.set_result(answer)
-
-        answered = False
-
-        def on_reply(reply: zenoh.Reply) -> None:
-            nonlocal answered
-            keep_attached()
-            answered = True
-            if (ok := reply.ok) is not None:
-                self._from_thread(settle, ok.payload.to_bytes(), None)
-            elif reply.err is not None:
-                problem = _problem(key, reply.err.payload.to_bytes(), timeout_s)
-                self._from_thread(settle, None, problem)
-
-        def on_end() -> None:
-            if not answered:
-                self._from_thread(settle, None, NotServed(key))
-
+        asked = _Asked(key, timeout_s, on_answer, self._from_thread)
         priority, congestion, express = self._outgoing.way(key, traffic)
         self._session.get(
             key,
-            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
+            zenoh.handlers.Callback(asked.reply, asked.end, indirect=False),
             payload=payload,
             timeout=timeout_s,
             priority=priority,
             congestion_control=congestion,
             express=express,
         )
-        return await done
 
     async def ask_all(self, key: str, *, timeout_s: float) -> list[tuple[str, bytes]]:
         """`Mesh.ask_all`."""

@@ -26,7 +26,7 @@ from macs_zenoh.protocol.policing import Policer
 from macs_zenoh.versions import installed
 
 from .arrivals import Arrivals
-from .calls import Calls
+from .calls import Calls, OnAnswer
 from .declared import AtOnce, Handler, OnAged, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
 from .link_log import LinkLog
 from .loopback import Loopback
@@ -377,6 +377,13 @@ class Mesh:
         it is larger than a traffic rule allows: of what a rule limits, only the size holds for queries.
         """
         return await self._calls.query(key, payload, timeout_s=timeout_s, traffic=traffic)
+
+    def ask(
+        self, key: str, payload: Payload, on_answer: OnAnswer, *, timeout_s: float, traffic: Traffic = Traffic.CALL
+    ) -> None:
+        """The same for who asks hundreds, without a task for each: ``on_answer`` is called once, later, with the
+        answer or one of these errors. Raises OutOfRange itself."""
+        self._calls.ask(key, payload, on_answer, timeout_s=timeout_s, traffic=traffic)
 
     async def ask_all(self, key: str, *, timeout_s: float) -> list[tuple[str, bytes]]:
         """Ask everybody who serves a key, as the routers' admin space (``@/*/router``), and return every answer with

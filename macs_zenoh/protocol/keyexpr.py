@@ -42,6 +42,9 @@ _TYPE_NUMBERS = {name: number for number, name in _TYPE_NAMES.items()}
 
 FieldValue = int | str
 
+WRITTEN = 4096
+"""How many fields of keys are remembered as they are written."""
+
 _TYPES = frozenset({"type", "from_type"})
 _RANGES = {
     "type": (1, 255),
@@ -90,10 +93,12 @@ class Key(Generic[_F]):
     subscriber: str
     payload: str
     fields: tuple[str, ...] = field(init=False)
+    _names: frozenset[str] = field(init=False, repr=False, compare=False)
     _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fields", tuple(re.findall(r"\{(\w+)\}", self.template)))
+        object.__setattr__(self, "_names", frozenset(self.fields))
         pattern = re.sub(r"\{(\w+)\}", r"([^/*$?#]+)", self.template)
         object.__setattr__(self, "_pattern", re.compile(pattern))
 
@@ -104,8 +109,7 @@ class Key(Generic[_F]):
 
     def of(self, **values: FieldValue) -> str:
         """The concrete key for these fields. Raises UsageError when one is missing, unknown or cannot be written."""
-        missing = set(self.fields) - values.keys()
-        if missing:
+        if values.keys() != self._names and (missing := self._names - values.keys()):
             raise UsageError(f"key {self.template}: no value for {', '.join(sorted(missing))}")
         return self._fill(values)
 
@@ -137,10 +141,10 @@ class Key(Generic[_F]):
             return None
 
     def _fill(self, values: dict[str, FieldValue], template: str | None = None) -> str:
-        unknown = values.keys() - set(self.fields)
-        if unknown:
+        if not values.keys() <= self._names:
+            unknown = values.keys() - self._names
             raise UsageError(f"key {self.template} has no field {', '.join(sorted(unknown))}")
-        key = (template or self.template).format(**{name: _write(name, value) for name, value in values.items()})
+        key = (template or self.template).format(**{name: _written(name, value) for name, value in values.items()})
         if len(key) > KEY_BYTES:
             raise UsageError(f"a key {self.template} of {len(key)} bytes, at most {KEY_BYTES} are allowed")
         return key
@@ -308,6 +312,12 @@ def _stands_for(pattern: re.Pattern[str] | None, chunk: str) -> bool:
     return not chunk.startswith("@") if pattern is None else pattern.fullmatch(chunk) is not None
 
 
+@lru_cache(maxsize=WRITTEN, typed=True)
+def _written(name: str, value: FieldValue) -> str:
+    """`_write`, remembered: a key is made for each call and each agent, of the same few hundred values."""
+    return _write(name, value)
+
+
 def _write(name: str, value: FieldValue) -> str:
     if name in _TYPES and isinstance(value, str):
         value = type_number(value)
@@ -336,7 +346,7 @@ def _read(name: str, text: str) -> FieldValue:
         value = type_number(text)
     elif name in _RANGES:
         value = int(text)
-    if _write(name, value) != text:  # one way to write an agent: access rules for it cover all that is taken for it
+    if _written(name, value) != text:  # one way to write an agent: access rules for it cover all that is taken for it
         raise ValueError(text)
     return value
 

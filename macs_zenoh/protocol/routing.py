@@ -45,8 +45,15 @@ def call(
     to: tuple[int, int], verb: str, sender: tuple[int, int], data: bytes, metadata: Metadata, layout: Layout = MACS
 ) -> tuple[str, bytes]:
     """Key and frame of a call; ``to`` and ``sender`` are (type, id), and the metadata's sender is the same one."""
+    return call_of(to, verb, sender, encode_message(metadata.encode(), data), layout)
+
+
+def call_of(
+    to: tuple[int, int], verb: str, sender: tuple[int, int], message: bytes, layout: Layout = MACS
+) -> tuple[str, bytes]:
+    """The same for a message that is made."""
     key = CALL.of(type=to[0], id=to[1], verb=verb, from_type=sender[0], from_id=sender[1])
-    return key, encode_frame(to[0], (to[1],), message=encode_message(metadata.encode(), data), layout=layout)
+    return key, encode_frame(to[0], (to[1],), message=message, layout=layout)
 
 
 def inbox(agent_type: int, agent_id: int) -> str:
