@@ -42,8 +42,8 @@ from macs_zenoh.protocol.rmw_zenoh.keyexpr import (
 from macs_zenoh.protocol.rmw_zenoh.qos import SERVICES, Durability, History, Qos, Reliability
 
 from .declared import Subscription
+from .opening import open_session
 from .panics import call, unwatched, watched
-from .session import open_session
 from .threads import keep_attached
 
 log = logging.getLogger("macs.rmw_zenoh")

@@ -7,15 +7,13 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from types import TracebackType
 
-import msgspec
 import zenoh
 
 from macs_zenoh.config import MeshSettings, Priority, TrafficRule
-from macs_zenoh.errors import ConfigError, Unreachable
+from macs_zenoh.errors import Unreachable
 from macs_zenoh.handles import Callbacks, Handle
 from macs_zenoh.losses import Losses
 from macs_zenoh.protocol import ping, trace
@@ -30,10 +28,11 @@ from .calls import Calls, OnAnswer
 from .declared import AtOnce, Handler, OnAged, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
 from .link_log import LinkLog
 from .loopback import Loopback
+from .opening import open_now, open_session
 from .outgoing import Outgoing
 from .panics import call, end_on_panics, last_words, watched
 from .reliable import Recovered
-from .threads import keep_attached, shared_threads
+from .threads import keep_attached
 from .tracing import Tracing
 from .zenoh_config import check_files, first_line, id_is_chosen, insert, zenoh_config
 
@@ -41,9 +40,6 @@ log = logging.getLogger("macs.mesh")
 
 BEAT_S = 5.0
 """How often it is tried whether Zenoh still works in this process."""
-
-LOGGED = "error,zenoh_transport::unicast::establishment=off"
-"""What Zenoh logs by itself. Not each attempt to open a session that fails: who waits says so, and why."""
 
 
 class Mesh:
@@ -145,7 +141,7 @@ class Mesh:
         check_files(config)
         insert(config, "connect/timeout_ms", str(round(timeout_s * 1000)))
         try:
-            return cls(await _open(config), settings)
+            return cls(await open_now(config), settings)
         except zenoh.ZError as error:
             raise Unreachable(", ".join(settings.routers) or "a router", first_line(error)) from error
 
@@ -477,56 +473,3 @@ class Mesh:
             (self._loop.call_soon if here else self._loop.call_soon_threadsafe)(callback, *args)
         except RuntimeError:  # the loop is closed: the program is ending and nobody waits for this
             log.debug("the event loop has ended")
-
-
-async def open_session(
-    settings: MeshSettings, *, on_waiting: Callable[[str], None] | None = None, quiet: bool = False
-) -> zenoh.Session:
-    """A session of Zenoh's by these settings. See `Mesh.open`."""
-    zenoh.init_log_from_env_or("off" if quiet else LOGGED)  # RUST_LOG, as with Zenoh's own tools
-    check_files(zenoh_config(settings))  # once: a file that is being replaced ends nobody who waits
-    waiting = False
-    while True:
-        config = zenoh_config(settings)
-        try:
-            return await _open(config)
-        except zenoh.ZError as error:
-            problem = first_line(error)
-            if settings.mode != "client":
-                raise Unreachable(", ".join(settings.listen) or "the mesh", problem) from error
-            if not problem.startswith("Unable to connect"):
-                raise ConfigError("zenoh configuration", problem) from error
-            if not waiting:
-                waiting = True
-                (on_waiting or _log_waiting)(", ".join(settings.routers) or "a router")
-            await asyncio.sleep(settings.retry_max_ms / 1000)
-
-
-async def _open(config: zenoh.Config) -> zenoh.Session:
-    """Open a session in a thread. When the caller is cancelled, a session that comes late is closed there: the event
-    loop may have ended by then, and a process that exits with an open session hangs.
-
-    Raises zenoh.ZError.
-    """
-    thread = ThreadPoolExecutor(1, "macs-open")
-    opened = thread.submit(_open_now, config)
-    thread.shutdown(wait=False)
-    try:
-        return await asyncio.wrap_future(opened)
-    except asyncio.CancelledError:
-        opened.add_done_callback(_close_late)
-        raise
-
-
-def _open_now(config: zenoh.Config) -> zenoh.Session:
-    with shared_threads(msgspec.json.decode(config.get_json("mode"), type=str)):
-        return zenoh.open(config)
-
-
-def _close_late(opened: Future[zenoh.Session]) -> None:
-    if not opened.cancelled() and opened.exception() is None:
-        opened.result().close()  # type: ignore[no-untyped-call]
-
-
-def _log_waiting(target: str) -> None:
-    log.warning("no router at %s yet; waiting for it", target)
