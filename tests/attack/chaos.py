@@ -86,12 +86,17 @@ class Counting:
     session: RosSession
     publisher: Any
     number: int = 0
+    refused: list[str] = field(default_factory=list)
+    """What ROS said to messages that it did not take, as for a moment while a subscription has died."""
 
     async def count(self) -> None:
         """Publish, until cancelled."""
         while True:
             self.number += 1
-            self.publisher.publish(String(data=str(self.number)))
+            try:
+                self.publisher.publish(String(data=str(self.number)))
+            except Exception as error:  # noqa: BLE001 - rclpy's, whatever it is
+                self.refused.append(repr(error))
             await asyncio.sleep(COUNT_EVERY_S)
 
     async def sees(self) -> str:
@@ -100,7 +105,8 @@ class Counting:
         known = await self.session.run(lambda: node.get_subscriptions_info_by_topic(TOPIC))
         takers = [f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in known]
         matched = self.publisher.get_subscription_count()
-        return f"its publisher is at {self.number}, has {matched} subscriptions, and knows of {takers}"
+        refused = f"{len(self.refused)} messages were refused {self.refused[-1:]}"
+        return f"its publisher is at {self.number}, has {matched} subscriptions, knows of {takers}; {refused}"
 
 
 @dataclass
@@ -265,6 +271,8 @@ class Site:
             assert state != "Z", f"the {name} has ended: {program.log[-5:]}"
             faults = [line for line in program.log if "Traceback" in line or " E macs" in line or "panicked" in line]
             assert not faults, f"the {name} has a fault in its log: {faults[:3]}"
+        for job in self.jobs:
+            assert not (job.done() and not job.cancelled() and job.exception()), f"nobody listens: {job.exception()!r}"
         if lost := [p.headset.target for p in self.people if not p.headset.connected]:
             return f"{len(lost)} headsets are not connected: {lost}"
         ids = [person.headset.id for person in self.people]
