@@ -20,6 +20,7 @@ from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError
 from macs_zenoh.locked_out import locked_out
 from macs_zenoh.mesh.ros_network import RosNetwork
+from macs_zenoh.protocol.rmw_zenoh.attachment import gid_of
 from macs_zenoh.protocol.rmw_zenoh.keyexpr import BadToken, Endpoint, Node, parse_token
 from macs_zenoh.sections import changed
 
@@ -120,7 +121,12 @@ async def run(
     on_waiting: Callable[[str], None] | None = None,
     on_ready: Callable[[list[RmwZenohRobot]], None] | None = None,
 ) -> None:
-    """Present the robots of the settings until the task is cancelled. Raises ConfigError."""
+    """Present the robots of the settings until the task is cancelled.
+
+    Raises ConfigError; MissingExtra and UnknownType, for what is missing here.
+    """
+    gid_of("")  # what is missing here is told now, and not when the first node comes
+    await asyncio.to_thread(KnownTypes, settings.rmw_zenoh.definitions)
     robots = settings.rmw_zenoh.robots
     async with AsyncExitStack() as stack:
         networks: dict[str, RosNetwork] = {}
