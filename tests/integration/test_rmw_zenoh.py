@@ -11,6 +11,8 @@ from typing import NamedTuple
 import pytest
 
 import macs_zenoh
+from bridge.headset.client import Headset
+from bridge.headset.nodes import ServiceRequest
 from macs_zenoh.agent import Agent
 from tests.support.programs import Program, macs
 from tests.support.routers import Router
@@ -123,6 +125,25 @@ async def test_services_both_ways(site: Site) -> None:
     await site.there()
     answer = await site.agent.call_service("/lights", {"data": True}, robot=7)
     assert answer == {"success": True, "message": "sdk says True"}
+
+    async def serve(request: ServiceRequest) -> bytes:
+        return b"\0\1\0\0" + request.data[4:5] + b"\0\0\0\x03\0\0\0me\0"
+
+    async with (
+        Program("gateway", "--port", "0", "-e", site.endpoint) as gateway,
+        await Headset.connect("127.0.0.1", gateway.port) as headset,
+    ):
+
+        async def there() -> bool:
+            return 7 in (await headset.online()).ros_agent_ids
+
+        await until(there, PATIENCE_S)
+        await headset.serve("/ask", "std_srvs/SetBool", serve, agents=[7])
+
+        async def answered() -> bool:
+            return await site.robot.ask("call_set_bool", name="/ask", data=True) == [True, "me"]
+
+        await until(answered, PATIENCE_S)
 
 
 async def test_the_graph_tells_the_truth(site: Site) -> None:
