@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import re
 
+from macs_zenoh.protocol.name_patterns import PATTERN
+
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kMGT]?)(i?)B?", re.IGNORECASE)
 _TIME = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|m|min|h|)")
 _SECONDS = {"ms": 0.001, "": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
@@ -28,6 +30,13 @@ def seconds(text: str) -> float:
     if match is None:
         raise argparse.ArgumentTypeError(f"{text!r} is no time, as in 90s, 10m or 1h")
     return float(match[1]) * _SECONDS[match[2]]
+
+
+def pattern(text: str) -> str:
+    """A pattern of topics' names: ``/camera/**``. Raises ArgumentTypeError."""
+    if re.fullmatch(PATTERN, text) is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is no pattern of names, as '/camera/**'")
+    return text
 
 
 def in_bytes(count: float) -> str:

@@ -53,7 +53,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--start", type=amounts.seconds, default=0.0, metavar="T", help="from so long after the beginning"
     )
     cut.add_argument("--end", type=amounts.seconds, metavar="T", help="to so long after the beginning")
-    cut.add_argument("--topics", action="append", default=[], metavar="PATTERN", help="channels, as '/7/**'; repeat")
+    cut.add_argument(
+        "--topics",
+        type=amounts.pattern,
+        action="append",
+        default=[],
+        metavar="PATTERN",
+        help="channels, as '/7/**'; repeat",
+    )
     rosbag2 = _verb(verbs, "to-rosbag2", "write a folder that `ros2 bag` reads")
     rosbag2.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="(default: mcap)")
     for verb, kind in ((merge, "FILE"), (cut, "FILE"), (rosbag2, "FOLDER")):

@@ -19,6 +19,7 @@ import argparse
 from pathlib import Path
 
 from bridge.cli import options, running
+from bridge.cli.amounts import pattern
 from bridge.settings import Settings
 from macs_zenoh.errors import ConfigError, Unreachable, UsageError
 from macs_zenoh.protocol.addresses import is_local, joined
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view-only", action="store_true", help="nobody can publish or call services")
     parser.add_argument("--robot", type=int, action="append", default=[], metavar="ID", help="this one; repeat (all)")
     parser.add_argument(
-        "--topics", action="append", default=[], metavar="PATTERN", help="as '/camera/**'; repeat (all)"
+        "--topics", type=pattern, action="append", default=[], metavar="PATTERN", help="as '/camera/**'; repeat (all)"
     )
     parser.add_argument("--tls-cert", type=Path, metavar="FILE", help="certificate (PEM), for wss://")
     parser.add_argument("--tls-key", type=Path, metavar="FILE", help="its key (PEM, PKCS#8)")
@@ -79,7 +80,7 @@ async def _show(args: argparse.Namespace, settings: Settings) -> int:
         live = Live(agent, wanted, view_only=args.view_only)
         try:
             port = live.start(args.host, args.port, **tls)
-        except (OSError, RuntimeError, ValueError) as error:
+        except Exception as error:  # of the SDK's own kinds, as where the port is taken
             raise Unreachable(joined(args.host, args.port), str(error)) from error
         try:
             running.say_ready(f"foxglove on {joined(args.host, port)}")

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bridge.cli import amounts, options, output, running
-from bridge.cli.amounts import seconds, size
+from bridge.cli.amounts import pattern, seconds, size
 from bridge.settings import Settings
 from macs_zenoh.errors import UsageError
 from macs_zenoh.plain import plain
@@ -42,7 +42,9 @@ SUMMARY = "record a mesh into MCAP files"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = parser.add_argument_group("what to record")
     what.add_argument("--robot", type=int, action="append", default=[], metavar="ID", help="this one; repeat (all)")
-    what.add_argument("--topics", action="append", default=[], metavar="PATTERN", help="as '/camera/**'; repeat (all)")
+    what.add_argument(
+        "--topics", type=pattern, action="append", default=[], metavar="PATTERN", help="as '/camera/**'; repeat (all)"
+    )
     what.add_argument("--commands", action="store_true", help="also commands as sent and carried out, calls, refusals")
     what.add_argument("--headsets", action="store_true", help="also messages between agents")
     where = parser.add_argument_group("where to")

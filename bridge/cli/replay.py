@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bridge.cli import options, output, running
-from bridge.cli.amounts import seconds
+from bridge.cli.amounts import pattern, seconds
 from bridge.settings import Settings
 from macs_zenoh.errors import UsageError
 from macs_zenoh.plain import plain
@@ -46,7 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=_rate, default=1.0, metavar="X", help="so many times as fast (default: 1)")
     parser.add_argument("--loop", action="store_true", help="again and again")
     parser.add_argument("--start", type=seconds, default=0.0, metavar="TIME", help="so long after the beginning")
-    parser.add_argument("--topics", action="append", default=[], metavar="PATTERN", help="as '/camera/**'; repeat")
+    parser.add_argument(
+        "--topics", type=pattern, action="append", default=[], metavar="PATTERN", help="as '/camera/**'; repeat"
+    )
     parser.add_argument("--robot", type=_robot, action="append", default=[], metavar="ID", help="this one; repeat")
     parser.add_argument("--as-robot", type=_as_robot, action="append", default=[], metavar="7:17", help="7 as 17")
     parser.add_argument(

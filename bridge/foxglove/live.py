@@ -10,7 +10,8 @@ import asyncio
 import json
 import logging
 from collections import Counter
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
 from typing import Any
 
 import foxglove
@@ -193,11 +194,11 @@ class Live(ServerListener):
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
         """Somebody looks at a channel."""
-        self._loop.call_soon_threadsafe(self._look, channel.topic, 1)
+        self._from_thread(self._look, channel.topic, 1)
 
     def on_unsubscribe(self, client: Any, channel: Any) -> None:
         """Somebody looks away."""
-        self._loop.call_soon_threadsafe(self._look, channel.topic, -1)
+        self._from_thread(self._look, channel.topic, -1)
 
     def on_client_advertise(self, client: Any, channel: Any) -> None:
         """Somebody will publish."""
@@ -211,7 +212,11 @@ class Live(ServerListener):
         """Somebody publishes."""
         named = self._advertised.get((client.id, client_channel_id))
         if named is not None:
-            self._loop.call_soon_threadsafe(lambda: self._spawn(self._publish(*named, bytes(data))))
+            self._from_thread(lambda: self._spawn(self._publish(*named, bytes(data))))
+
+    def _from_thread(self, callback: Callable[..., None], *args: object) -> None:
+        with suppress(RuntimeError):  # the loop is closed: clients look away when the server ends
+            self._loop.call_soon_threadsafe(callback, *args)
 
     def _called(self, request: Any) -> bytes:
         robot, service, of_type = self._services[request.service_name]

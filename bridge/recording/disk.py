@@ -7,6 +7,7 @@ What is lost is counted by name, in the file and for who asks: nothing is droppe
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 import threading
 import time
@@ -19,6 +20,8 @@ from typing import NamedTuple, Protocol
 from bridge.recording.mcap_file import McapFile
 from bridge.recording.streams import LOST, ROS2MSG, Channel
 from macs_zenoh.errors import ConfigError
+
+log = logging.getLogger("macs.record")
 
 QUEUE_BYTES = 256 << 20
 """What may wait for the disk."""
@@ -183,6 +186,9 @@ class Disk:
             reason = f"the disk takes no more: {error.strerror or error}"
         except ConfigError as error:
             reason = str(error)
+        except Exception:
+            log.exception("writing a recording failed")  # a fault of ours must not look as if all were well
+            reason = "writing failed, see the log"
         self._ended = True
         self._count_late()
         try:

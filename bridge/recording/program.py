@@ -175,7 +175,10 @@ class Recording:
 
     def _triggered(self, trigger: str, about: dict[str, Any]) -> None:
         if self._ring is not None and trigger in self._order.on and time.monotonic() > self._dumped_at + AGAIN_S:
-            self.dump(trigger, f"robot {about.get('robot')}: {trigger}")
+            try:
+                self.dump(trigger, f"robot {about.get('robot')}: {trigger}")
+            except ConfigError as error:
+                log.error("the ring is not written: %s", error)
 
     def dump(self, name: str, reason: str) -> Path:
         """Write what the ring has, and what comes for a while. Raises ConfigError, UsageError where there is none."""

@@ -37,6 +37,8 @@ WITHOUT_STATUS_S = 30.0
 """The same of one that has not answered: an existing program."""
 EARLY = 4096
 """So many commands wait for the schema of their type."""
+EARLY_BYTES = 16 << 20
+"""And no more of them than this."""
 
 
 @dataclass(frozen=True)
@@ -242,7 +244,7 @@ class Recorder:
         if channel is not None:
             self._put_command(channel, sent, log_ns)
             return
-        if len(self._early) >= EARLY:
+        while len(self._early) >= EARLY or sum(len(each.data) for each, _ in self._early) > EARLY_BYTES:
             self._early.popleft()
             self._bad_frames += 1
         self._early.append((sent, log_ns))

@@ -28,12 +28,16 @@ from std_msgs.msg import String
 
 import macs_zenoh
 from bridge.headset.client import Headset
+from bridge.recording import recorder
 from bridge.recording.bag import Bag
+from bridge.recording.conditions import Condition, Event
+from bridge.recording.disk import Entry
 from bridge.recording.repair import problems
 from macs_zenoh.agent import Agent
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.messages import StreamData, decode_management
+from macs_zenoh.protocol.robot_state import RobotStatus
 from macs_zenoh.protocol.wire import parse_frames
 from tests.support.programs import Program, ended, macs
 from tests.support.ros_peer import Peer, say_hello
@@ -382,3 +386,33 @@ async def test_a_file_that_cannot_be_written_is_told(site: Site) -> None:
     code, _, errors = await ended("record", "-e", site.endpoint, "-o", str(site.folder / "none" / "a.mcap"))
     assert code == 2
     assert "cannot be written" in errors
+
+
+async def test_an_idle_mesh_costs_nothing(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that is asked how it is five hundred times, and is as it was, adds nothing to a recording."""
+    asked = 0
+    entries: list[Entry] = []
+
+    class Sink:
+        def put(self, entry: Entry) -> None:
+            entries.append(entry)
+
+    def tell(self: Condition, status: RobotStatus) -> list[Event]:
+        nonlocal asked
+        asked += 1
+        return told(self, status)
+
+    told = Condition.tell
+    monkeypatch.setattr(Condition, "tell", tell)
+    monkeypatch.setattr(recorder, "STATUS_S", 0.001)
+    async with macs_zenoh.join("unity", connect=[site.endpoint]) as agent:
+        recording = recorder.Recorder(agent, Sink(), recorder.Wanted(commands=True, headsets=True))
+        recording.start()
+        try:
+            await until(lambda: recording.topics == 1 and asked > 100)
+            before, since = len(entries), asked
+            await until(lambda: asked > since + 500)
+            assert entries[before:] == []
+            assert sum(len(entry.data) for entry in entries) < 20_000
+        finally:
+            recording.close()
