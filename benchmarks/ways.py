@@ -36,13 +36,21 @@ class _Like:
 
 
 class Tls(_Like):
-    """A socket whose time to receive has run out says so as a plain one."""
+    """A socket whose time to receive has run out says so as a plain one: Python's own TLS would try again for ever."""
+
+    def setsockopt(self, level: int, option: int, value: Any) -> None:
+        """As of a plain one."""
+        if (level, option) == (socket.SOL_SOCKET, socket.SO_RCVTIMEO):
+            seconds, micros = struct.unpack("ll", value)
+            self._sock.settimeout(seconds + micros / 1e6)
+        else:
+            self._sock.setsockopt(level, option, value)
 
     def recv_into(self, buffer: Any) -> int:
         """Some bytes. Raises BlockingIOError."""
         try:
             return int(self._sock.recv_into(buffer))
-        except ssl.SSLWantReadError as error:
+        except TimeoutError as error:
             raise BlockingIOError from error
 
 

@@ -27,7 +27,6 @@ from . import frames
 from .frames import NodeSpec
 from .mailbox import Mailbox
 from .nodes import REQUEST_IDS, Incoming, Node, Owner
-from .resumption import always
 
 ID_BYTES = 16
 UNKNOWN, ACCEPTED, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = range(7)
@@ -141,9 +140,10 @@ class ActionClient(Node):
         """Send one message of this action. Raises Unreachable."""
         request_id = self._next_request
         self._next_request = (request_id + 1) % REQUEST_IDS
-        frame = frames.node_data(self._owner.id, self.spec, data, (robot,), request_id=request_id, manager=verb.value)
-        # a goal that was lost with a connection would set the robot going when nobody expects it any more
-        await self._owner.send_frame(frame, None if verb is ActionVerb.GOAL else always)
+        # not again when it is lost: a goal would set the robot going when nobody expects it any more
+        await self._owner.send_frame(
+            frames.node_data(self._owner.id, self.spec, data, (robot,), request_id=request_id, manager=verb.value)
+        )
 
     async def ask_again(self) -> None:
         """After a reconnection: ask for everything that may have come meanwhile."""

@@ -633,8 +633,7 @@ class Headset:
     async def _rejoin(self) -> None:
         for attempt in itertools.count():
             try:
-                if not await self._join():
-                    await self._register_all()
+                await self._register_all(again=not await self._join())
             except Unreachable as error:
                 log.debug("%s", error)
                 self.drop_connection()
@@ -645,9 +644,10 @@ class Headset:
                 return
             await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
 
-    async def _register_all(self) -> None:
+    async def _register_all(self, *, again: bool) -> None:
+        """Whatever has to be said after a reconnection; ``again``: to a gateway that knows nothing of before."""
         for node in self.nodes:
-            if node.agents or node.groups:
+            if again and (node.agents or node.groups):
                 agents, groups = sorted(node.agents), sorted(node.groups)
                 await self.send_frame(frames.registration(self.id, node.spec, agents, groups), always)
             if isinstance(node, ActionClient):

@@ -252,6 +252,9 @@ class InterfaceNode(ABC):
     def fell_asleep(self, agent: Registrant) -> None:  # noqa: B027 - only some nodes move the robot
         """The connection of an agent has ended, and it may come back as the same one. On the loop."""
 
+    def stays_asleep(self, agent: Registrant) -> None:  # noqa: B027 - only who waits for it cares
+        """It has not come back for longer than others should wait for it. On the loop."""
+
     def returned(self, agent: Registrant) -> None:  # noqa: B027 - only some nodes care
         """An agent that left is there again, and nobody had its id meanwhile. On the loop."""
 

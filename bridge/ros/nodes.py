@@ -254,6 +254,10 @@ class InterfaceNodes:
             self._early.drop(registrant, MOVING)
         self._each(lambda node: node.fell_asleep(registrant))
 
+    def stays_asleep(self, registrant: Registrant) -> None:
+        """It is still not back: nobody waits for it any more."""
+        self._each(lambda node: node.stays_asleep(registrant))
+
     def arrived(self, registrant: Registrant) -> None:
         """An agent is seen now; what it sent before waits to be judged."""
         self.rights.changed()

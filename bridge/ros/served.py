@@ -110,6 +110,13 @@ class ServiceNode(InterfaceNode):
     def retire(self) -> None:
         if self._watching is not None:
             self._watching.cancel()
+        self._fail_open()
+
+    def stays_asleep(self, agent: Registrant) -> None:
+        if agent in self.registrants:
+            self._fail_open()
+
+    def _fail_open(self) -> None:
         for request_id in list(self._open_calls):
             self._fail(request_id, f"the headset that serves {self.topic} has left")
 

@@ -208,6 +208,9 @@ class Directory:
 
     def _claim(self, agent: AgentInfo) -> list[Change]:
         claims = self._claims.setdefault(agent.key, {})
+        own = claims.get(agent.zid)
+        if own is not None and own.epoch == agent.epoch and 0 < agent.asleep < own.asleep:
+            return []  # news of an earlier sleep, which routers bring us of what we said ourselves
         before = self._current(agent.key) if claims else None
         replaced = before is not None and before.zid == agent.zid and before.epoch != agent.epoch
         self._doubtful.discard(agent)

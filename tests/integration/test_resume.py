@@ -448,4 +448,5 @@ async def test_a_thousand_times_leave_nothing_behind(start_site: StartSite, capl
         assert after - before < 64 << 10
         assert len(site.gateway.agents) == 2
         assert len(site.gateway._sleepers) == 0
-        assert [agent.id for agent in site.gateway.directory.of_type(UNITY)] == sorted({own_id, other.id})
+        everybody = sorted({own_id, other.id})
+        await until(lambda: [agent.id for agent in site.gateway.directory.of_type(UNITY)] == everybody)
