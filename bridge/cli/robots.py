@@ -47,12 +47,25 @@ CLOCK_PINGS = 5
 WITHOUT_A_ROUTER = "(start one with `macs router`, or name it with -e; `macs doctor` looks closer)"
 
 
+class RouterSession(Struct, frozen=True):
+    """Somebody whom a router has a session with."""
+
+    peer: str = ""
+    whatami: str = ""
+
+
 class Router(Struct, frozen=True):
     """A router, as its admin space has it."""
 
     zid: str
     version: str = ""
     locators: list[str] = []
+    sessions: list[RouterSession] = []
+
+    @property
+    def linked(self) -> list[str]:
+        """Ids of the routers that it is linked with itself."""
+        return sorted({session.peer for session in self.sessions if session.whatami == "router"})
 
     @property
     def release(self) -> str:

@@ -1,7 +1,7 @@
 """A mesh, live, in a terminal: robots and who has control of them, who is stopped; topics with rates and ages;
-headsets with address, token and age; gateways, routers and the links between them; what changes.
+headsets with address, token and age; gateways, routers and the links between them; what was lost; what changes.
 
-Keys: 1 to 5 choose what is shown, Tab goes on to the next; s sorts by the next column, r the other way; / filters,
+Keys: 1 to 6 choose what is shown, Tab goes on to the next; s sorts by the next column, r the other way; / filters,
 arrows scroll, q ends it. It works over ssh and from 80 by 24 on. It joins nothing, and asks each robot at most once a
 second and all of them together 60 times.
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "the mesh, live: robots, topics, headsets, links"
 
-VIEWS = ("robots", "topics", "headsets", "links", "events")
+VIEWS = ("robots", "topics", "headsets", "links", "lost", "events")
 EVERY_S = 0.5
 KEYS = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[5~": "page up", "\x1b[6~": "page down"}
 RATES_S = 1.2

@@ -53,7 +53,7 @@ from macs_zenoh.protocol.messages import (
     RemoveNode,
     encode_data,
 )
-from macs_zenoh.protocol.ping import GatewayAgent
+from macs_zenoh.protocol.ping import GatewayAgent, encode_told
 from macs_zenoh.protocol.rate_limit import TOGETHER, Pace
 from macs_zenoh.protocol.recipient import Recipient, to_agent
 from macs_zenoh.protocol.registrations import AgentKey
@@ -236,7 +236,7 @@ class Gateway:
         self._audit = open_audit(
             settings.audit_file, name, settings.audit_max_bytes, settings.audit_files, self._audit_lost
         )
-        self.mesh.tells, self.mesh.away, self.mesh.agents = self._now, self._away, self._agents
+        self.mesh.tells, self.mesh.away, self.mesh.told = self._now, self._away, self._told
         await self._presence.start()
         self.mesh.on_link(lambda up: self._robots.repeat_all() if up else None)
         await self._leases.take()
@@ -259,8 +259,14 @@ class Gateway:
         now = time.monotonic()
         return sorted(connection.key for connection in self.agents.online() if connection.is_away(now))
 
+    def _told(self) -> bytes:
+        """Its agents and what was lost, for who asks by a ping."""
+        lost = self.drops
+        for connection in self.agents.connections():
+            lost.update(connection.all_drops())
+        return encode_told(self._agents(), lost)
+
     def _agents(self) -> Iterator[GatewayAgent]:
-        """Its agents, for who asks by a ping."""
         now = time.monotonic()
         for connection in self.agents.online():
             age_s = round(now - connection.greeted_at, 1)

@@ -26,6 +26,23 @@ REFUSALS = {
 """Drops of a robot that mean that it did not do what somebody wanted, and why."""
 
 
+TURNED_AWAY = {
+    "NotAdmitted": "no valid token was shown",
+    "NotPermitted": "their token gives no right to it",
+    "NotAllowed": "they spoke for others",
+    "address_not_allowed": "they come from a network that may not",
+    "too_many_connections": "there are too many connections",
+    "too_many_from_address": "there are too many connections of one address",
+    "too_many_unknown": "there are too many that have shown no token",
+    "robot_not_allowed": "robot programs may not come with that id",
+    "zenoh_program": "they are Zenoh programs, which want a router",
+    "other_page": "another web page asked",
+}
+"""Drops of a gateway that mean that it turned somebody away, and why."""
+HARMLESS = frozenset({"wrong_sender", "nobody_with_this_id"})
+"""What existing programs do all day."""
+
+
 class Event(NamedTuple):
     """One thing that happened. ``what`` is one of `KINDS`, ``who`` whom it is about, ``text`` a line for people."""
 
@@ -93,6 +110,17 @@ def of_robot(robot: int, before: RobotStatus, after: RobotStatus, at_s: float) -
             yield Event(at_s, "refused", who, f"{who} refused {_messages(count)}: {REFUSALS[name]} ({name})")
         else:
             yield Event(at_s, "lost", who, f"{who} lost {_messages(count)} ({name})")
+
+
+def of_gateway(name: str, before: Mapping[str, int], after: Mapping[str, int], at_s: float) -> Iterator[Event]:
+    """What a gateway refused and lost between two looks."""
+    who = f"gateway {name}"
+    for counter, count in _more(before, after).items():
+        why = TURNED_AWAY.get(counter)
+        if why is not None:
+            yield Event(at_s, "refused", who, f"{who} refused {count}: {why} ({counter})")
+        elif counter not in HARMLESS:
+            yield Event(at_s, "lost", who, f"{who} lost {_messages(count)} ({counter})")
 
 
 def _stops(who: str, before: RobotStatus, after: RobotStatus, at_s: float) -> Iterator[Event]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import re
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
@@ -20,7 +19,7 @@ from macs_zenoh.mesh import Mesh
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol import ping
 from macs_zenoh.protocol.directory import Change
-from macs_zenoh.protocol.keyexpr import PING, router_links
+from macs_zenoh.protocol.keyexpr import PING
 from macs_zenoh.protocol.ping import Pong
 from macs_zenoh.protocol.robot_state import RobotStatus
 
@@ -35,10 +34,6 @@ STATES_PER_S = 60
 PROGRAMS_EVERY_S = 2.0
 ROUTERS_EVERY_S = 5.0
 ANSWER_S = 2.0
-
-GRAPH_BYTES = 1 << 20
-_NODE = re.compile(r'(\d+) \[ ?label ?= ?"(?:\\\\")?([0-9a-f]{1,32})')
-_EDGE = re.compile(r"(\d+) -- (\d+)")
 
 OnEvents = Callable[[list[Event]], None]
 
@@ -152,8 +147,7 @@ class Observer:
         try:
             answer = await self._mesh.query(PING.of(zid=zid), ping.AGENTS, timeout_s=ANSWER_S)
             pong, told = ping.decode(answer)
-            for agent in ping.decode_agents(told):
-                self.picture.known[agent.type, agent.id] = agent
+            self._tell(self.picture.told_by_gateway(zid, ping.decode_told(told), time.time()))
         except MacsError:
             return None
         return pong, time.monotonic() - began
@@ -162,26 +156,5 @@ class Observer:
         began = time.monotonic()
         found = await self._operator.routers(timeout_s=ANSWER_S)
         took_s = time.monotonic() - began
-        links = await asyncio.gather(*(self._links(router.zid) for router in found))
-        rows = {
-            router.zid: (", ".join(router.locators), router.release, linked)
-            for router, linked in zip(found, links, strict=True)
-        }
+        rows = {router.zid: (", ".join(router.locators), router.release, router.linked) for router in found}
         self._tell(self.picture.routers(rows, took_s, time.time()))
-
-    async def _links(self, zid: str) -> list[str]:
-        """Routers that a router is linked with, as it tells."""
-        if self._mesh.settings.namespace:
-            return []
-        for _, answer in await self._mesh.ask_all(router_links(zid), timeout_s=ANSWER_S):
-            return linked_in(answer, zid)
-        return []
-
-
-def linked_in(graph: bytes, zid: str) -> list[str]:
-    """The ids of those that a router is linked with, in what its admin space says of links (Graphviz' text)."""
-    text = graph[:GRAPH_BYTES].decode(errors="replace")
-    names = dict(_NODE.findall(text))
-    mine = {number for number, name in names.items() if name == zid}
-    linked = {number for pair in _EDGE.findall(text) if mine & set(pair) for number in pair} - mine
-    return sorted(names[number] for number in linked if number in names)

@@ -9,10 +9,10 @@ from msgspec import UNSET
 
 from macs_zenoh.protocol.directory import AgentInfo, Change
 from macs_zenoh.protocol.messages import ROS
-from macs_zenoh.protocol.ping import GatewayAgent, Pong
+from macs_zenoh.protocol.ping import GatewayAgent, GatewayTold, Pong
 from macs_zenoh.protocol.robot_state import CarriedStatus, NodeStatus, RobotStatus
 
-from .events import Event, of_presence, of_program, of_robot
+from .events import Event, of_gateway, of_presence, of_program, of_robot
 
 MOST_TOPICS = 2000
 """Rows of topics that are kept: what others choose must not decide how much is."""
@@ -49,6 +49,18 @@ class RobotRow:
     unanswered: int = 0
     problem: str = ""
     lost_per_s: float = 0.0
+    lost: dict[str, float] = field(default_factory=dict)
+    """By counter, how many a second since the last look."""
+
+
+@dataclass(frozen=True)
+class LostRow:
+    """What a robot has lost or refused, by the name of its counter (docs/counters.md)."""
+
+    robot: int
+    counter: str
+    count: int
+    per_s: float
 
 
 @dataclass(frozen=True)
@@ -75,6 +87,8 @@ class ProgramRow:
     lost: int = 0
     links: list[str] = field(default_factory=list)
     """Of a router: those that it is linked with."""
+    counters: dict[str, int] | None = None
+    """Of a gateway: what was lost and refused there, by name."""
 
 
 class Picture:
@@ -129,7 +143,9 @@ class Picture:
         if row.unanswered >= SILENT_AFTER:
             events.append(Event(at_s, "came", str(row.info.key), f"{row.info.key} answers again"))
         if before is not None and since_s > 0:
-            row.lost_per_s = max(0, sum(status.drops.values()) - sum(before.drops.values())) / since_s
+            more = {name: count - before.drops.get(name, 0) for name, count in status.drops.items()}
+            row.lost = {name: max(0, count) / since_s for name, count in more.items()}
+            row.lost_per_s = sum(row.lost.values())
         row.status, row.told_s, row.round_trip_s, row.unanswered, row.problem = status, now, round_trip_s, 0, ""
         self._topics_of(robot, status, before is not None, since_s)
         return events
@@ -158,10 +174,21 @@ class Picture:
             row.answers = told is not None
             if told is not None:
                 pong, row.round_trip_s = told
-                row.address, row.lost = pong.address, sum(pong.drops.values())
+                row.address = pong.address
+                row.lost = sum(pong.drops.values()) + sum((row.counters or {}).values())
                 row.versions = f"macs {pong.macs}, Zenoh {pong.zenoh}"
             rows[zid] = row
         return self._programs("gateway", rows, at_s)
+
+    def told_by_gateway(self, zid: str, told: GatewayTold, at_s: float) -> list[Event]:
+        """What a gateway tells of its agents, and of what was lost and refused there."""
+        for agent in told.agents:
+            self.known[agent.type, agent.id] = agent
+        row = self.programs.get(zid)
+        if row is None:
+            return []
+        before, row.counters = row.counters, told.lost
+        return [] if before is None else list(of_gateway(row.address or zid[:8], before, told.lost, at_s))
 
     def routers(
         self, found: Mapping[str, tuple[str, str, list[str]]], round_trip_s: float, at_s: float
@@ -196,6 +223,12 @@ class Picture:
             del self.topics[key]
 
     # -- what is so ----------------------------------------------------------------------------------------------
+
+    def losses(self) -> Iterator[LostRow]:
+        """What robots have lost, by name."""
+        for number, row in sorted(self.robots.items()):
+            for name, count in sorted(row.status.drops.items()) if row.status is not None else ():
+                yield LostRow(number, name, count, row.lost.get(name, 0.0))
 
     def headsets(self) -> Iterator[HeadsetRow]:
         """Agents that are no robots, by type and id."""

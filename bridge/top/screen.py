@@ -18,8 +18,8 @@ from macs_zenoh.plain import plain
 from .events import SHORT, Event
 from .picture import Picture
 
-VIEWS = ("robots", "topics", "headsets", "links", "events")
-HELP = "1 robots 2 topics 3 headsets 4 links 5 events   s sort  r reverse  / filter  ↑↓ scroll  q quit"
+VIEWS = ("robots", "topics", "headsets", "links", "lost", "events")
+HELP = "1 robots 2 topics 3 headsets 4 links 5 lost 6 events  s r sort  / filter  ↑↓  q quit"
 EVENTS = 200
 STALE_S = 5.0
 """What a robot told longer ago is shown as old."""
@@ -128,6 +128,7 @@ class Screen:
             "topics": self._topics,
             "headsets": self._headsets,
             "links": self._links,
+            "lost": self._lost,
             "events": self._events,
         }
         return make[self.view.name](now)
@@ -199,6 +200,13 @@ class Screen:
             cells = (row.kind, row.zid[:SHORT], row.address or "?", _ms(row.round_trip_s), str(row.lost), what)
             rows.append((keys, cells, "" if row.answers else "bold red"))
         return ("KIND", "SESSION", "ADDRESS", "RTT", "LOST", "LINKED WITH"), {3, 4}, rows
+
+    def _lost(self, now: float) -> tuple[Sequence[str], set[int], list[Row]]:
+        rows: list[Row] = []
+        for row in self.picture.losses():
+            cells = (str(row.robot), row.counter, str(row.count), f"{row.per_s:.1f}")
+            rows.append(((row.robot, row.counter, row.count, row.per_s), cells, "yellow" if row.per_s else ""))
+        return ("ROBOT", "COUNTER", "LOST", "LOST/s"), {0, 2, 3}, rows
 
     def _events(self, now: float) -> tuple[Sequence[str], set[int], list[Row]]:
         rows: list[Row] = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import islice
 
 import msgspec
@@ -91,19 +91,26 @@ def encode(said: Pong, echo: Buffer = b"") -> bytes:
     return encode_message(msgspec.json.encode(said), echo)
 
 
-def encode_agents(agents: Iterable[GatewayAgent]) -> bytes:
-    """What a gateway answers to `AGENTS`."""
-    return msgspec.json.encode(list(islice(agents, MOST_AGENTS)))
+class GatewayTold(msgspec.Struct, frozen=True):
+    """What a gateway answers to `AGENTS`: its agents, and what was lost and refused there, by name."""
+
+    agents: list[GatewayAgent] = []
+    lost: dict[str, int] = {}
 
 
-def decode_agents(told: bytes) -> list[GatewayAgent]:
-    """The agents that a gateway told; none of one that has only sent the question back. Raises TooLong, BadJson."""
+def encode_told(agents: Iterable[GatewayAgent], lost: Mapping[str, int]) -> bytes:
+    """The answer to `AGENTS`."""
+    return msgspec.json.encode(GatewayTold(list(islice(agents, MOST_AGENTS)), dict(lost)))
+
+
+def decode_told(told: bytes) -> GatewayTold:
+    """What a gateway told; nothing of one that has only sent the question back. Raises TooLong, BadJson."""
     if told == AGENTS or not told:
-        return []
+        return GatewayTold()
     if len(told) > AGENTS_BYTES:
         raise TooLong("what a gateway tells of its agents", len(told), AGENTS_BYTES)
     try:
-        return msgspec.json.decode(told, type=list[GatewayAgent])
+        return msgspec.json.decode(told, type=GatewayTold)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise BadJson("what a gateway tells of its agents", str(error)) from None
 

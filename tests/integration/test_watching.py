@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import pty
+import socket
 import struct
 import sys
 import termios
@@ -14,8 +15,10 @@ from typing import Any
 
 import macs_zenoh
 from bridge.headset.client import Headset
+from macs_zenoh.protocol.greetings import INIT_SYN
 from tests.support.processes import ROOT
 from tests.support.programs import Program, ended, free_port, macs
+from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
 
 STATE: dict[str, Any] = {
@@ -54,7 +57,7 @@ async def test_watch_tells_what_changes(router: str) -> None:
     async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
         robot = Told(agent)
         watching = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "bridge", "watch", "--json", "--count", "6", "-e", router),
+            *(sys.executable, "-m", "bridge", "watch", "--json", "--count", "7", "-e", router),
             cwd=ROOT,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
@@ -86,6 +89,11 @@ async def test_watch_tells_what_changes(router: str) -> None:
         endpoint = router
         async with Program("gateway", "--port", "0", "-e", endpoint) as gateway:
             assert (await event())["who"] == gateway.ready.replace("gateway on", "gateway")
+            with socket.create_connection(("127.0.0.1", gateway.port)) as wrong:  # a Zenoh program, as it dials
+                wrong.sendall(INIT_SYN)
+                said = await event()
+            assert said["event"] == "refused"
+            assert said["text"].endswith("they are Zenoh programs, which want a router (zenoh_program)")
         assert await asyncio.wait_for(watching.wait(), PATIENCE_S) == 0
 
 
@@ -165,6 +173,18 @@ async def test_top_fills_a_terminal_of_80_by_24(router: str) -> None:
                 await process.wait()
             os.close(master)
             os.close(slave)
+
+
+async def test_top_shows_which_routers_are_linked() -> None:
+    """Two in a row, each with the other, whichever is asked."""
+    async with Router() as first, Router(connect=[first.endpoint]) as second:
+
+        async def linked() -> bool:
+            said = await macs("top", "--json", "-e", second.endpoint)
+            routers = {row["zid"]: row["links"] for row in said["programs"] if row["kind"] == "router"}
+            return len(routers) == 2 and all(set(links) == routers.keys() - {zid} for zid, links in routers.items())
+
+        await until(linked, every_s=0.2)
 
 
 async def test_ping_says_how_long_a_robot_takes(router: str) -> None:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import io
 
+import msgspec
 import pytest
 from rich.console import Console
 
+from bridge.cli.robots import Router
 from bridge.top.events import KINDS, Event, of_robot
-from bridge.top.observer import linked_in
 from bridge.top.picture import MOST_TOPICS, SILENT_AFTER, Picture
 from bridge.top.screen import Screen, View
+from macs_zenoh.errors import WireError
 from macs_zenoh.protocol.directory import AgentInfo, Change
-from macs_zenoh.protocol.ping import AGENTS, GatewayAgent, Pong, decode_agents, encode_agents
+from macs_zenoh.protocol.ping import AGENTS, GatewayAgent, GatewayTold, Pong, decode_told, encode_told
 from macs_zenoh.protocol.robot_state import (
     CarriedStatus,
     ControlStatus,
@@ -132,6 +134,21 @@ def test_rates_are_those_between_two_looks() -> None:
     assert not picture.topics
 
 
+def test_what_is_lost_is_told_by_name() -> None:
+    """How many in all, and a second since the last look."""
+    picture = Picture()
+    picture.presence(Change(robot(), True), 1.0)
+    picture.told(7, status(drops={"stopped": 4}), 0.001, 10.0, 1.0)
+    picture.told(7, status(drops={"stopped": 10, "bad_cdr": 1}), 0.001, 12.0, 1.0)
+    assert [(row.counter, row.count, row.per_s) for row in picture.losses()] == [
+        ("bad_cdr", 1, 0.5),
+        ("stopped", 10, 3.0),
+    ]
+    assert picture.robots[7].lost_per_s == 3.5
+    lines = drawn(Screen(picture, View("lost")))
+    assert lines[2].split() == ["7", "bad_cdr", "1", "0.5"]
+
+
 def test_gateways_and_routers_come_and_go() -> None:
     """With their addresses, once each."""
     picture = Picture()
@@ -147,21 +164,37 @@ def test_gateways_and_routers_come_and_go() -> None:
 
 
 def test_links_are_read_from_what_routers_tell() -> None:
-    """Zenoh draws its graph for Graphviz; what is none is no link."""
-    graph = (
-        b'graph {\n 0 [ label = "aa11" ]\n 1 [ label = "bb22" ]\n 2 [ label = "cc33" ]\n 0 -- 1 [ ]\n 1 -- 2 [ ]\n}'
-    )
-    assert linked_in(graph, "aa11") == ["bb22"]
-    assert linked_in(graph, "bb22") == ["aa11", "cc33"]
-    assert linked_in(b"\xff nonsense", "aa11") == []
+    """Each router's own sessions with routers, once each; a robot's or a gateway's is no link."""
+    said = b'{"zid": "aa", "version": "v1.10.2-x", "locators": ["tcp/10.0.0.1:7447"], "plugins": {}, "sessions": ['
+    said += b'{"peer": "bb", "whatami": "router", "links": []}, {"peer": "cc", "whatami": "client"}]}'
+    router = msgspec.json.decode(said, type=Router)
+    assert (router.linked, router.release) == (["bb"], "1.10.2")
 
 
 def test_a_gateway_tells_of_its_agents() -> None:
     """As many as an answer may have; one that does not know the question sends it back."""
     agents = [GatewayAgent(2, number, f"10.0.0.1:{number}", "anna", 1.5) for number in range(3000)]
-    told = decode_agents(encode_agents(agents))
-    assert told == agents[:2000]
-    assert decode_agents(AGENTS) == []
+    told = decode_told(encode_told(agents, {"NotAdmitted": 3}))
+    assert (told.agents, told.lost) == (agents[:2000], {"NotAdmitted": 3})
+    assert decode_told(AGENTS) == GatewayTold()
+    for wrong in (b"[", b"[]", b'{"agents": [3]}', b"x" * (600 << 10)):
+        with pytest.raises(WireError):
+            decode_told(wrong)
+
+
+def test_a_gateway_turns_away() -> None:
+    """What it counts between two looks is an event by name; the first look is none, nor what is harmless."""
+    picture = Picture()
+    picture.gateways({"g1": (Pong(time_s=1.0, address="10.0.0.5:7000"), 0.002)}, 1.0)
+    agent = GatewayAgent(2, 256, "10.0.0.9:4000", "anna", 1.0)
+    assert picture.told_by_gateway("g1", GatewayTold([agent], {"NotAdmitted": 3}), 1.0) == []
+    lost = {"NotAdmitted": 5, "outbox_full": 1, "wrong_sender": 9}
+    assert [event.text for event in picture.told_by_gateway("g1", GatewayTold([agent], lost), 2.0)] == [
+        "gateway 10.0.0.5:7000 refused 2: no valid token was shown (NotAdmitted)",
+        "gateway 10.0.0.5:7000 lost 1 message (outbox_full)",
+    ]
+    assert picture.known[2, 256] == agent
+    assert picture.told_by_gateway("g2", GatewayTold(), 2.0) == []
 
 
 def drawn(screen: Screen, width: int = 80, height: int = 24) -> list[str]:
@@ -188,7 +221,7 @@ def full_picture() -> Picture:
     return picture
 
 
-@pytest.mark.parametrize("view", ["robots", "topics", "headsets", "links", "events"])
+@pytest.mark.parametrize("view", ["robots", "topics", "headsets", "links", "lost", "events"])
 @pytest.mark.parametrize("size", [(80, 24), (40, 10), (200, 60)])
 def test_a_screen_is_never_larger_than_the_terminal(view: str, size: tuple[int, int]) -> None:
     """With two hundred robots and a thousand headsets, and names that nobody would choose."""
