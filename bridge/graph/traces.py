@@ -23,6 +23,8 @@ POLL_S = 0.2
 ASK_S = 3.0
 """So long each request holds; it is repeated while traces are collected."""
 PINGS = 10
+MOST_OTHERS = 50
+"""Of agents that are behind no gateway so many are asked to mark what they send."""
 WARM = 2
 """So many first messages of each way do not count: they find nothing prepared."""
 
@@ -120,8 +122,9 @@ class Tracing:
             pong = await self._pong(zid)
             self._names[zid] = f"gateway {pong.address}" if pong is not None and pong.address else f"gateway {zid[:8]}"
         if self._commands:
-            putting = {*gateways, *(agent.zid for agent in self._site.agent.online())}
-            self._marking = sorted(putting - {self._mesh.zid, self._robot_zid})
+            others = dict.fromkeys(agent.zid for agent in self._site.agent.online())
+            putting = dict.fromkeys([*gateways, *list(others)[:MOST_OTHERS]])
+            self._marking = [zid for zid in putting if zid not in (self._mesh.zid, self._robot_zid)]
             self._looking = [Noting(self._robot_zid, self._names[self._robot_zid])]
             return
         self._marking = [self._robot_zid]

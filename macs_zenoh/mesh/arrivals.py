@@ -156,7 +156,7 @@ class Arrivals:
         others, mine, limit, large, own = self._queue, self._mine, self.TOPICS_LIMIT, self.LARGE_BYTES, self._own
 
         def receive(sample: zenoh.Sample) -> bool:
-            if looks and (trace := self._tracing.begin(sample)) is not None:
+            if looks and sample.attachment is not None and (trace := self._tracing.begin(sample)) is not None:
                 noted = noting(trace, on_batch, on_numbered, at_once)
                 return self.receiver(noted[0], noted[1], at_once=noted[2], traced=False)(sample)
             try:
@@ -209,7 +209,7 @@ class Arrivals:
                         behind.leave(key)
 
         def receive(sample: zenoh.Sample) -> None:
-            if looks and (trace := self._tracing.begin(sample)) is not None:
+            if looks and sample.attachment is not None and (trace := self._tracing.begin(sample)) is not None:
                 self.guarded(noting_aged(trace, on_aged), NotingGate(trace, gate), behind)(sample)
                 return
             try:

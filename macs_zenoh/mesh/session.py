@@ -6,7 +6,7 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from types import TracebackType
 
@@ -98,8 +98,8 @@ class Mesh:
         """What this program tells `macs doctor` of itself, by name: what is so now and should not be."""
         self.address = ""
         """Where headsets reach this program, if it is a gateway."""
-        self.agents: Callable[[], Iterable[ping.GatewayAgent]] | None = None
-        """A gateway's agents."""
+        self.told: Callable[[], bytes] | None = None
+        """What a gateway tells of its agents (`ping.encode_told`)."""
         self.away: Callable[[], list[tuple[int, int]]] = list
         """(type, id) of a gateway's agents that are silent."""
         self._linked_with: set[str] = set()
@@ -178,6 +178,7 @@ class Mesh:
         """Put something to nobody: a panic in a thread of Zenoh's own would show nowhere else."""
         self._pulse = self._pulse or self._session.declare_publisher(PING.of(zid=self.zid))
         call(self._pulse.put, b"")
+        self.tracing.end(time.monotonic())
         self._beating = self._loop.call_later(BEAT_S, self._beat)
 
     async def __aenter__(self) -> Mesh:
@@ -421,8 +422,8 @@ class Mesh:
             )
             if payload.startswith(trace.PREFIX):
                 payload = self.tracing.answer(payload)
-            if payload == ping.AGENTS and self.agents is not None:
-                payload = ping.encode_agents(self.agents())
+            if payload == ping.AGENTS and self.told is not None:
+                payload = self.told()
             return ping.encode(said, payload)
 
         return self.serve(PING.of(zid=self.zid), answer)

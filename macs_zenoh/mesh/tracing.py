@@ -30,6 +30,10 @@ log = logging.getLogger("macs.mesh")
 
 MOST_WANTED = 64
 """Beginnings of keys that are marked at one time."""
+KNOWN = 4096
+"""Keys that are remembered as looked up."""
+STALE_NS = 1_000_000_000
+_UNKNOWN: Any = object()
 _NAMES = {"SEND": SENT, "ROUTE": ROUTER, "RECEIVE": RECEIVED}
 
 
@@ -60,6 +64,8 @@ class Tracing:
         self.name = name
         self.wanted: dict[str, Wanted] = {}
         """By beginnings of keys; empty: nothing is marked."""
+        self._of_key: dict[str, Wanted | None] = {}
+        """By keys, as far as they were looked up."""
         self.looks: list[Tracing] = []
         """Itself while what comes marked is noted; empty otherwise."""
         self.on_report: Callable[[Report], None] | None = None
@@ -106,13 +112,15 @@ class Tracing:
                 found.every, found.until_s = min(found.every, request.every), max(found.until_s, until_s)
             elif len(self.wanted) < MOST_WANTED:
                 self.wanted[request.put] = Wanted(request.every, until_s, commands=request.commands)
+                self._of_key.clear()
         self.end(now)
 
     def end(self, now: float) -> None:
         """Let go of what is not wanted any more."""
         for prefix, wanted in list(self.wanted.items()):
             if wanted.until_s < now:
-                del self.wanted[prefix]
+                self.wanted.pop(prefix, None)
+                self._of_key.clear()
         if self.looks and now > self._until_s and not self._always:
             self.looks.clear()
 
@@ -124,21 +132,34 @@ class Tracing:
 
     def mark(self, key: str, *, command: bool) -> dict[str, Any] | None:
         """What to give to Zenoh with a message that is put now, if it is to be traced."""
-        for prefix, wanted in list(self.wanted.items()):
-            if key.startswith(prefix) and (command or not wanted.commands):
-                points = getattr(self._noted, "points", ())
-                self._noted.points = ()
-                if wanted.until_s < time.monotonic():
-                    self.end(time.monotonic())
-                    return None
-                if not wanted.due():
-                    return None
-                number = int.from_bytes(os.urandom(8), "little")
-                return {
-                    "attachment": trace.encode_mark(number, [*points, (PUT, time.time_ns())]),
-                    "timestamp_instrumentation": INSTRUMENTED,
-                }
-        return None
+        wanted = self._of_key.get(key, _UNKNOWN)
+        if wanted is _UNKNOWN:
+            wanted = self._find(key)
+        if wanted is None or (wanted.commands and not command) or not wanted.due():
+            return None
+        return self._marked(wanted)
+
+    def _find(self, key: str) -> Wanted | None:
+        found = next((wanted for prefix, wanted in list(self.wanted.items()) if key.startswith(prefix)), None)
+        if len(self._of_key) >= KNOWN:
+            self._of_key.clear()
+        self._of_key[key] = found
+        return found
+
+    def _marked(self, wanted: Wanted) -> dict[str, Any] | None:
+        points = getattr(self._noted, "points", ())
+        self._noted.points = ()
+        now = time.monotonic()
+        if wanted.until_s < now:
+            self.end(now)
+            return None
+        number, now_ns = int.from_bytes(os.urandom(8), "little"), time.time_ns()
+        if points and now_ns - points[-1][1] > STALE_NS:
+            points = ()  # of another message, which was not marked
+        return {
+            "attachment": trace.encode_mark(number, [*points, (PUT, now_ns)]),
+            "timestamp_instrumentation": INSTRUMENTED,
+        }
 
     # -- where they come -----------------------------------------------------------------------------------------
 

@@ -229,7 +229,8 @@ async def test_off_it_costs_no_byte(router: str) -> None:
         mesh.tracing.answer(trace.encode_request(TraceRequest(put="macs/from/ros/7/", seconds=60)))
         on = await sent()
         assert on > off + 100 * 30
-        mesh.tracing.wanted.clear()
+        mesh.tracing.end(float("inf"))
+        assert not mesh.tracing.wanted
         again = await sent()
         assert abs(again - off) < 400  # a beat of the session may fall into one of them
         subscription.close()
