@@ -11,8 +11,10 @@ from typing import Literal
 Kind = Literal["counter", "gauge", "info"]
 Labels = tuple[tuple[str, str], ...]
 
-MOST_ROWS = 40
+MOST_ROWS = 30
 """Of one figure: what is more than this is added up under `OTHERS`."""
+MOST_TYPES = 8
+"""Of kinds of agents, of which there are three, and 255 that there may be."""
 OTHERS = "(others)"
 
 
@@ -83,4 +85,4 @@ def by_type(name: str, text: str, kinds: Iterable[str]) -> Family:
     family = gauge(name, text)
     for kind, count in sorted(Counter(kinds).items()):
         family.add(count, type=kind)
-    return family.bounded()
+    return family.bounded(MOST_TYPES)

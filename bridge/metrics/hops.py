@@ -12,7 +12,7 @@ from macs_zenoh.protocol.trace import DONE, IN, PUT, RECEIVED, ROS_SENT, ROUTER,
 
 from .families import Histogram
 
-BUCKETS_S = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.5)
+BUCKETS_S = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.02, 0.1)
 
 _NAMES = {
     (ROS_SENT, TAKEN): "ros_to_agent",

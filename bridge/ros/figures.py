@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from bridge.ros.agent import RobotAgent
 
 
+MOST_TOPICS = 12
+"""Rows of figures that have a topic each."""
+
+
 def watched(current: Callable[[], RobotAgent | None]) -> Watched:
     """A robot as who watches it sees it. ``current`` is its agent now, None while it joins the mesh."""
 
@@ -69,4 +73,5 @@ def _figures(robot: RobotAgent) -> Iterator[Family]:
             direction = "out" if status.role == "subscriber" else "in"
             messages.add(status.carried.messages, topic=status.name, direction=direction)
             carried.add(status.carried.bytes, topic=status.name, direction=direction)
-    yield from (nodes, registrants, trips, controlled, calls, goals, messages.bounded(20), carried.bounded(20))
+    yield from (nodes, registrants, trips.bounded(MOST_TOPICS), controlled, calls, goals)
+    yield from (messages.bounded(MOST_TOPICS), carried.bounded(MOST_TOPICS))

@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import re
+import signal
 import sys
 import time
 from collections.abc import AsyncIterator
@@ -280,6 +281,22 @@ async def test_goals_are_given(site: Site, count_action: Any) -> None:
     assert code == 1
     assert "stop" in log.splitlines()[-1]
     await site.peer.session.run(server.destroy)
+
+
+async def test_to_be_stopped_is_the_good_end_of_what_has_none(site: Site) -> None:
+    """Ctrl-C ends `echo` with 0, and what was to show so many messages with 130."""
+    for options, code in (((), 0), (("--count", "1000000"), 130)):
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "bridge", "topic", "echo", "/chatter", "-e", site.endpoint, *options),
+            cwd=ROOT,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.DEVNULL,
+        )
+        assert process.stdout is not None
+        assert await asyncio.wait_for(process.stdout.readline(), 60) == b"data: hello from ROS\n"
+        process.send_signal(signal.SIGINT)
+        await asyncio.wait_for(process.communicate(), 60)
+        assert process.returncode == code
 
 
 async def test_of_several_robots_one_is_named(site: Site) -> None:
