@@ -36,7 +36,7 @@ KEPT = 4096
 """Newest values, of latched topics and of what robots say, that a client gets who comes later."""
 
 
-class Live(ServerListener):
+class Live(ServerListener):  # type: ignore[misc, unused-ignore]  # of a checkout without the SDK
     """One server for one mesh. The SDK calls in threads of its own; all else belongs to the loop."""
 
     def __init__(self, agent: Agent, wanted: Wanted, *, view_only: bool) -> None:
@@ -70,12 +70,12 @@ class Live(ServerListener):
             server_listener=self,
             supported_encodings=[CDR, JSON],
             context=self._context,
-            **tls,  # type: ignore[arg-type]
+            **tls,  # type: ignore[arg-type, unused-ignore]
         )
         self.recorder.start()
         self._agent.on_presence(self._presence)
         self._spawn(self._show_graph())
-        return self._server.port
+        return int(self._server.port)
 
     def close(self) -> None:
         """End."""

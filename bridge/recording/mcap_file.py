@@ -55,7 +55,8 @@ def compressor(name: str) -> Callable[[bytes], bytes]:
     if name == "zstd":
         import zstandard
 
-        return zstandard.ZstdCompressor(level=1).compress
+        small: Callable[[bytes], bytes] = zstandard.ZstdCompressor(level=1).compress
+        return small
     if name == "lz4":
         import lz4.frame  # type: ignore[import-untyped, unused-ignore]
 
@@ -100,7 +101,7 @@ class Index:
         self.start_ns = min((chunk.message_start_time for chunk in self.chunks), default=0)
         self.end_ns = max((chunk.message_end_time for chunk in self.chunks), default=0)
         self.metadata = [each for each in self.metadata if each.offset < last.chunk_start_offset]
-        return last.chunk_start_offset
+        return int(last.chunk_start_offset)
 
     def end(self, at: int) -> bytes:
         """All behind the data, which ends at this offset."""
