@@ -107,7 +107,7 @@ def test_a_program_has_at_most_two_hundred_series() -> None:
     directory = Directory()
     for kind in range(1, 255):
         directory.token(AgentInfo(kind, 1, 0, "z").presence, True, 0.0)
-    topics = [gauge(f"macs_{name}", "of topics") for name in ("a", "b", "c")]
+    topics = [gauge(f"macs_{name}", "of topics") for name in ("first", "second", "third")]
     for family in topics:
         for number in range(500):
             family.add(number, topic=f"/t{number}", direction="out")
