@@ -45,6 +45,7 @@ async def hostile_robot(mesh: Mesh, agent: macs_zenoh.Agent) -> None:
     async def status(call: macs_zenoh.Call) -> bytes:
         stop = {"stopped": True, "by": EVIL, "seconds": 1.0, "times": 1, "history": [EVIL]}
         node = {"role": EVIL, "name": EVIL, "type": EVIL, "registrants": [EVIL], "control": {"holder": EVIL}}
+        node["carried"] = {"messages": 3, "bytes": 4}
         return json.dumps(
             {"ros_node": EVIL, "stopped": True, "stop": stop, "nodes": [node], "drops": {EVIL: 1}}
         ).encode()
@@ -94,6 +95,19 @@ async def test_every_program_filters_what_it_shows(endpoint: str) -> None:
             ("stop", "7", "--json", "-e", endpoint, "--timeout", "1"),
             ("doctor", "-e", endpoint, "--quick"),
             ("doctor", "-e", endpoint, "--quick", "--json"),
+            ("top", "--once", "-e", endpoint),
+            ("top", "--once", "--view", "topics", "-e", endpoint),
+            ("top", "--once", "--view", "lost", "-e", endpoint),
+            ("top", "--json", "-e", endpoint),
+            ("topic", "list", "-v", "-e", endpoint),
+            ("topic", "list", "--json", "-e", endpoint),
+            ("topic", "info", EVIL, "-v", "-e", endpoint),
+            ("topic", "echo", "/chatter", "-e", endpoint),
+            ("topic", "pub", "/chatter", "std_msgs/msg/String", "{}", "-1", "-e", endpoint),
+            ("service", "list", "-t", "-e", endpoint),
+            ("action", "list", "-t", "-e", endpoint),
+            ("trace", "/chatter", "--seconds", "0.5", "-e", endpoint),
+            ("ping", "7", "--count", "1", "-e", endpoint),
             (
                 "headset",
                 f"127.0.0.1:{gateway.port}",
