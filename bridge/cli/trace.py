@@ -27,7 +27,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 from typing import TYPE_CHECKING, Any
 
 from bridge.cli import named, output, terminal
@@ -62,14 +61,18 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError("one robot at a time: --robot 7")
         tracing = traces.Tracing(site, robots[0], args.topic, every=args.every, commands=args.commands)
         await tracing.begin()
-        with contextlib.suppress(asyncio.CancelledError):
+        stopped = False
+        try:
             await tracing.collect(seconds=args.seconds, count=args.count)
+        except asyncio.CancelledError:  # what has come until now is told
+            stopped = True
         found = await tracing.conclude()
+        await tracing.end()
+        if not found and stopped:
+            raise asyncio.CancelledError
         if not found:
-            await tracing.end()
             why = "nobody has sent a command" if args.commands else "no message has come"
             raise Unreachable(f"{args.topic} of robot {robots[0]}", f"{why} that was traced")
-        await tracing.end()
         for traced in found:
             if args.json:
                 named.emit(traced.facts())
