@@ -26,7 +26,7 @@ from bridge.ros.services import ClientNode
 from bridge.ros.side import NamesAndTypes, first_line
 from bridge.ros.stop import StopNode
 from bridge.ros.subscriber import SubscriberNode
-from bridge.ros.topics import PublisherNode
+from bridge.ros.topics import PublisherNode, types_of_others
 from bridge.ros.types import InterfaceName
 from macs_zenoh.deadline import Deadline
 from macs_zenoh.errors import MacsError, Refused
@@ -206,10 +206,28 @@ class InterfaceNodes:
         stop = StopNode(self.robot, topic, self._stopped)
         for node in self._places.all_of(stop.key):  # of headsets that registered what has its name meanwhile
             self._remove(node)
+        await self._make_room_for_stop(stop)
         self._nodes[_work(stop)] = stop
         self._places.bind(stop.key, stop)
         await self._start(stop)
         self.stop = stop
+
+    async def _make_room_for_stop(self, stop: StopNode) -> None:
+        """A topic that headsets take, or took, with another type may be only theirs by now: then they lose it, or
+        there would be no emergency stop as long as they like."""
+        node, topic = self.robot.session.node, stop.topic
+
+        def types() -> set[str]:
+            return types_of_others(
+                node, [*node.get_publishers_info_by_topic(topic), *node.get_subscriptions_info_by_topic(topic)]
+            )
+
+        if await self.robot.session.run(types) - {str(stop.interface)}:
+            return
+        for other in self:
+            if other.INTERFACE == stop.INTERFACE and other.topic == topic and other.interface != stop.interface:
+                self._tell_type(other, {str(stop.interface)})
+                self._remove(other)
 
     def _stopped(self, by: str) -> None:
         # what moves the robot now comes first

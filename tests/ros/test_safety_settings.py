@@ -15,6 +15,8 @@ from bridge.ros.rclpy_side import RclpySide
 from bridge.ros.rules import Rules
 from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
+from macs_zenoh.presses import STOP_NAME
+from macs_zenoh.protocol.messages import AddNode, NodeType, encode_data
 from tests.ros.driven import driving, hear, may_command, site
 from tests.support.programs import ended
 from tests.support.ros_peer import Peer
@@ -64,6 +66,8 @@ async def test_a_robot_without_its_emergency_stop_is_found_and_gets_it(
         assert [finding["severity"] for finding in found] == ["error"], errors
         assert code == 1
         await may_command(driver, 1)
+        takes = AddNode(*driver.key, NodeType.SUBSCRIBER, STOP_NAME, "/emergency_stop", "std_msgs/String")
+        await driver.call("ros", 1, "add_node", encode_data(takes), timeout_s=20)  # it must not keep the other type
         async with driving(driver, 1):
 
             async def refused() -> bool:
