@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
 
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.directory import AgentInfo
@@ -53,21 +53,24 @@ class Roll:
         self._answers[grant.name] = grant.rights, reply
         return reply
 
-    def tell_gone(self, gone: Iterable[AgentInfo]) -> None:
-        """Tell everybody that these have left."""
-        every = list(gone)
-        agents = [GoneAgent(agent.type, agent.id) for agent in every]
-        if not agents:
-            return
+    def telling(self, gone: list[AgentInfo]) -> Callable[[Connection], None]:
+        """What tells one agent that these have left."""
+        agents = [GoneAgent(agent.type, agent.id) for agent in gone]
         message = to_agent(AgentsGone(agents))
-        for connection in self._agents.online():
+
+        def tell(connection: Connection) -> None:
             rights = connection.peer.grant.rights
             if rights is None or connection.key[0] != UNITY:
                 connection.recipient.gone(agents)
                 connection.send_call(message)
-                continue
-            seen = [agent for agent in every if agent.type != ROS or rights.sees(agent.id, agent.group)]
-            if seen:
-                told = [GoneAgent(agent.type, agent.id) for agent in seen]
+                return
+            told = [
+                GoneAgent(agent.type, agent.id)
+                for agent in gone
+                if agent.type != ROS or rights.sees(agent.id, agent.group)
+            ]
+            if told:
                 connection.recipient.gone(told)
                 connection.send_call(to_agent(AgentsGone(told)))
+
+        return tell

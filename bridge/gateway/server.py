@@ -86,6 +86,7 @@ from .agents import Agents, Group
 from .connection import Connection
 from .declarations import AgentDeclarations
 from .delivery import Delivery, Stream
+from .departures import PIECE_S, Departures, Pieces
 from .door import Door, Entrance, entrances
 from .forwarding import Forwarding
 from .judged import JudgedFrames
@@ -149,6 +150,9 @@ class Gateway:
         self._churn = Churn()
         self._coming: dict[Connection, asyncio.TimerHandle] = {}
         """Who is not greeted yet, since many from there have come and gone."""
+        self._greeting: asyncio.Handle | None = None
+        self._leaving = Pieces(self._has_closed)
+        self._departures = Departures(self.agents.online, lambda gone: self._roll.telling(gone))
         self._waiting = WaitingRoom(settings.handshake_timeout_s, self._no_id)
         self._subscriptions: dict[str, Subscription] = {}
         self._door = Door(
@@ -299,6 +303,8 @@ class Gateway:
             for connection in connections:
                 connection.abort()
         await self.listeners.end()
+        self._leaving.finish()
+        self._departures.close()
         self._forwarding.close()
         self._leases.close()
         self._declarations.close()
@@ -346,8 +352,17 @@ class Gateway:
         self._greet_waiting()
 
     def _greet_waiting(self) -> None:
-        """Give waiting connections ids of our blocks that no agent of any type has."""
+        """Give waiting connections ids of our blocks that no agent of any type has, in pieces."""
+        if self._greeting is None:
+            self._greet_some()
+
+    def _greet_some(self) -> None:
+        self._greeting = None
+        until = time.monotonic() + PIECE_S
         while self._waiting:
+            if time.monotonic() > until:
+                self._greeting = asyncio.get_running_loop().call_soon(self._greet_some)
+                return
             agent_id = self._leases.take_id(self._is_not_for_headsets, wanting=len(self._waiting))
             if agent_id is None:
                 if self._leases.exhausted:
@@ -403,7 +418,10 @@ class Gateway:
         self._delivery.forget()
 
     def closed(self, connection: Connection) -> None:
-        """Forget a connection; its presence ends at once."""
+        """Forget a connection; its presence ends at once, or as soon as those have ended that left just before."""
+        self._leaving.put(connection)
+
+    def _has_closed(self, connection: Connection) -> None:
         self._door.leave(connection)
         self._sleepers.left(connection)
         if not connection.asleep:
@@ -755,7 +773,8 @@ class Gateway:
 
     def _tell(self, changes: list[Change]) -> None:
         self._roll.changed()
-        self._roll.tell_gone(change.agent for change in changes if not (change.online or self._is_here(change.agent)))
+        gone = [change.agent for change in changes if not (change.online or self._is_here(change.agent))]
+        self._departures.tell(gone, [change.agent.key for change in changes if change.online])
         for change in changes:
             try:
                 self._robots.presence(change)

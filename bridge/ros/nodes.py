@@ -215,12 +215,10 @@ class InterfaceNodes:
     async def _make_room_for_stop(self, stop: StopNode) -> None:
         """A topic that headsets take, or took, with another type may be only theirs by now: then they lose it, or
         there would be no emergency stop as long as they like."""
-        node, topic = self.robot.session.node, stop.topic
+        side, topic = self.robot.session, stop.topic
 
         def types() -> set[str]:
-            return types_of_others(
-                node, [*node.get_publishers_info_by_topic(topic), *node.get_subscriptions_info_by_topic(topic)]
-            )
+            return types_of_others(side, [*side.publishers(topic), *side.subscriptions(topic)])
 
         if await self.robot.session.run(types) - {str(stop.interface)}:
             return
