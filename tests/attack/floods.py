@@ -462,6 +462,23 @@ def leaving_and_coming(target: Target) -> None:
             agent.close(reset=True)
 
 
+@attack(2, "headset", seen=True)
+def a_thousand_leave_at_once(target: Target) -> None:
+    """1 000 headsets that have registered at the robot end in the same moment, and come again."""
+
+    def make() -> Agent:
+        agent = Agent(target.port, read=False)
+        agent.send(registration("nd__cmd_vel", "/cmd_vel", "geometry_msgs/Twist", node_type=2, me=agent.id))
+        return agent
+
+    while target.running():
+        agents = crowd(target, 1000, make)
+        target.rest(0.5)
+        for agent in agents:
+            agent.close(reset=True)
+        target.rest(0.5)
+
+
 @attack(3, "tcp robot")
 def topic_data_at_full_rate(target: Target) -> None:
     """A TCP robot that streams small messages to every headset at full rate."""

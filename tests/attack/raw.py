@@ -146,6 +146,7 @@ class Agent:
         """End it; ``reset`` with RST."""
         with suppress(OSError):
             if reset:
+                self.socket.shutdown(socket.SHUT_RD)  # who reads holds the socket open; the other side sees nothing
                 self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             self.socket.close()
 

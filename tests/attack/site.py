@@ -66,8 +66,7 @@ class Site:
             return ["--port", "0"]
         ports = ["--port", str(free_port()), f"--{self.attacked_by}-port", str(self._attacked_port)]
         if self.attacked_by == "tls":
-            certificate, key = Authority(directory / "ca").issue("gateway")
-            ports += ["--certificate", str(certificate), "--key", str(key)]
+            ports += certified(directory)
         return ports
 
     @property
@@ -85,6 +84,12 @@ class Site:
         for program in self.programs.values():
             await program.start()
             stack.push_async_callback(_kill, program)
+
+
+def certified(directory: Path) -> list[str]:
+    """Options of a gateway that shows a certificate to headsets."""
+    certificate, key = Authority(directory / "ca").issue("gateway")
+    return ["--certificate", str(certificate), "--key", str(key)]
 
 
 async def _kill(program: Router | Program) -> None:
