@@ -15,14 +15,14 @@ ASKED_FOR_S = 600.0
 
 
 class Questions:
-    """To all headsets of a gateway that drive."""
+    """To all headsets of a gateway that drive for longer than a moment."""
 
     def __init__(self) -> None:
         self._timers: dict[Connection, asyncio.TimerHandle] = {}
 
     def drives(self, connection: Connection) -> None:
         """It has sent a command."""
-        if connection in self._timers or connection.peer.agent_type != UNITY or not connection.pace.drives:
+        if connection in self._timers or connection.peer.agent_type != UNITY or not connection.pace.drives_on:
             return
         self._ask_on(connection)
 

@@ -42,6 +42,8 @@ class Flow:
 
     LENGTH = 5
     """So many commands, each soon after the one before, are a flow: somebody drives."""
+    LONG = 20
+    """So many, and somebody drives for longer."""
     LEAST_S, MOST_S = 0.002, 0.5
     """What comes faster comes together, as programs send it that have several things to say; what comes slower is no
     flow."""
@@ -69,6 +71,11 @@ class Flow:
     def drives(self) -> bool:
         """Whether it is one: not a command now and then."""
         return self._length >= self.LENGTH or self._late_since is not None
+
+    @property
+    def is_long(self) -> bool:
+        """Whether somebody drives for longer, and it pays to ask him (`recency`)."""
+        return self._length >= self.LONG
 
     def has_waited(self, count: int, now: float) -> bool:
         """Whether commands that come at this time may be older than that."""
@@ -170,8 +177,14 @@ class Pace:
 
     @property
     def drives(self) -> bool:
-        """Whether any of its commands are a flow. Then it should be asked, every `Recency.EVERY_S`."""
+        """Whether any of its commands are a flow."""
         return any(flow.drives for flow in self._flows.values())
+
+    @property
+    def drives_on(self) -> bool:
+        """Whether one of these is a long one. Then it should be asked, every `Recency.EVERY_S`: programs that say a
+        few things hear nothing that they did not hear before."""
+        return any(flow.is_long for flow in self._flows.values())
 
     @property
     def in_doubt(self) -> bool:

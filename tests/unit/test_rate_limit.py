@@ -191,6 +191,15 @@ def test_what_waits_longer_than_seconds_has_waited_all_the_same() -> None:
     assert abs(late_s - 60 / 3) < 0.5, "200 a second come, 50 a second are said"
 
 
+def test_who_says_a_few_things_is_not_asked(pace: Pace) -> None:
+    """What existing programs send in a moment brings them no message that they did not get before."""
+    drive(pace, 0.0, 20, 50)
+    assert pace.drives
+    assert not pace.drives_on
+    drive(pace, 0.4, 1, 50)
+    assert pace.drives_on
+
+
 def test_no_more_questions_are_open_than_an_agent_may_leave_unanswered() -> None:
     """What it does not take does not pile up."""
     pace = driving(until=1.0)
