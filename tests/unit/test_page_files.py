@@ -44,7 +44,7 @@ def test_nothing_is_from_elsewhere(path: Path) -> None:
     allowed = re.compile(r"http://www\.w3\.org/2000/svg|ws://127\.0\.0\.1:7080/macs|\$\{scheme\}")
     assert [address for address in addresses if not allowed.match(address)] == []
     assert max(len(line) for line in text.splitlines()) <= 140
-    assert len(text.splitlines()) <= (900 if path.suffix == ".css" else 560)
+    assert len(text.splitlines()) <= (900 if path.suffix == ".css" else 640)
 
 
 def test_what_is_named_is_there() -> None:

@@ -17,7 +17,7 @@
  *
  * Events (CustomEvent, what they bring is in `detail`):
  *
- * | `link`     | the connection is up or lost: {up, id, why} |
+ * | `link`     | the connection is up or lost: {up, id, why, resumed} |
  * | `id`       | the gateway gave another id: {id} |
  * | `presence` | after `follow`, who is online, when that has changed: {robots, headsets} |
  * | `gone`     | who has just left: [{type, id}] |
@@ -39,6 +39,7 @@ import {
   nodeName,
   object,
 } from "./macs-wire.js";
+import { Session } from "./macs-session.js";
 import { ActionClient, CallError, Publisher, Service, ServiceClient, Subscription } from "./macs-nodes.js";
 
 export { BROADCAST, ROS, UNITY, NodeType, WireError, CallError, nodeName, json, object };
@@ -50,8 +51,8 @@ const DEFAULTS = {
   group: 0,
   /** What `macs token create` printed; null: none, or the cookie of a login. */
   token: null,
-  /** Said in the configuration, where a gateway knows sessions; null: nothing is said. */
-  session: null,
+  /** Come back as the same headset when a connection was lost, where the gateway knows sessions. */
+  resume: true,
   handshakeMs: 5000,
   /** So long without other output, a heartbeat is sent. */
   heartbeatMs: 5000,
@@ -67,6 +68,13 @@ const DEFAULTS = {
 const SUBPROTOCOL = "macs.v1";
 /** What one WebSocket message may have. */
 const PIECE_BYTES = 1 << 20;
+/** A gateway that knows no sessions says nothing about one. */
+const RETURN_MS = 3000;
+/** For so long a session is waited for; a gateway keeps it for 30 s unless it is set otherwise. */
+const ASLEEP_MS = 30000;
+const LATER = 1000;
+/** So often a gateway is told how much has come, while something does. */
+const TOLD_MS = 1000;
 /** Reasons for which it makes no sense to come again. */
 const FINAL = new Set(["no_token", "ended"]);
 const REQUEST_IDS = 2 ** 31;
@@ -87,7 +95,10 @@ export class Headset extends EventTarget {
   #heardAt = 0;
   #pulse = { askedAt: 0, open: false };
   #following = "";
+  #followMs = 0;
   #refused = "";
+  #session = null;
+  #greeted = false;
   #connected = false;
 
   /** `url` is that of a gateway's WebSocket, as ws://127.0.0.1:7080/macs. Options: see docs/macs-js.md. */
@@ -95,6 +106,7 @@ export class Headset extends EventTarget {
     super();
     this.url = String(url);
     this.#options = { ...DEFAULTS, ...options };
+    if (this.#options.resume) this.#session = new Session();
     /** The number that others know this headset by; 0 before the first connection. */
     this.id = 0;
     this.#connected = false;
@@ -158,6 +170,11 @@ export class Headset extends EventTarget {
     this.#lost("closed here");
   }
 
+  /** Cut the connection and live on, as when a network is lost: a new one is made. */
+  drop() {
+    this.#lost("it was cut here");
+  }
+
   /** End without a word, as a headset that lost power. */
   abort() {
     this.#closed = true;
@@ -178,7 +195,8 @@ export class Headset extends EventTarget {
   /** Ask who is online every so often, and tell changes as `presence`. 0: no more. */
   follow(everyMs = 1000) {
     this.#clear("follow");
-    if (!everyMs) return;
+    this.#followMs = everyMs;
+    if (!everyMs || !this.#connected) return;
     const look = async () => {
       try {
         const seen = await this.online();
@@ -189,7 +207,7 @@ export class Headset extends EventTarget {
       } catch {
         // it is asked again
       }
-      if (!this.#closed) this.#set("follow", everyMs, look);
+      if (this.#connected && this.#followMs) this.#set("follow", everyMs, look);
     };
     look();
   }
@@ -278,9 +296,11 @@ export class Headset extends EventTarget {
     return this.sendNow(frames);
   }
 
-  /** Send what a reconnection would repeat anyway. */
+  /** Send what a reconnection would repeat anyway; of a session that is asleep, when it goes on. */
   sendIfOnline(one) {
-    this.sendNow(() => [one()]);
+    if (this.sendNow(() => [one()]) || !this.#session?.secret) return;
+    this.#session.later.push(one);
+    if (this.#session.later.length > LATER) this.#session.end(); // all is registered anew
   }
 
   forget(node) {
@@ -294,6 +314,7 @@ export class Headset extends EventTarget {
     const socket = new Socket(this.url, [SUBPROTOCOL]);
     socket.binaryType = "arraybuffer";
     this.#socket = socket;
+    this.#greeted = false;
     this.#decoder = new MessageDecoder(maxMessageBytes);
     socket.onmessage = ({ data }) => this.#read(new Uint8Array(data));
     socket.onclose = ({ reason }) => this.#lost(reason || "the connection was closed");
@@ -304,6 +325,7 @@ export class Headset extends EventTarget {
 
   #read(bytes) {
     this.#heardAt = performance.now();
+    const tooLarge = this.tooLarge;
     let messages;
     try {
       messages = this.#decoder.feed(bytes);
@@ -312,9 +334,11 @@ export class Headset extends EventTarget {
       this.#lost(`what came makes no sense: ${error.message}`);
       return;
     }
+    this.#count(this.tooLarge - tooLarge);
     for (const message of messages) {
       if (this.#socket === null) return; // one of them ended it
       try {
+        if (!Session.isAbout(message) && this.#greeted) this.#count(1);
         if (message instanceof WireError) throw message;
         this.#take(message);
       } catch (error) {
@@ -329,6 +353,8 @@ export class Headset extends EventTarget {
       this.#takeForNode(message); // the node's name counts first: topic data also names a manager
     } else if (message.manager === "AgentConfigurer") {
       this.#takeId(message);
+    } else if (Session.isAbout(message)) {
+      this.#takeSession(message.manager, object(message.data));
     } else if (!message.manager && this.#questions.has(message.requestId)) {
       this.#answered(message);
     } else if (message.manager === "PrunedUnityAgentsInterfaceNodesCleaner" && message.senderType === null) {
@@ -354,27 +380,62 @@ export class Headset extends EventTarget {
   #takeId(message) {
     const { agentId } = object(message.data);
     if (!Number.isInteger(agentId) || agentId < 0 || agentId > 0xffff) throw new WireError(`${agentId} is no id`);
-    this.id = agentId;
     this.#welcome = message.requestId;
-    const first = !this.#connected;
-    this.#connected = true;
-    this.#configure();
-    if (!first) {
+    this.id = agentId;
+    if (this.#connected) {
+      this.#configure();
       this.#tell("id", { id: agentId });
       return;
     }
     this.#clear("handshake");
-    this.#attempt = 0;
-    this.#pulse.open = false;
-    this.#watch();
-    for (const node of this.nodes) node.again();
-    this.#joining?.resolve(agentId);
-    this.#joining = null;
-    this.#tell("link", { up: true, id: agentId, why: "" });
+    this.#configure(this.#greeted ? null : this.#session);
+    this.#greeted = true;
+    if (this.#session?.secret) this.#set("return", RETURN_MS, () => this.#enter({}));
+    else this.#enter({});
   }
 
-  #configure() {
-    const { group, token, session } = this.#options;
+  /** What became of the session: it goes on, or another one has begun. */
+  #takeSession(manager, { session, agentId, received }) {
+    if (this.#session === null) return;
+    if (manager === "SessionResumed") {
+      if (!Number.isInteger(agentId) || !Number.isInteger(received)) throw new WireError("a session without numbers");
+      if (this.#connected) {
+        this.#session.end();
+        this.#lost("a session that comes too late");
+        return;
+      }
+      this.id = agentId;
+      this.#enter({ resumed: true, lost: this.#session.goOn(received) });
+    } else {
+      if (typeof session !== "string") throw new WireError("a session without a secret");
+      if (!this.#connected) this.#enter({}); // it had shown another one
+      this.#session.begin(session);
+    }
+  }
+
+  /** It is online now. */
+  #enter({ resumed = false, lost = 0 }) {
+    this.#clear("return", "asleep");
+    this.#attempt = 0;
+    this.#pulse.open = false;
+    this.#connected = true;
+    const later = this.#session?.later.splice(0) ?? [];
+    if (!resumed) {
+      this.#failOpen("the connection was lost");
+      this.#session?.end();
+    }
+    this.#watch();
+    if (resumed) for (const one of later) this.sendIfOnline(one);
+    if (!resumed || lost) for (const node of this.nodes) node.again();
+    this.#joining?.resolve(this.id);
+    this.#joining = null;
+    if (this.#followMs) this.follow(this.#followMs); // a question from before may never be answered
+    this.#tell("link", { up: true, id: this.id, why: "", resumed });
+  }
+
+  /** The first configuration of a connection says what is known of the session, and is not counted. */
+  #configure(session = null) {
+    const { group, token } = this.#options;
     const management = {
       agentType: UNITY,
       agentId: this.id,
@@ -384,8 +445,8 @@ export class Headset extends EventTarget {
       extensions: EXTENSIONS,
     };
     if (token !== null) management.token = token;
-    if (session !== null) management.session = session;
-    this.#send(frame({ management }));
+    this.#send(frame({ management: { ...management, ...session?.said } }));
+    if (session !== null) session.sent -= 1;
   }
 
   #takeAccess({ kind, reason, requestId }) {
@@ -414,18 +475,20 @@ export class Headset extends EventTarget {
     this.#socket = null;
     socket.onmessage = socket.onclose = null;
     socket.close();
-    this.#clear("handshake", "beat", "silence");
+    this.#clear("handshake", "beat", "silence", "return", "follow");
     const was = this.#connected;
     this.#connected = false;
     this.#following = "";
-    const error = new CallError("offline", why);
-    for (const requestId of [...this.#questions.keys()]) this.#fail(requestId, error);
-    for (const node of this.nodes) node.end(why);
-    this.#joining?.reject(error);
+    // what is open may still be answered where the session goes on; it has times of its own
+    const asleep = !this.#closed && Boolean(this.#session?.secret);
+    if (!asleep) this.#failOpen(why);
+    else if (was) this.#set("asleep", ASLEEP_MS, () => this.#failOpen(why));
+    this.#joining?.reject(new CallError("offline", why));
     this.#joining = null;
     if (was || this.#refused) this.#tell("link", { up: false, id: this.id, why: this.#refused || why });
     if (this.#closed) {
-      this.#clear("follow", "retry");
+      this.#clear("retry", "asleep");
+      this.#session?.end();
     } else {
       const { retryMs } = this.#options;
       const pause = retryMs[Math.min(this.#attempt++, retryMs.length - 1)];
@@ -433,15 +496,25 @@ export class Headset extends EventTarget {
     }
   }
 
+  #failOpen(why) {
+    for (const requestId of [...this.#questions.keys()]) this.#fail(requestId, new CallError("offline", why));
+    for (const node of this.nodes) node.end(why);
+  }
+
+  #count(messages) {
+    if (this.#session?.open) this.#session.received += messages;
+  }
+
   /** Say something when nothing else was said for a while, and notice when nobody says anything any more. */
   #watch() {
     const { heartbeatMs, silenceMs } = this.#options;
     const beat = () => {
       const due = this.#sentAt + heartbeatMs - performance.now();
-      if (due <= 0) this.#send(frame({ management: { messageManager: "HeartbeatHandler" } }));
-      this.#set("beat", due <= 0 ? heartbeatMs : due, beat);
+      const untold = this.#session?.open && this.#session.received > this.#session.told;
+      if (due <= 0 || untold) this.#beat();
+      this.#set("beat", Math.min(due <= 0 ? heartbeatMs : due, this.#session?.open ? TOLD_MS : heartbeatMs), beat);
     };
-    beat();
+    this.#set("beat", TOLD_MS, beat);
     if (!silenceMs) return;
     const listen = () => {
       const silent = performance.now() - this.#heardAt;
@@ -452,7 +525,15 @@ export class Headset extends EventTarget {
     this.#set("silence", silenceMs / 4, listen);
   }
 
+  /** So many messages have come: the gateway keeps those behind them, for a session that goes on. */
+  #beat() {
+    const management = { messageManager: "HeartbeatHandler" };
+    if (this.#session?.open) this.#session.told = management.received = this.#session.received;
+    this.#send(frame({ management }));
+  }
+
   #send(bytes) {
+    if (this.#session) this.#session.sent += 1;
     for (let at = 0; at < bytes.length; at += PIECE_BYTES) this.#socket.send(bytes.subarray(at, at + PIECE_BYTES));
     this.#sentAt = performance.now();
   }
