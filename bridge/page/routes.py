@@ -13,6 +13,7 @@ from aiohttp import web
 from bridge.gateway.site import Site
 from macs_zenoh.errors import MacsError
 from macs_zenoh.protocol.credit import Credit
+from macs_zenoh.protocol.limits import NAME_BYTES
 from macs_zenoh.protocol.rights import RIGHTS, Grant
 from macs_zenoh.versions import installed
 
@@ -21,6 +22,7 @@ from .definitions import Definitions
 from .files import File
 from .mesh import Picture
 from .robots import Robots, may_see, problem_of
+from .traces import Traces
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
@@ -45,6 +47,7 @@ class Page:
         self._robots = Robots(gateway.mesh)
         self._picture = Picture(gateway.mesh, gateway.directory, self._robots)
         self._definitions = Definitions(self._robots)
+        self._traces = Traces(gateway.mesh, gateway.directory)
         self._drawn: dict[str, tuple[float, bytes]] = {}
         """By token, when the picture of the mesh was made, and what it was: of a large mesh it takes milliseconds."""
         self._credit = Credit(BYTES_PER_S, time.monotonic())
@@ -53,6 +56,7 @@ class Page:
         """Ask nobody any more."""
         self._picture.close()
         self._robots.close()
+        self._traces.close()
 
     def add_to(self, site: Site) -> None:
         """Say what is where."""
@@ -66,6 +70,7 @@ class Page:
         site.get_for_all("/view/me", self._me)
         site.get("/view/mesh", self._mesh)
         site.get(r"/view/robots/{robot:\d{1,5}}/{what:status|offers}", self._robot)
+        site.get(r"/view/trace/{robot:\d{1,5}}", self._trace)
         site.get(r"/types/{robot:\d{1,5}}/{package}/{kind:msg|srv|action}/{name}", self._type)
 
     async def _file(self, file: File, request: web.Request) -> web.StreamResponse:
@@ -121,6 +126,15 @@ class Page:
             return _json(await asking(robot))
         except MacsError as error:
             return _json({"error": problem_of(error)})  # the question was right: it is the robot that does not answer
+
+    async def _trace(self, request: web.Request, visitor: Grant) -> web.StreamResponse:
+        robot, topic = int(request.match_info["robot"]), request.query.get("topic", "")[:NAME_BYTES]
+        if not may_see(visitor, robot):
+            return _json({"error": "this token does not give the right to see this robot"})
+        try:
+            return _json({"ways": await self._traces.of(robot, topic)})
+        except MacsError as error:
+            return _json({"error": problem_of(error)})
 
     async def _type(self, request: web.Request, visitor: Grant) -> web.StreamResponse:
         said = request.match_info

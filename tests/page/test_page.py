@@ -284,6 +284,29 @@ async def test_a_service_is_called_with_a_form(site: Site) -> None:
     await until(lambda: changed(page, before))
 
 
+async def test_it_shows_where_the_time_goes(site: Site) -> None:
+    """The hops of the pose from the ROS node to the gateway's socket add up to the whole, and are shown as bars."""
+    page = await site.open("#latency")
+    await page.page.wait_for_selector("#hops tbody tr", timeout=60_000)
+    names = await page.page.locator("#hops tbody tr td:first-child").all_inner_texts()
+    assert any("router" in name for name in names), names
+    assert len(names) >= 4
+    assert "end to end" in await text(page, "#trace-state")
+
+    async def drawn() -> bool:
+        return int(await page.value(BARS)) > 3
+
+    await until(drawn)
+
+
+BARS = """(() => {
+  const canvas = document.querySelector('.bars');
+  const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  return new Set(new Uint32Array(data.buffer)).size;
+})()"""
+"""How many colours they have."""
+
+
 async def test_it_survives_its_gateway_and_its_router(site: Site) -> None:
     """Killed and started again: without a reload the page shows the robot's pictures again, and drives it."""
     page = await site.with_robot()
@@ -367,9 +390,9 @@ async def test_it_can_be_used_by_everybody(site: Site) -> None:
         for width, height in SIZES:
             page = await site.with_robot(viewport={"width": width, "height": height}, color_scheme=scheme)
             await page.value(AXE.read_text(encoding="utf-8"))
-            for view in ("robot", "mesh"):
+            for view, shown in (("robot", CAMERA), ("mesh", "#mesh svg.mesh g.robot"), ("latency", "#hops tbody tr")):
                 await page.value(f"location.hash = '{view}'")
-                await page.page.wait_for_selector("#mesh svg.mesh g.robot" if view == "mesh" else CAMERA)
+                await page.page.wait_for_selector(shown)
                 assert await page.page.locator("#stop").is_visible()
                 await page.page.screenshot(path=SCREENSHOTS / f"{view}-{width}-{scheme}.png")
                 assert await page.value("document.documentElement.scrollWidth <= innerWidth"), f"{view} {width}"

@@ -3,6 +3,7 @@
 import { Headset } from "../macs.js";
 import { Types } from "../ros.js";
 import { digits, h, say, show } from "./dom.js";
+import { LatencyView } from "./latency-view.js";
 import { MeshView } from "./mesh-view.js";
 import { RobotView } from "./robot-view.js";
 import { Stop } from "./stop.js";
@@ -28,6 +29,7 @@ class Page {
     this.online = { robots: [], headsets: [] };
     this.robotView = new RobotView(this);
     this.meshView = new MeshView(this);
+    this.latencyView = new LatencyView(this);
     this.#build();
     this.#listen();
   }
@@ -69,6 +71,7 @@ class Page {
     this.tabs = [
       ["robot", "Robot", this.robotView],
       ["mesh", "Mesh", this.meshView],
+      ["latency", "Latency", this.latencyView],
     ].map(([name, title, view]) => {
       const tab = h("a", { href: `#${name}`, class: "tab" }, title);
       return { name, view, tab };
@@ -143,6 +146,7 @@ class Page {
     const mine = this.me.robots === "any" ? now.robots : now.robots.filter((id) => this.me.robots.includes(id));
     this.stop.setRobots(mine);
     this.robotView.setRobots(mine);
+    this.latencyView.setRobots(mine);
   }
 
   #tick() {
