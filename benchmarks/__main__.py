@@ -31,6 +31,7 @@ WITHOUT_ROS = {**cases.CASES, **differing.CASES, **scale.CASES, **crowd.CASES, *
 CASES = {**WITHOUT_ROS, **WITH_ROS}
 ONLY_ASKED_FOR = ("mixed", "peers")
 """What takes ten minutes, or programs that the user starts."""
+ROUNDS = 5
 BEGIN, END = "<!-- figures: {} -->", "<!-- end of figures -->"
 """Around the table of a page."""
 
@@ -70,7 +71,7 @@ def main() -> int:
     }
     print(json.dumps(report, indent=1) if args.json else _text(report, figures, profiled=bool(args.profile)))
     if args.into is not None:
-        _write_into(args.into, " ".join(args.cases), report, figures)
+        _write_into(args.into, args, report, figures)
     return 1 if failed or plan.lost else 0
 
 
@@ -80,7 +81,7 @@ def _arguments() -> argparse.Namespace:
     what = what.replace("%", "%%")  # argparse would fill something in
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"what to measure (default: all). {what}")
     parser.add_argument("--quick", action="store_true", help="3 rounds with a quarter of the messages or the time")
-    parser.add_argument("--rounds", type=int, default=5, metavar="N", help="rounds of each case (default: 5)")
+    parser.add_argument("--rounds", type=int, default=ROUNDS, metavar="N", help="rounds of each case (default: 5)")
     parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
     parser.add_argument(
         "--into", type=Path, metavar="PAGE", help="write the table into a page, where these cases were"
@@ -119,10 +120,13 @@ def _possible() -> list[str]:
     return [name for name in WITHOUT_ROS if name not in ONLY_ASKED_FOR]
 
 
-def _write_into(page: Path, names: str, report: dict[str, Any], figures: list[Figure]) -> None:
-    """Write a table between the marks of these cases, or behind everything."""
+def _write_into(page: Path, args: argparse.Namespace, report: dict[str, Any], figures: list[Figure]) -> None:
+    """Write a table between the marks of these cases, or behind everything. It says how much was measured."""
+    names = " ".join(args.cases)
     text, begin = page.read_text(), BEGIN.format(names)
-    lines = [begin, f"{date.today()}, {_machine(report)}", "", f"`python -m benchmarks {names}`: {_losses(report)}"]
+    how = " --quick" if args.quick else f" --rounds {args.rounds}" if args.rounds != ROUNDS else ""
+    said = f"`python -m benchmarks{how} {names}`: {_losses(report)}"
+    lines = [begin, f"{date.today()}, {_machine(report)}", "", said]
     table = "\n".join([*lines, "", markdown(figures), END])
     before, found, after = text.partition(begin)
     after = after.partition(END)[2] if found else ""
