@@ -56,6 +56,8 @@ IMAGES = [
 IGNORES = [path for path in FILES if path.suffix == ".dockerignore"]
 KERNEL = [path for path in FILES if path.suffix == ".conf" and path.parent.name == "wan"]
 CORES = [CONFIG / "tmpfiles.d" / "macs-cpu-latency.conf", CONFIG / "tuned" / "macs" / "tuned.conf"]
+FIGURES = [path for path in FILES if path.parent.name in ("grafana", "prometheus")]
+"""In tests/unit/test_metrics.py."""
 LAYOUTS = [CONFIG / "foxglove-demo.json"]
 """In tests/ros/test_foxglove.py."""
 LAUNCH = [CONFIG / "robot.launch.py"]
@@ -75,7 +77,20 @@ def ids(path: Path) -> str:
 
 def test_every_file_is_tested() -> None:
     """Each shipped file is of a kind that a test here loads."""
-    known = [*ROUTERS, *SETTINGS, *PLANS, *COMPOSED, *UNITS, *IMAGES, *IGNORES, *KERNEL, *CORES, *LAUNCH, *LAYOUTS]
+    known = [
+        *ROUTERS,
+        *SETTINGS,
+        *PLANS,
+        *COMPOSED,
+        *UNITS,
+        *IMAGES,
+        *IGNORES,
+        *KERNEL,
+        *CORES,
+        *LAUNCH,
+        *LAYOUTS,
+        *FIGURES,
+    ]
     assert sorted(known) == FILES
 
 
