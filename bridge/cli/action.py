@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 
 from bridge.cli import named, output
 from bridge.cli.topic import EVERY_ROBOT, ONE_ROBOT, _is_type
+from macs_zenoh.plain import plain
 
 if TYPE_CHECKING:
     from bridge.graph.site import Looking, Site
@@ -74,7 +75,7 @@ def _list(args: argparse.Namespace) -> int:
         if args.json:
             output.say(json.dumps([action.facts("action") for action in found]))
         for action in () if args.json else found:
-            output.say(f"{action.name} [{action.type}]" if args.show_types else action.name)
+            output.say(plain(f"{action.name} [{action.type}]" if args.show_types else action.name))
         return 0
 
     return named.looking(args, work)

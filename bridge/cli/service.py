@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 
 from bridge.cli import named, output
 from bridge.cli.topic import EVERY_ROBOT, ONE_ROBOT, _is_type
+from macs_zenoh.plain import plain
 
 if TYPE_CHECKING:
     from bridge.graph.site import Looking, Site
@@ -72,7 +73,7 @@ def _list(args: argparse.Namespace) -> int:
         if args.json:
             output.say(json.dumps([service.facts("service") for service in found]))
         for service in () if args.json else found:
-            output.say(f"{service.name} [{service.type}]" if args.show_types else service.name)
+            output.say(plain(f"{service.name} [{service.type}]" if args.show_types else service.name))
         return 0
 
     return named.looking(args, work)

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 from bridge.cli import named, output
 from macs_zenoh.errors import Unreachable
+from macs_zenoh.plain import plain
 
 if TYPE_CHECKING:
     from bridge.graph.echo import End
@@ -199,11 +200,11 @@ def _list(args: argparse.Namespace) -> int:
                 output.say(f"{heading} topics:")
                 for topic in topics:
                     if robots := getattr(topic, end):
-                        output.say(f" * {topic.name} [{topic.type}] {named_robots(robots)}")
+                        output.say(plain(f" * {topic.name} [{topic.type}] {named_robots(robots)}"))
                 output.say("")
         else:
             for topic in topics:
-                output.say(f"{topic.name} [{topic.type}]" if args.show_types else topic.name)
+                output.say(plain(f"{topic.name} [{topic.type}]" if args.show_types else topic.name))
         return 0
 
     return named.looking(args, work)
@@ -223,7 +224,7 @@ def _info(args: argparse.Namespace) -> int:
         if args.json:
             named.emit(about)
         else:
-            output.say("\n".join(lists.shown_topic(about, verbose=args.details)))
+            output.say("\n".join(map(plain, lists.shown_topic(about, verbose=args.details))))
         return 0
 
     return named.looking(args, work)

@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 from bridge.cli import named, output, terminal
 from macs_zenoh.errors import Unreachable, UsageError
+from macs_zenoh.plain import plain
 
 if TYPE_CHECKING:
     from bridge.graph.site import Site
@@ -92,4 +93,4 @@ def _show(traced: Traced) -> None:
         f"{traced.title}: {traced.count} messages, {traced.at_once} at once",
         terminal.Columns(rows, headings=["HOP", "MEAN", "P50", "P99"], right={1, 2, 3}),
     )
-    output.say(f"clocks: {traced.clocks_text}\n")
+    output.say(plain(f"clocks: {traced.clocks_text}") + "\n")

@@ -26,6 +26,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from bridge.cli import named, options, output, robots, running
+from macs_zenoh.plain import plain
 from macs_zenoh.timeouts import within
 
 if TYPE_CHECKING:
@@ -104,4 +105,4 @@ def _only(text: str) -> frozenset[str]:
 
 def _line(event: Event) -> str:
     at = time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(event.at_s))
-    return f"{at} {event.what:10}{event.text}"
+    return plain(f"{at} {event.what:10}{event.text}")
