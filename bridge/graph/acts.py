@@ -20,6 +20,7 @@ from bridge.headset.frames import NodeSpec
 from bridge.headset.nodes import Incoming
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError, Refused, Unreachable
+from macs_zenoh.plain import plain
 from macs_zenoh.protocol.messages import ROS, ActionVerb, Metadata, NodeType
 from macs_zenoh.protocol.offers import absolute, closest, short_type
 from macs_zenoh.protocol.reading import Message
@@ -187,7 +188,8 @@ async def call_service(
             emit(line)
         else:
             head = f"response of robot {robot}:" if len(robots) > 1 else "response:"
-            say(f"{head}\n{line.get('problem') or as_yaml(line['response'])}\n")
+            said = plain(line["problem"]) if "problem" in line else as_yaml(line["response"])
+            say(f"{head}\n{said}\n")
     return code
 
 
