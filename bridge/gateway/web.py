@@ -399,6 +399,8 @@ class WebSocketTransport(asyncio.Transport):
         """None when it has ended: two that know each other are kept until Python looks for circles."""
         self._socket = socket
         self._below = below
+        self._encrypts = bool(below.get_extra_info("sslcontext"))
+        """Then each piece would be encrypted for itself."""
         self._closing: asyncio.Task[bool] | None = None
         self._may_read = asyncio.Event()
         self._may_read.set()
@@ -500,7 +502,8 @@ class WebSocketTransport(asyncio.Transport):
     def writelines(self, list_of_data: Any) -> None:
         """Whole WebSocket messages. aiohttp writes its own, which are pongs and the last one, whole as well."""
         if not self.is_closing():
-            self._below.writelines(list(_messages(list_of_data)))
+            pieces = list(_messages(list_of_data))
+            self._below.writelines([b"".join(pieces)] if self._encrypts else pieces)
 
     def get_write_buffer_size(self) -> int:
         return self._below.get_write_buffer_size()

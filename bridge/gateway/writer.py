@@ -46,6 +46,8 @@ class Writer:
         self._gathered_bytes = 0
         self._direct: DirectWriter | None = None
         self._wants_direct = False
+        self._joins = False
+        """Whether what is written together is one piece: TLS encrypts each piece for itself."""
         self._lock = threading.RLock()
         """Held by whoever writes, the loop or a thread of Zenoh's, as long as older messages are on their way."""
         self._rest = b""
@@ -54,6 +56,7 @@ class Writer:
     def attach(self, transport: asyncio.Transport) -> None:
         """The connection is there."""
         self._transport = transport
+        self._joins = bool(transport.get_extra_info("sslcontext"))
         transport.set_write_buffer_limits(high=BUFFER_BYTES)
 
     def detach(self) -> None:
@@ -175,7 +178,7 @@ class Writer:
                 chunks = [rest, *chunks]
             if chunks and not self._transport.is_closing():
                 self.written_bytes += sum(map(len, chunks))
-                self._transport.writelines(chunks)
+                self._transport.writelines([b"".join(chunks)] if self._joins and len(chunks) > 1 else chunks)
 
     def pause(self) -> None:
         """The transport takes nothing more."""
