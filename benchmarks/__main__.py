@@ -20,14 +20,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from . import awareness, cases, crowd, differing, peers, ports, robot_speed, scale
+from . import awareness, cases, crowd, differing, door, peers, ports, robot_speed, scale
 from .figures import Figure, markdown, table
 from .peer_ends import KINDS
 from .plan import Plan
 from .processes import ProgramFailed, Stage
 
 WITH_ROS = {**robot_speed.CASES, **awareness.CASES, **peers.CASES}
-WITHOUT_ROS = {**cases.CASES, **differing.CASES, **scale.CASES, **crowd.CASES, **ports.CASES}
+WITHOUT_ROS = {**cases.CASES, **differing.CASES, **scale.CASES, **crowd.CASES, **ports.CASES, **door.CASES}
 CASES = {**WITHOUT_ROS, **WITH_ROS}
 ONLY_ASKED_FOR = ("mixed", "peers")
 """What takes ten minutes, or programs that the user starts."""

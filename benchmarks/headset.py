@@ -59,7 +59,16 @@ class Headset:
         self._next_beat = time.monotonic() + BEAT_S
 
     @classmethod
-    def join(cls, port: int, group: int, *, robot: bool = False, way: str = "plain", authority: str = "") -> Headset:
+    def join(
+        cls,
+        port: int,
+        group: int,
+        *,
+        robot: bool = False,
+        way: str = "plain",
+        authority: str = "",
+        token: str | None = None,
+    ) -> Headset:
         """Connect and configure: a gateway counts this headset, or robot program, from now on."""
         sock = ways.connect(port, way, authority)
         decoder = MessageDecoder()
@@ -69,7 +78,9 @@ class Headset:
         agent_id = int(json.loads(bytes(data))["agentId"])
         number = json.loads(metadata)["requestId"]
         told = encode_management(Configuration(ROS, agent_id, group, number, Functionality()))
-        sock.sendall(encode_frame(management=told) if robot else frames.configuration(agent_id, group, number))
+        sock.sendall(
+            encode_frame(management=told) if robot else frames.configuration(agent_id, group, number, 0, token)
+        )
         return cls(sock, agent_id)
 
     def beat(self) -> None:
@@ -324,7 +335,8 @@ def main() -> None:
     port, count, group = map(int, sys.argv[1:4])
     robot = sys.argv[4:] == ["robot"]
     way, authority = sys.argv[4:6] if len(sys.argv) > 5 else ("plain", "")
-    joined = [Headset.join(port, group, robot=robot, way=way, authority=authority) for _ in range(count)]
+    token = sys.argv[6] if len(sys.argv) > 6 else None
+    joined = [Headset.join(port, group, robot=robot, way=way, authority=authority, token=token) for _ in range(count)]
     workers = Headsets(joined)
     names: tuple[str, ...] = ("send", "message_bytes", "register", "check", "receive", "ping", "echo")
     names = (*names, "prepare", "prepare_topic", "send_prepared", "receive_sequence")

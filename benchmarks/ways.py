@@ -59,6 +59,7 @@ class WebSocket(_Like):
 
     def __init__(self, sock: socket.socket, port: int) -> None:
         super().__init__(sock)
+        self.raw = sock
         self._left = 0
         """Of the message that has begun."""
         lines = [
