@@ -225,6 +225,11 @@ class Headset:
         return list(self._nodes.values())
 
     @property
+    def waiting(self) -> int:
+        """How many messages outside nodes nobody has taken yet."""
+        return len(self._inbox)
+
+    @property
     def dropped(self) -> int:
         """How many messages outside nodes were dropped because nobody took them."""
         return self._inbox.dropped

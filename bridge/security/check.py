@@ -20,6 +20,7 @@ from pathlib import Path
 
 from bridge.security import access, certificates
 from bridge.security.attempts import Result
+from bridge.security.headsets import try_headsets
 from bridge.security.policy import Policy
 from bridge.security.router_path import Progress, RouterPath, settings_of
 from macs_zenoh.config import MeshSettings
@@ -60,7 +61,7 @@ async def check(
             for one in policy.routers
             for other in access.linked(policy, one)
         ]
-    results: list[Result] = []
+    results: list[Result] = await try_headsets(policy, directory, timeout_s)
     for number, (label, near, far) in enumerate(paths):
         path = RouterPath(policy, directory, label, near, far, timeout_s)
 

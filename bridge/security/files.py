@@ -338,7 +338,7 @@ def settings_toml(policy: Policy, client: Client, directory: str) -> str:
         *(f"  {_toml(override)}," for override in client_overrides(directory)),
         "]",
     ]
-    lines += _sections(policy, client)
+    lines += _sections(policy, client, directory)
     for rule in policy.traffic:
         lines += ["", "[[traffic]]"]
         given = msgspec.structs.asdict(rule)
@@ -359,9 +359,10 @@ def _command(client: Client, directory: str) -> str:
     return f"macs {verb} --settings {directory}/macs.toml"
 
 
-def _sections(policy: Policy, client: Client) -> list[str]:
+def _sections(policy: Policy, client: Client, directory: str) -> list[str]:
     if isinstance(client, Gateway):
-        return _gateway_section(client)
+        tokens = f"{directory}/tokens.json" if policy.headsets else None
+        return _gateway_section(client, tokens)
     if isinstance(client, Operator) and client.id is not None:
         return [
             "",
@@ -388,8 +389,11 @@ def _sections(policy: Policy, client: Client) -> list[str]:
     return lines
 
 
-def _gateway_section(gateway: Gateway) -> list[str]:
+def _gateway_section(gateway: Gateway, tokens: str | None) -> list[str]:
     lines = []
+    if tokens is not None:
+        lines += ["# what the policy's headsets may; it is followed while the gateway runs"]
+        lines += [f"tokens_file = {json.dumps(tokens)}"]
     if gateway.blocks:
         lines += ["# the certificate is good for these only", f"blocks = {json.dumps(gateway.blocks)}"]
     if gateway.groups:

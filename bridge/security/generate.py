@@ -8,7 +8,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bridge.security import certificates, files
+from bridge.security import certificates, files, headsets
 from bridge.security.certificates import (
     AUTHORITY,
     CA_DIRECTORY,
@@ -69,8 +69,10 @@ def generate(
     be written.
     """
     names = [node.name for node in policy.nodes]
+    for headset in policy.headsets:
+        headsets.rights_of(policy, headset)
     for name in renew:
-        if name not in (*names, ALL):
+        if name not in (*names, *(headset.name for headset in policy.headsets), ALL):
             raise UsageError(f"there is no {name!r} in the policy to renew")
     try:
         into.mkdir(mode=PRIVATE_DIRECTORY, parents=True, exist_ok=True)
@@ -91,6 +93,13 @@ def generate(
             _write(directory / ROUTER_FILE, files.router_json5(policy, node, there), report)
         else:
             _write(directory / SETTINGS_FILE, files.settings_toml(policy, node, there), report)
+    known = {}
+    for headset in policy.headsets:
+        anew = headset.name in renew or ALL in renew
+        known[headset.name] = headsets.secret_of(into / headset.name, renew=anew)
+    for gateway in policy.gateways if policy.headsets else ():
+        content = headsets.tokens_of(policy, gateway, into, now, known=known)
+        _write(into / gateway.name / headsets.TOKENS_FILE, content.decode(), report)
     report.orphaned.extend(_orphaned(into, names))
     return report
 

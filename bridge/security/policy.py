@@ -32,6 +32,8 @@ from bridge.settings import GatewaySettings
 from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.errors import ConfigError, MissingExtra
 from macs_zenoh.protocol import endpoints
+from macs_zenoh.protocol.name_patterns import NamePattern
+from macs_zenoh.protocol.rights import Right as HeadsetRight
 from macs_zenoh.sections import AgentId, AgentName, GroupId, read, read_text
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=63)]
@@ -110,6 +112,8 @@ class Gateway(_Client, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The blocks of 256 ids that it gives out, so that its certificate is good for these ids only. Empty: any."""
     groups: dict[str, list[str]] = {}
     """Groups that robots believe of its headsets, for rights, and the networks whose headsets may choose them."""
+    ports: list[Annotated[str, Meta(pattern=r"^(tcp|tls|ws|wss)/.+:[0-9]{1,5}\Z")]] = []
+    """Where headsets reach it, as in tls/10.0.0.5:7001: there `check` tries their tokens."""
 
 
 class Operator(_Client, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -118,6 +122,23 @@ class Operator(_Client, frozen=True, kw_only=True, forbid_unknown_fields=True):
     id: AgentId | None = None
     """With an id it is ``operator/5`` and nobody else, and its settings say so. Unset: ``operator/0``, who is nobody
     in particular, and whom nobody can write to."""
+
+
+class Headset(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Who comes to gateways with a token: what it may there. What routers let those gateways do holds besides."""
+
+    name: Name
+    gateways: list[str] = []
+    """Which. Empty: all."""
+    may: list[HeadsetRight] = []
+    robots: list[str] | Literal["any"] = []
+    """By their names."""
+    groups: list[Annotated[int, Meta(ge=1, le=0xFF)]] | Literal["any"] = []
+    topics: list[NamePattern] = []
+    """Patterns of topics, services and actions. Empty: every one."""
+    frames_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0
+    days: Annotated[int, Meta(ge=1, le=3650)] | None = None
+    """How long a token holds; `generate` gives it as long again when less than a third is left. Unset: for ever."""
 
 
 class Permission(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -159,6 +180,7 @@ class Policy(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True):
     robots: list[Robot] = []
     gateways: list[Gateway] = []
     operators: list[Operator] = []
+    headsets: list[Headset] = []
     permissions: list[Permission] = []
     traffic: list[TrafficRule] = []
     """As in a settings file: each program and each router applies them."""
@@ -332,6 +354,7 @@ def _check(policy: Policy) -> None:
         except ConfigError as error:
             field = error.path.rpartition("gateway.")[2]
             raise ConfigError(f"gateways: {gateway.name}.{field}", error.problem) from None
+    _check_headsets(policy)
     for number, permission in enumerate(policy.permissions):
         _check_permission(f"permissions[{number}]", permission, policy)
     for field in ELSEWHERE:
@@ -355,6 +378,18 @@ def _check_router(router: Router, policy: Policy) -> None:
         if "/" in address or not (_is_ip(address) or re.fullmatch(r"[A-Za-z0-9.-]+", address)):
             raise ConfigError(f"{where}.addresses", f"{address!r} is no host name or IP address")
     _known(f"{where}.links", router.links, [other.name for other in policy.routers if other is not router])
+
+
+def _check_headsets(policy: Policy) -> None:
+    taken = {node.name.lower() for node in policy.nodes} | RESERVED
+    _once("name", ((f"headsets: {headset.name}", headset.name.lower()) for headset in policy.headsets))
+    for headset in policy.headsets:
+        where = f"headsets: {headset.name}"
+        if headset.name.lower() in taken:
+            raise ConfigError(where, "is the name of a node, or a word of the policy; choose another")
+        _known(f"{where}.gateways", headset.gateways, [gateway.name for gateway in policy.gateways])
+        if not isinstance(headset.robots, str):
+            _known(f"{where}.robots", headset.robots, [robot.name for robot in policy.robots])
 
 
 def _check_permission(where: str, permission: Permission, policy: Policy) -> None:
