@@ -23,7 +23,7 @@ from tests.support.waiting import PATIENCE_S, until
 
 async def test_a_generated_router_holds_everybody_to_the_plan(site: Site) -> None:
     """Tried with every certificate on the real router: everything is as expected, permitted and forbidden alike."""
-    results = await check(site.policy, site.directory, timeout_s=PATIENCE_S)
+    results = await check(site.policy, site.directory)
     assert [result for result in results if not result.as_expected] == []
     for word in ("heard by", "is online", "calls", "delivers to"):
         assert {result.permitted for result in results if word in result.what} == {True, False}, word
@@ -41,7 +41,7 @@ async def test_across_two_routers(tmp_path: Path) -> None:
     found = made(tmp_path / "pki", routers=2)
     async with Router(found.file("site")), Router(found.file("cloud")):
         await linked(found)
-        results = await check(found.policy, found.directory, timeout_s=PATIENCE_S)
+        results = await check(found.policy, found.directory)
     assert {result.router for result in results} == {"site", "cloud", "site to cloud", "cloud to site"}
     assert [result for result in results if not result.as_expected] == []
 
@@ -117,7 +117,7 @@ async def test_the_check_finds_rules_that_are_missing(tmp_path: Path) -> None:
         text = text[:policy] + text[policy:].replace(f'"{rule}", ', "", 1).replace(f'"{rule}",', "", 1)
     found.file().write_text(text)
     async with Router(found.file()):
-        wrong = [one.what for one in await found.wrong(timeout_s=5.0) if one.permitted and not one.seen]
+        wrong = [one.what for one in await found.wrong() if one.permitted and not one.seen]
     overlooked = [rule for rule, found_as in MISSING.items() if not any(what.startswith(found_as) for what in wrong)]
     assert overlooked == [], wrong
 
