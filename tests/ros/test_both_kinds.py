@@ -11,6 +11,7 @@ from std_msgs.msg import String
 
 from bridge.headset.client import Headset
 from macs_zenoh import ros
+from macs_zenoh.protocol.rmw_zenoh.cdr import read_text
 from tests.support.programs import Program
 from tests.support.ros_peer import Peer
 from tests.support.routers import Router
@@ -29,7 +30,7 @@ async def test_one_registration_for_robots_of_both_kinds(domain: int) -> None:
         gateway = await enter(Program("gateway", "--port", "0", "-e", router.endpoint))
         arguments = ("--group", "3", "-e", router.endpoint)
         await enter(Program("agent", "--id", "1", *arguments, env={"ROS_DOMAIN_ID": str(domain)}))
-        other = AsyncExitStack()
+        other = await enter(AsyncExitStack())
         await other.enter_async_context(Program("rmw-zenoh", "--id", "7", *arguments))
         talker = await enter(ros.node("talker", connect=[router.endpoint]))
         zenoh_says = talker.publisher("/chatter", "std_msgs/String")
@@ -43,7 +44,7 @@ async def test_one_registration_for_robots_of_both_kinds(domain: int) -> None:
 
         async def listen() -> None:
             async for message in messages:
-                heard[message.sender_id, bytes(message.data[8:-1]).decode()] += 1
+                heard[message.sender_id, read_text(bytes(message.data)).decode()] += 1  # ROS pads
 
         listening = asyncio.create_task(listen())
         stack.callback(listening.cancel)
