@@ -68,7 +68,8 @@ async def reaches(nodes: InterfaceNodes, topic: str) -> None:
     subscriptions, whatever these know."""
     node = nodes.on_topic(NodeType.PUBLISHER, topic)
     assert isinstance(node, PublisherNode)
-    await until(lambda: node._publisher.get_subscription_count())
+    made = node._publisher._made  # type: ignore[union-attr]
+    await until(made.get_subscription_count)
 
 
 async def known(robot: RosSession, *services: str) -> None:
