@@ -9,10 +9,17 @@ from collections.abc import Callable
 from macs_zenoh.errors import MacsError
 
 from ..checks import Check, Level, NotHeld, NotTried, Verdict, Verdicts
-from . import bad_input, joining, leaving, robots, routing
+from . import bad_input, joining, leaving, robots, routing, sessions
 from .scene import Scene, Trial
 
-TRIALS: tuple[Trial, ...] = (*joining.TRIALS, *routing.TRIALS, *robots.TRIALS, *leaving.TRIALS, *bad_input.TRIALS)
+TRIALS: tuple[Trial, ...] = (
+    *joining.TRIALS,
+    *routing.TRIALS,
+    *robots.TRIALS,
+    *leaving.TRIALS,
+    *sessions.TRIALS,
+    *bad_input.TRIALS,
+)
 
 CHECKS: tuple[Check, ...] = tuple(trial.check for trial in TRIALS)
 
