@@ -511,9 +511,9 @@ class Connection(asyncio.BufferedProtocol):
         self._unfinished = self._unread = 0
         self._account()
 
-    def wake(self, newcomer: Connection, received: int) -> None:
-        """The agent is there again, as a newcomer who has ``received`` so much: its socket and its state machine are
-        this one's from now on."""
+    def wake(self, newcomer: Connection, received: int, heard: int) -> None:
+        """The agent is there again, as a newcomer who has ``received`` so much and was ``heard`` so far: what is the
+        newcomer's, socket and state machine, is this one's from now on."""
         kept = self._writer.kept
         assert kept is not None
         self._memory.waiting.set(self, self.host, 0)
@@ -526,7 +526,7 @@ class Connection(asyncio.BufferedProtocol):
         self._transport = transport
         self._outbox.limit_bytes = self._outbox_bytes
         again, gap = kept.again(received)
-        resumed = to_agent(SessionResumed(self.agent_id, self.peer.heard, gap))
+        resumed = to_agent(SessionResumed(self.agent_id, heard, gap))
         self._writer.wake(transport, resumed, again)
         self._account()
         if self._pauses:

@@ -135,7 +135,7 @@ class Sleepers:
         if not connection.asleep:  # its old socket has not ended yet, or nobody has noticed
             self._lay_down(connection)
         laid_down_s = self._resume_s - self._up(connection)
-        connection.wake(newcomer, event.received)
+        connection.wake(newcomer, event.received, event.heard)
         delay_s = max(0.0, CALM_S - laid_down_s)
         self._showing[connection] = asyncio.get_running_loop().call_later(delay_s, self._show, connection, 0)
         log.info("%s is there again", connection)

@@ -199,6 +199,8 @@ class Resumed(NamedTuple):
     spare_credit: Credit
     received: int
     """How many messages of its session it has."""
+    heard: int
+    """How many frames of it had come, without what follows in the same read."""
 
 
 class NotResumed(NamedTuple):
@@ -628,7 +630,7 @@ class TcpAgent:
         if former is None:
             events.append(NotResumed())
             return
-        events.append(Resumed(former, self.agent_id, self.credit, configuration.received))
+        events.append(Resumed(former, self.agent_id, self.credit, configuration.received, former.heard))
         self._take_over(former, events)
 
     def _take_over(self, former: TcpAgent, events: list[Event]) -> None:
