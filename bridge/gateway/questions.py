@@ -22,9 +22,11 @@ class Questions:
 
     def drives(self, connection: Connection) -> None:
         """It has sent a command."""
-        if connection in self._timers or connection.peer.agent_type != UNITY or not connection.pace.drives_on:
+        if connection in self._timers or connection.peer.agent_type != UNITY:
             return
-        self._ask_on(connection)
+        pace = connection.pace
+        if pace.drives_on or pace.in_doubt:  # after a long pause a single command is no flow yet, but waits for this
+            self._ask_on(connection)
 
     def answered(self, connection: Connection, number: int) -> None:
         """It has answered."""

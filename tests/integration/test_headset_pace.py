@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Hashable
 import pytest
 
 import macs_zenoh
-from bridge.gateway import Gateway
+from bridge.gateway import Gateway, questions
 from bridge.headset.client import Headset
 from macs_zenoh.agent import Agent
 from macs_zenoh.protocol.messages import Configuration, Metadata, Welcome, encode_management
@@ -275,5 +275,32 @@ async def test_what_waited_is_not_carried_out_however_slowly_it_comes(
             await until(lambda: connection.pace.recency.age_at_most(time.monotonic()) < 0.3)
             link.writer.write(frame(1_000_000))
             await until(lambda: taken(robot)[-1] == 1_000_000)
+        finally:
+            headset.close()
+
+
+async def test_after_a_long_pause_a_driver_is_asked_with_the_first_command(
+    start_gateway: StartGateway, robot: Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who has not driven for long is asked no more; when he drives on, no more is lost than it takes to ask: the
+    second command comes behind the answer."""
+    gateway = await start_gateway()
+    async with socket(gateway) as link:
+        await ready(gateway, link)
+        connection = gateway.agents.find(2, link.id)
+        headset = Answering(link)
+        try:
+            await until(lambda: connection.pace.recency.is_quick)
+            headset.pause()
+            monkeypatch.setattr(questions, "ASKED_FOR_S", 0.5)
+            await until(lambda: connection.pace.recency.age_at_most(time.monotonic()) > 2.0)
+            monkeypatch.undo()
+            before, old = len(taken(robot)), drops(gateway, link).get("too_old", 0)
+            link.writer.write(frame(1_000_000))
+            await until(lambda: drops(gateway, link).get("too_old") == old + 1)
+            await until(lambda: not connection.pace.in_doubt)
+            link.writer.write(frame(1_000_001))
+            await until(lambda: taken(robot)[-1] == 1_000_001)
+            assert len(taken(robot)) == before + 1
         finally:
             headset.close()
