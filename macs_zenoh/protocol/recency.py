@@ -30,6 +30,8 @@ class Recency:
     """So many of these in a row, and none that does not come tells anything any more."""
     OPEN = 4
     """So many questions may be open: what nobody takes should not fill its link."""
+    LOST_S = 10.0
+    """A question that was not answered for so long is open no more: it got lost, or its answer did."""
 
     def __init__(self) -> None:
         self.is_quick = False
@@ -42,6 +44,8 @@ class Recency:
 
     def ask(self, now: float) -> int | None:
         """A question is asked now: its number. None: so many are open that it had better not be."""
+        while self._open and now - self._open[0][1] > self.LOST_S:
+            self._open.popleft()
         if len(self._open) >= self.OPEN:
             return None
         self._number += 1
@@ -51,16 +55,17 @@ class Recency:
     def answered(self, number: int, now: float, steady_since: float) -> None:
         """An answer came. If all else that the agent says has come steadily since before the question, and the answer
         took long nevertheless, that was on the way to the agent."""
-        while self._open:
-            asked, at = self._open.popleft()
-            if asked == number:
-                self._since = at
-                if now - at <= self.QUICK_S:
-                    self.is_quick, self._slow = True, 0
-                elif steady_since <= at:
-                    self._slow += 1
-                    self.is_quick = self.is_quick and self._slow < self.SLOW
-                return
+        at = next((at for asked, at in self._open if asked == number), None)
+        if at is None:
+            return
+        while self._open.popleft()[0] != number:
+            pass  # it answers in order, if at all
+        self._since = at
+        if now - at <= self.QUICK_S:
+            self.is_quick, self._slow = True, 0
+        elif steady_since <= at:
+            self._slow += 1
+            self.is_quick = self.is_quick and self._slow < self.SLOW
 
     def age_at_most(self, now: float) -> float:
         """How old what comes now can be, in s; infinite when nothing is known."""

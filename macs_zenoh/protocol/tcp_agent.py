@@ -58,7 +58,7 @@ from .messages import (
     decode_data,
     decode_management,
 )
-from .recency import QUESTIONS
+from .recency import QUESTIONS, Recency
 from .recipient import Recipient, to_agent
 from .rights import OPEN, Grant, Rights
 from .wire import MACS, MAX_FRAME_BYTES, Frame, Frames, Header, Layout, encode_frame, parse_frame
@@ -290,6 +290,8 @@ class TcpAgent:
         self._rights: Rights | None = None
         self._permitted: dict[tuple[bytes, int, str, str], str | None] = {}
         """Of an agent with a token: why what goes there, and is that, may not go on."""
+        self._questions: deque[int] = deque(maxlen=2 * Recency.OPEN)
+        """What it was asked last and has not answered."""
         self._registered: dict[tuple[int, str], Registering] = {}
         """Of an agent with a token: what it registered, by node type and name, and where."""
         self._refused_at: dict[tuple[int, str], set[int]] = {}
@@ -336,6 +338,8 @@ class TcpAgent:
     def welcome(self, number: int = 0) -> bytes:
         """The first message on every connection; agents give up when anything else comes before it. A headset takes a
         later one as its new id, and answers again; with a ``number`` (`recency`) it is `Answered`."""
+        if number:
+            self._questions.append(number)
         return to_agent(Welcome(agent_id=self.agent_id), request_id=number or self.connection_number)
 
     @property
@@ -361,7 +365,8 @@ class TcpAgent:
             return []
         self._heard_at = now
         events: list[Event] = []
-        decoder, limited, shared = self._decoder, self._limits.frames_per_s, self.grant.credit
+        decoder, limited = self._decoder, self._limits.frames_per_s
+        shared = self.grant.credit
         for frame in decoder.advance(size):
             if isinstance(frame, WireError):
                 self.heard += self.state is ONLINE
@@ -370,9 +375,7 @@ class TcpAgent:
             if self.state is ONLINE:
                 self.heard += frame.count
             try:
-                if (limited and not self._covered(frame, now)) or (
-                    shared is not None and not shared.take(frame.count, now)
-                ):
+                if (limited or shared is not None) and not self._covered(frame, now):
                     self._too_fast(frame, now, events)
                 elif self.state is ONLINE and not frame.has_management:
                     self._send(frame, events)
@@ -472,10 +475,21 @@ class TcpAgent:
         events.append(Forbidden(metadata, robots, str(error)))
 
     def _covered(self, frame: Frames, now: float) -> bool:
-        """Whether the rate limit lets a frame pass: every one counts but the one that configures the agent."""
-        if self.state is GREETED and frame.has_management and isinstance(self._management(frame), Configuration):
-            return True
-        return self.credit.take(frame.count, now)
+        """Whether the rate limits let a frame pass. Each counts, but not what the gateway asked for: the one that
+        configures the agent, and the first answer to each question (`recency`)."""
+        greeted = self.state is GREETED
+        if frame.has_management and (greeted or self._questions):
+            management = self._management(frame)
+            if isinstance(management, Configuration):
+                if greeted:
+                    return True
+                if management.request_id in self._questions:
+                    self._questions.remove(management.request_id)
+                    return True
+        limited, shared = self._limits.frames_per_s, self.grant.credit
+        return (not limited or self.credit.take(frame.count, now)) and (
+            shared is None or shared.take(frame.count, now)
+        )
 
     def _too_fast(self, frame: Frames, now: float, events: list[Event]) -> None:
         """A frame beyond the rate limit is dropped, but who leaves may say so, and who may stops a robot. A

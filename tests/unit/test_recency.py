@@ -59,3 +59,27 @@ def test_slow_answers_count_against_it_only_while_it_speaks_steadily() -> None:
     assert not recency.is_quick
     recency.answered(asked(recency, 30.0), 30.1, 19.0)
     assert recency.is_quick
+
+
+def test_questions_that_nobody_answers_are_open_only_for_a_while() -> None:
+    """As many as may be open get lost: later ones are asked nevertheless, and their answers count."""
+    recency = Recency()
+    lost = [asked(recency, float(n)) for n in range(Recency.OPEN)]
+    assert recency.ask(Recency.LOST_S) is None
+    found = asked(recency, 0.1 + Recency.LOST_S)
+    recency.answered(lost[0], 10.2, -math.inf)
+    assert recency.age_at_most(10.2) == math.inf, "it was given up"
+    recency.answered(found, 10.3, -math.inf)
+    assert recency.is_quick
+    assert math.isclose(recency.age_at_most(10.3), 0.2)
+    assert asked(recency, 10.4) > found
+
+
+def test_a_number_that_nobody_asked_ends_no_question() -> None:
+    """Or whoever says one would take the answers behind it away."""
+    recency = Recency()
+    number = asked(recency, 1.0)
+    for wrong in (QUESTIONS, number - 1, number + 1):
+        recency.answered(wrong, 1.1, -math.inf)
+    recency.answered(number, 1.2, -math.inf)
+    assert math.isclose(recency.age_at_most(1.2), 0.2)

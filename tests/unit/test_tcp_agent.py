@@ -50,8 +50,10 @@ from macs_zenoh.protocol.messages import (
     encode_management,
     node_name,
 )
+from macs_zenoh.protocol.recency import QUESTIONS
 from macs_zenoh.protocol.rights import Grant, Rights
 from macs_zenoh.protocol.tcp_agent import (
+    Answered,
     Asked,
     AskedOnline,
     Event,
@@ -687,6 +689,29 @@ def test_a_press_of_a_stop_passes_beyond_the_rate() -> None:
     assert [type(event) for event in peer.receive(press, 0.0)] == [Sent]
     assert errors(peer.receive(release + said("nd__cmd_vel", "geometry_msgs/Twist", bytes(52)), 0.0)) == [TooFast] * 2
     assert sum(type(event) is Sent for event in peer.receive(press * 100, 0.0)) < TcpAgent.STOPS_PER_S
+
+
+def test_answers_to_questions_cost_nothing_of_the_rate() -> None:
+    """Who drives as fast as it may would be asked in vain; what nobody asked counts, and a second answer."""
+
+    def answer(number: int) -> bytes:
+        return encode_frame(management=encode_management(Configuration(UNITY, 7, request_id=number)))
+
+    peer = online(limits=LIMITS._replace(frames_per_s=1.0))
+    assert count_sent(peer, 3, 0.0) == 1
+    first, second = QUESTIONS + 1, QUESTIONS + 2
+    peer.welcome(first)
+    peer.welcome(second)
+    assert peer.receive(answer(first), 0.0) == [Answered(first)]
+    assert errors(peer.receive(answer(first) + answer(QUESTIONS + 9), 0.0)) == [TooFast] * 2
+    assert peer.receive(answer(second), 0.0) == [Answered(second)]
+    credit = Credit(1.0, 0.0)
+    grant = Grant("g", Rights(may=["send"], frames_per_s=1.0), credit)
+    held = TcpAgent(7, 42, 0.0, limits=LIMITS, admit=lambda _: grant)
+    held.receive(shown("good"), 0.0)
+    assert count_sent(held, 3, 0.0) == 1
+    held.welcome(first)
+    assert held.receive(answer(first), 0.0) == [Answered(first)]
 
 
 def test_a_slow_rate_lets_something_through() -> None:
