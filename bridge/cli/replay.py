@@ -2,8 +2,12 @@
 need not know. They do nothing: commands, services and actions are refused with the reason. Ctrl-C leaves nothing
 behind.
 
+With --to ros the topics are behind /replay/robot_7, where no robot listens.
+
 With --commands-to ROBOT it sends what headsets sent to that robot once more, which MOVES IT: it asks first, and wants
 the robot's id a second time, from a terminal or with --confirm. The robot's rules and its emergency stop hold.
+--own-names ROBOT, which may move any robot of the ROS graph, asks in the same way: that robot's topics then keep their
+names, but for its emergency stop and those that its nodes listened to, unless --topics has the whole name of one.
 
 Exit code 0: played, or stopped with Ctrl-C; 1: a file cannot be read, or nobody is there; 2: wrong usage, as when a
 robot of that id is online.
@@ -12,6 +16,7 @@ examples:
   macs replay monday.mcap -e tcp/192.168.1.10:7447
   macs replay monday.mcap --start 10m --rate 0.5 --loop --topics '/camera/**' --as-robot 7:17
   macs replay monday.mcap --to ros
+  macs replay monday.mcap --to ros --own-names 7 --confirm 7
   macs replay monday.mcap --to gateway 192.168.1.10:7000
   macs replay monday.mcap --commands-to 7
 
@@ -54,6 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--to", nargs="+", default=["mesh"], metavar=("mesh|ros|gateway", "HOST:PORT"), help="where to (default: mesh)"
     )
+    parser.add_argument(
+        "--own-names", type=_robot, metavar="ID", help="to ros: this one's topics under their own names"
+    )
     parser.add_argument("--commands-to", type=_robot, metavar="ID", help="send recorded commands to this robot")
     parser.add_argument("--confirm", type=_robot, metavar="ID", help="its id again, instead of being asked")
     options.add_as_option(parser)
@@ -65,8 +73,8 @@ def run(args: argparse.Namespace) -> int:
 
     need_mcap()
     order = _order(args)
-    if order.commands_to:
-        _confirm(args)
+    if order.commands_to or order.own_names:
+        _confirm(order.commands_to or order.own_names, args.confirm, order.to)
     settings = options.settings(args)
     return running.until_stopped(lambda: _replay(order, settings))
 
@@ -84,6 +92,8 @@ def _order(args: argparse.Namespace) -> Order:
         raise UsageError("--as says who sends commands, as unity/5 does, with --commands-to")
     if args.commands_to and kind != "mesh":
         raise UsageError("commands are sent over the mesh")
+    if args.own_names and kind != "ros":
+        raise UsageError("--own-names says how topics are called in ROS, with --to ros")
     return Order(
         path=args.file,
         to=kind,
@@ -94,6 +104,7 @@ def _order(args: argparse.Namespace) -> Order:
         rate=args.rate,
         loop=args.loop,
         start_s=args.start,
+        own_names=args.own_names or 0,
         commands_to=args.commands_to or 0,
         agent=args.principal.agent if args.principal is not None else None,
     )
@@ -106,14 +117,16 @@ def _place(text: str) -> tuple[str, int]:
         raise UsageError(f"--to gateway: {error}") from error
 
 
-def _confirm(args: argparse.Namespace) -> None:
+def _confirm(robot: int, again: int | None, to: str) -> None:
     """Have the robot's id a second time. Raises UsageError."""
-    robot = args.commands_to
-    again = args.confirm
     if again is None:
         if not sys.stdin.isatty():
             raise UsageError(f"this may move robot {robot}: name it again with --confirm {robot}")
-        output.note(f"This sends recorded commands to robot {robot}, which may move. Look that nobody is near it.")
+        if to == "ros":
+            output.note(f"This publishes topics of robot {robot} under their own names into the ROS graph here.")
+            output.note("What listens to them there may move. Look that nobody is near a robot.")
+        else:
+            output.note(f"This sends recorded commands to robot {robot}, which may move. Look that nobody is near it.")
         output.note("Type its id again to go on:")
         text = sys.stdin.readline().strip()
         again = int(text) if text.isascii() and text.isdigit() and len(text) < 6 else 0

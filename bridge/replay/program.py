@@ -45,6 +45,7 @@ class Order:
         robots: recorded ids; none: all.
         names: as which robot each is played, where not as itself.
         topics: patterns; none: all.
+        own_names: the recorded robot whose topics keep their names in ROS, where they may move one; 0: none's do.
         commands_to: the robot to play commands to; 0: none are.
         agent: who plays them, if not any free headset's id.
     """
@@ -58,6 +59,7 @@ class Order:
     rate: float = 1.0
     loop: bool = False
     start_s: float = 0.0
+    own_names: int = 0
     commands_to: int = 0
     agent: tuple[int, int] | None = None
 
@@ -153,7 +155,13 @@ async def _target(
         if order.to == "ros":
             from bridge.ros.replayed import RosTarget
 
-            target = await asyncio.to_thread(RosTarget, robots, order.names)
+            if order.own_names and order.own_names not in robots:
+                raise UsageError(
+                    f"{order.path} has no topics of robot {order.own_names}, whose own names are to be used"
+                )
+            target = await asyncio.to_thread(
+                RosTarget, robots, order.names, own_names=order.own_names, named=order.topics
+            )
             stack.push_async_callback(asyncio.to_thread, target.close)
             await target.open()
             for topic, why in target.left_out.items():

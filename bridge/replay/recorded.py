@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import msgspec
 from bridge.recording.bag import Bag
 from bridge.recording.mcap_records import ChannelRecord
 from bridge.recording.streams import CDR, OFFERS, PRESENCE, qos_of, split_topic
+from macs_zenoh.protocol.guard import STOP_TOPIC
 from macs_zenoh.protocol.robot_state import Offered, TopicQos
 from macs_zenoh.protocol.schemas import Definition, definitions_in
 
@@ -54,6 +55,21 @@ class RecordedRobot:
         }
         qos = {**self.offered.qos, **{topic.name: topic.qos for topic in self.topics.values()}}
         return Offered(others, types, self.offered.services, self.offered.actions, qos)
+
+    def moves_by(self, topic: str, named: Collection[str] = ()) -> str:
+        """Why a topic may move, stop or release a robot that has it; empty: it only tells something.
+
+        The emergency stop always may; of the others not those in ``named``, the names that somebody has given.
+        """
+        if topic == STOP_TOPIC:
+            return "it is the emergency stop"
+        if topic in named:
+            return ""
+        if topic in self.offered.subscribers:
+            return f"nodes of the robot listened to it, which may move it; to have it, name it: --topics {topic}"
+        if self.offered.publishers and topic not in self.offered.publishers:
+            return f"no node of the robot published it; to have it, name it: --topics {topic}"
+        return ""
 
 
 def recorded_robots(path: Path, wanted: Callable[[str], bool], start_s: float = 0.0) -> dict[int, RecordedRobot]:

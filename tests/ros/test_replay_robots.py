@@ -164,14 +164,61 @@ async def test_it_leaves_nothing_behind(recording: Path, router: Router) -> None
 
 async def test_a_recording_is_played_into_ros(recording: Path, router: Router, peer: Peer, domain: int) -> None:
     """An rclpy subscription gets each message, and a late one what is latched."""
-    received = await peer.subscription(String, "/chatter", 1000)
+    received = await peer.subscription(String, "/replay/robot_7/chatter", 1000)
+    own = await peer.subscription(String, "/chatter", 1000)
     env = {"ROS_DOMAIN_ID": str(domain)}
     async with replay(recording, router.endpoint, "--to", "ros", "--loop", env=env):
         first = int((await get(received)).data.rpartition(" ")[2])
         for number in range(1, 150):
             assert (await get(received)).data == f"message {(first + number) % 200}"
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        assert (await get(await peer.subscription(String, "/name", latched))).data == "seven"
+        assert (await get(await peer.subscription(String, "/replay/robot_7/name", latched))).data == "seven"
+    assert own.empty()
+
+
+DRIVING = ["/cmd_vel", "/emergency_stop", "/speed", "/tf"]
+"""What nodes of the robot listened to, its stop, and what only a recording of commands has."""
+
+
+@pytest.fixture
+def driven(tmp_path: Path) -> Path:
+    """A recording of commands as robot 7 carried them out: its navigation drove it, and its stop was released."""
+    writing = Writing(tmp_path / "driven.mcap")
+    listened = {"/cmd_vel": "std_msgs/msg/String", "/tf": "std_msgs/msg/String"}
+    published = dict.fromkeys(["/chatter", "/cmd_vel", "/tf"], "std_msgs/msg/String")
+    writing.say(OFFERS, 0, {"robot": 7, "offers": {"subscribers": listened, "publishers": published}})
+    for number in range(100):
+        for topic in (*DRIVING, "/chatter"):
+            writing.add(text_topic(7, topic), number / 100, cdr(f"{number}"))
+    writing.file.close()
+    return writing.path
+
+
+async def test_nothing_that_may_move_a_robot_is_played_into_ros_unasked(
+    driven: Path, router: Router, peer: Peer, domain: int
+) -> None:
+    """Without its id twice no topic has its own name; with it those that moved it are left out, unless named."""
+    env = {"ROS_DOMAIN_ID": str(domain)}
+    heard = {topic: await peer.subscription(String, topic, 1000) for topic in (*DRIVING, "/chatter")}
+    shown = await peer.subscription(String, "/replay/robot_7/cmd_vel", 1000)
+    async with replay(driven, router.endpoint, "--to", "ros", "--loop", env=env):
+        for _ in range(100):
+            await get(shown)
+    assert all(queue.empty() for queue in heard.values())
+    for options in (["--own-names", "7"], ["--own-names", "7", "--confirm", "8"]):
+        code, out, errors = await ended("replay", str(driven), "--to", "ros", *options)
+        assert (code, out) == (2, "")
+        assert "named twice" in errors or "--confirm 7" in errors
+    own = ("--to", "ros", "--own-names", "7", "--confirm", "7")
+    async with replay(driven, router.endpoint, *own, "--loop", env=env) as playing:
+        for _ in range(100):
+            await get(heard["/chatter"])
+        assert all(heard[topic].empty() for topic in DRIVING)
+        assert all(any(f"{topic} is not played" in line for line in playing.log) for topic in DRIVING)
+    async with replay(driven, router.endpoint, *own, "--loop", "--topics", "/tf", "--topics", "/emer*", env=env):
+        for _ in range(100):
+            await get(heard["/tf"])
+        assert all(heard[topic].empty() for topic in DRIVING if topic != "/tf")
 
 
 async def test_a_recording_is_played_to_a_gateway(recording: Path, router: Router) -> None:
@@ -266,6 +313,8 @@ def test_rate_and_loop(tmp_path: Path, rate: float, loop: bool) -> None:
         (["--to", "moon"], "--to gateway HOST:PORT"),
         (["--to", "gateway"], "--to gateway HOST:PORT"),
         (["--topics", "/none"], "no topics"),
+        (["--own-names", "7"], "with --to ros"),
+        (["--to", "ros", "--own-names", "9", "--confirm", "9"], "no topics of robot 9"),
         (["--commands-to", "9", "--confirm", "9"], "no commands to robot 9"),
     ],
 )
