@@ -13,11 +13,10 @@ from collections.abc import Callable
 from typing import Any
 
 from bridge.ros.interface import Robot
-from bridge.ros.side import Publisher, Server, ServiceType
+from bridge.ros.side import MessageType, NotOfType, Publisher, Server, ServiceType, first_line
 from bridge.ros.types import InterfaceName
 from bridge.settings.mirror import MirrorRule
 from macs_zenoh.agent import Agent
-from macs_zenoh.errors import MacsError
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.limits import ANSWER_BYTES
@@ -91,9 +90,9 @@ class _Mirrored:
         while True:
             try:
                 await self._mirror(await self._offers())
-            except MacsError as error:
-                if str(error) != problem:
-                    problem = str(error)
+            except Exception as error:  # noqa: BLE001 - of the middleware, too: it may do it the next time
+                if first_line(error) != problem:
+                    problem = first_line(error)
                     log.warning("%s of %s is not mirrored: %s", self._there, AgentId(ROS, self._other), problem)
             await asyncio.sleep(AGAIN_S)
 
@@ -114,17 +113,17 @@ class MirroredTopic(_Mirrored):
         told = await self._agent.subscribe(self._there, robot=self._other, type=of_type)
         try:
             change = self._prefixed(of_type)
-            publisher = await self._advertised(of_type, offered.qos.get(self._there, TopicQos()))
+            message, publisher = await self._advertised(of_type, offered.qos.get(self._there, TopicQos()))
             log.info("%s of %s is %s here", self._there, AgentId(ROS, self._other), self._here)
             try:
-                async for message in told:
-                    self._publish(publisher, change, message)
+                async for one in told:
+                    self._publish(publisher, message, change, one)
             finally:
                 self._robot.session.submit(publisher.close)
         finally:
             told.close()
 
-    async def _advertised(self, of_type: str, told: TopicQos) -> Publisher:
+    async def _advertised(self, of_type: str, told: TopicQos) -> tuple[MessageType, Publisher]:
         latched, best_effort = told.durability == "transient_local", told.reliability == "best_effort"
         qos = Qos(
             depth=1 if latched else 10,
@@ -132,9 +131,19 @@ class MirroredTopic(_Mirrored):
             reliability=Reliability.BEST_EFFORT if best_effort else Reliability.RELIABLE,
         )
         side, name = self._robot.session, InterfaceName.parse(of_type, "msg")
-        return await side.run(lambda: side.advertise(side.message(name, self._here), self._here, qos))
 
-    def _publish(self, publisher: Publisher, change: Callable[[bytes], bytes], message: TopicMessage) -> None:
+        def advertise() -> tuple[MessageType, Publisher]:
+            message = side.message(name, self._here)
+            return message, side.advertise(message, self._here, qos)
+
+        return await side.run(advertise)
+
+    def _publish(
+        self, publisher: Publisher, of: MessageType, change: Callable[[bytes], bytes], message: TopicMessage
+    ) -> None:
+        if problem := of.problem(message.data):  # the nodes that read it may end by it, whoever sent it
+            self._robot.drops.note("bad_cdr", self._here, f"not mirrored, {len(message.data)} bytes: {problem}")
+            return
         try:
             publisher.publish(change(message.data))
         except Exception as error:  # noqa: BLE001 - the middleware's, whatever it is
@@ -158,7 +167,7 @@ class MirroredTopic(_Mirrored):
 
 
 class MirroredService(_Mirrored):
-    """A service of another robot, served here."""
+    """A service of another robot, served here. Who calls it is told in any case: a ROS node waits for ever."""
 
     async def _mirror(self, offered: Offered) -> None:
         of_type = offered.services.get(self._there)
@@ -167,28 +176,59 @@ class MirroredService(_Mirrored):
         side, name, loop = self._robot.session, InterfaceName.parse(of_type, "srv"), asyncio.get_running_loop()
         asking: set[asyncio.Task[None]] = set()
         types = await side.run(lambda: side.service(name, self._here))
+        await side.run(lambda: self._failure(types, ""))  # that there is one
 
         def ask(request: bytes, header: Any) -> None:
-            task = loop.create_task(self._answer(server, types, request, header))
+            task = loop.create_task(self._answer(serving, types, request, header))
             asking.add(task)
             task.add_done_callback(asking.discard)
 
         def asked(request: bytes, header: Any) -> None:
             loop.call_soon_threadsafe(ask, request, header)
 
-        server = await side.run(lambda: side.serve(types, self._here, asked))
+        serving = loop.create_task(side.run(lambda: side.serve(types, self._here, asked)))
+        server = await serving
         log.info("%s of %s is %s here", self._there, AgentId(ROS, self._other), self._here)
         try:
-            await asyncio.get_running_loop().create_future()  # until it is cancelled
+            await loop.create_future()  # until it is cancelled
         finally:
             side.submit(server.close)
 
-    async def _answer(self, server: Server, types: ServiceType, request: bytes, header: Any) -> None:
-        timeout_s = self._robot.rules.call_timeout_s(self._here)
+    async def _answer(self, serving: asyncio.Task[Server], types: ServiceType, request: bytes, header: Any) -> None:
+        timeout_s, side = self._robot.rules.call_timeout_s(self._here), self._robot.session
+        server = await asyncio.shield(serving)  # it may be called before this is told that it is there
         try:
             response = await self._agent.call_service(self._there, request, robot=self._other, timeout_s=timeout_s)
-        except MacsError as error:
-            self._robot.drops.note("call_failed", self._here, str(error))
-            values = self._robot.rules.of(self._here).error_response
-            response = types.response.failure(str(error), values, "error_response")
-        self._robot.session.submit(lambda: server.answer(header, response))
+        except Exception as error:  # noqa: BLE001 - whatever it is, the caller waits
+            reason = first_line(error)
+            self._robot.drops.note("call_failed", self._here, reason)
+            side.submit(lambda: self._send(server, header, self._failure(types, reason)))
+            return
+        side.submit(lambda: self._send_response(server, types, header, response))
+
+    # -- in the ROS thread ---------------------------------------------------------------------------------------
+
+    def _failure(self, types: ServiceType, reason: str) -> bytes:
+        """Raises Refused."""
+        return types.response.failure(reason, self._robot.rules.of(self._here).error_response, "error_response")
+
+    def _send_response(self, server: Server, types: ServiceType, header: Any, response: bytes) -> None:
+        problem = types.response.problem(response)
+        try:
+            if problem is None:
+                self._send(server, header, response)
+        except NotOfType as error:
+            problem = str(error)
+        if problem is not None:
+            reason = f"the answer of {AgentId(ROS, self._other)} is none of this service: {problem}"
+            self._robot.drops.note("bad_cdr", self._here, reason)
+            self._send(server, header, self._failure(types, reason))
+
+    def _send(self, server: Server, header: Any, response: bytes) -> None:
+        """Raises NotOfType."""
+        try:
+            server.answer(header, response)
+        except NotOfType:
+            raise
+        except Exception as error:  # noqa: BLE001 - the middleware's, as when the caller is gone
+            self._robot.drops.note("failed", self._here, f"not answered: {first_line(error)}")
