@@ -15,6 +15,7 @@ from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.existing import asks
 from macs_zenoh.protocol.guard import STOP_TYPES
+from macs_zenoh.protocol.halts import halts, may_halt
 from macs_zenoh.protocol.messages import ROS, NodeType
 from macs_zenoh.protocol.rate_limit import Passing
 from macs_zenoh.protocol.routing import stream_key
@@ -125,8 +126,11 @@ class Forwarding:
         traffic = COMMAND if metadata.node_type == PUBLISHER else CALL
         if traffic is CALL and (metadata.node_type or metadata.message_manager) and asks(metadata):
             connection.recipient.asks(metadata, frame.header)
-        if route.to_robots and not self._may_go(connection, sent, route, traffic):
-            return
+        if route.to_robots:
+            going = self._may_go(connection, sent, route, traffic)
+            if going is None:
+                return
+            sent = going
         if route.limited:
             self.flush()
             self._put_singly(route.keys, sent, traffic)
@@ -204,38 +208,61 @@ class Forwarding:
                 self._judged.note(payload, read, copies, alone=not before)
             mesh.make_room()
 
-    def _may_go(self, connection: Connection, sent: Sent, route: Route, traffic: Traffic) -> bool:
-        """Whether a frame to robots goes on now; a command that has waited may, after all that came with it."""
+    def _may_go(self, connection: Connection, sent: Sent, route: Route, traffic: Traffic) -> Sent | None:
+        """What of a frame to robots goes on now; a command that has waited may, after all that came with it."""
         now, count, metadata = time.monotonic(), sent.frame.count, sent.metadata
         if traffic is not COMMAND:
             passing = connection.pace.request(count, now)
         elif metadata.data_exchange_type in STOP_TYPES:
-            return metadata.node_name != STOP_NAME or not self._waits_for_stop(connection, sent, route)
+            waits = metadata.node_name == STOP_NAME and self._waits_for_stop(connection, sent, route)
+            return None if waits else sent
         else:
             passing = connection.pace.command((sent.frame.destination, metadata.node_name), count, now)
         if passing is Passing.FLOODED:
-            connection.complain("flooded", "it sends robots more than one agent may", count)
+            halt = self._halt(connection, sent, passing, now) if traffic is COMMAND else None
+            lost = count - (halt is not None)
+            if lost:
+                connection.complain("flooded", "it sends robots more than one agent may", lost)
             self._slow_down(connection, now)
-        elif traffic is COMMAND:
+            return halt
+        if traffic is COMMAND:
             connection.drove_at = now
             self._questions.drives(connection)
-            self._keep_latest(connection, sent, route, passing)
-        return passing is Passing.NOW
+            return self._newest(connection, sent, route, passing, now)
+        return sent
 
-    def _keep_latest(self, connection: Connection, sent: Sent, route: Route, passing: Passing) -> None:
-        """Of commands that have waited the newest is kept, and goes on before one that has not."""
+    def _newest(self, connection: Connection, sent: Sent, route: Route, passing: Passing, now: float) -> Sent | None:
+        """What of commands goes on now. Of those that have waited the newest is kept, and goes on before one that has
+        not."""
         kind = sent.frame.destination, sent.metadata.node_name
         if passing is Passing.NOW:
             self._latest.follow(connection, kind)
-            return
+            return sent
         if passing is Passing.TOO_OLD:
-            connection.complain("too_old", "commands that may have waited in its connection", sent.frame.count)
-            return
-        *_, newest = sent.frame.each()
+            halt = self._halt(connection, sent, passing, now)
+            old = sent.frame.count - (halt is not None)
+            if old:
+                connection.complain("too_old", "commands that may have waited in its connection", old)
+            return halt
         older = sent.frame.count - 1
-        older += self._latest.hold(connection, kind, route, Sent(newest, sent.metadata, sent.readable))
+        older += self._latest.hold(connection, kind, route, Sent(sent.frame.last, sent.metadata, sent.readable))
         if older:
             connection.complain("too_old", "commands that waited with newer ones", older)
+        return None
+
+    def _halt(self, connection: Connection, sent: Sent, passing: Passing, now: float) -> Sent | None:
+        """Of commands that do not go on, the newest that says to stand still does: nobody may say it again. What waits
+        of the same kind is older. Of a flood only the last is looked at."""
+        metadata = sent.metadata
+        if not may_halt(metadata.data_exchange_type):
+            return None
+        frames = sent.frame.each() if passing is Passing.TOO_OLD else (sent.frame.last,)
+        halt = next((frame for frame in reversed(frames) if halts(metadata.data_exchange_type, frame.body)), None)
+        if halt is None or (passing is Passing.FLOODED and not connection.pace.halt(now)):
+            return None
+        if self._latest.drop(connection, (sent.frame.destination, metadata.node_name)):
+            connection.complain("too_old", "a command that waited with newer ones")
+        return Sent(halt, metadata, sent.readable)
 
     def _slow_down(self, connection: Connection, now: float) -> None:
         """What is dropped has to be read first, which costs others the time of the loop: all who flood have a small
@@ -247,11 +274,10 @@ class Forwarding:
 
     def _waits_for_stop(self, connection: Connection, sent: Sent, route: Route) -> bool:
         """Whether a release, or what else may be on that topic, goes on later."""
-        *_, last = sent.frame.each()
         looked = self._presses.look(
             connection.key,
             sent.frame.header,
-            bytes(last.body[:5]),
+            bytes(sent.frame.last.body[:5]),
             lambda: self._put(route.keys, sent.frame.data, COMMAND),
         )
         if looked not in (GOES, WAITS):

@@ -34,6 +34,16 @@ class Latest:
         if kind in self._held.get(connection, ()):
             self._go(connection, kind)
 
+    def drop(self, connection: Connection, kind: Hashable) -> bool:
+        """What waits is not to go on, since something newer does. Whether anything did."""
+        dropped = self._held.get(connection, {}).pop(kind, None)
+        if dropped is None:
+            return False
+        dropped[-1].cancel()
+        if not self._held[connection]:
+            del self._held[connection]
+        return True
+
     def go(self, connection: Connection) -> None:
         """Nothing newer can come: the connection has ended, or is about to have another id."""
         for kind in [*self._held.get(connection, ())]:

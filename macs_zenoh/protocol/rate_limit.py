@@ -3,9 +3,9 @@
 A robot drops what is too much for it, but on the way there it would fill the links that others' stops go over. And
 only the gateway can see that commands waited in the agent's own connection: a headset whose Wi-Fi stood still for a
 minute sends all that it said meanwhile at once, and no stamp tells how old it is. So after a gap none goes on that is
-not known to be recent, by what the agent answered (`recency`). Of one that does not answer, or late, there is only the
-pace to go by: while commands come faster than they were ever said, only the newest of each kind goes on, when no newer
-one has come for `TOGETHER_S`.
+not known to be recent, by what the agent answered (`recency`), but for one that says to stand still (`halts`). Of one
+that does not answer, or late, there is only the pace to go by: while commands come faster than they were ever said,
+only the newest of each kind goes on, when no newer one has come for `TOGETHER_S`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Hashable
 from enum import Enum
 
 from .credit import Credit
+from .halts import HALTS_PER_S
 from .recency import Recency
 
 
@@ -131,6 +132,7 @@ class Pace:
     ) -> None:
         self._commands = Credit(commands_per_s, now)
         self._requests = Credit(requests_per_s, now)
+        self._halts = Credit(HALTS_PER_S, now)
         self._little = self.LITTLE * requests_per_s
         self._together = together
         self._flows: dict[Hashable, Flow] = {}
@@ -174,6 +176,10 @@ class Pace:
         if self._answers_count and self.recency.is_quick:
             return TOO_OLD if self._may_be_old(gap, now) else NOW
         return WAITED if waited or (not drives and now < self._late_until) else NOW
+
+    def halt(self, now: float) -> bool:
+        """Whether a command that says to stand still goes on, though there were too many before it."""
+        return self._halts.take(1, now)
 
     @property
     def drives(self) -> bool:

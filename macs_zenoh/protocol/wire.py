@@ -223,6 +223,11 @@ class Frame(_Alike):
         """The frame itself, as of a `Run`."""
         return (self,)
 
+    @property
+    def last(self) -> Frame:
+        """Likewise."""
+        return self
+
     def with_metadata(self, metadata: bytes) -> Frame:
         """The same with other metadata. Raises TooLong."""
         header = self.header
@@ -269,6 +274,11 @@ class Run(_Alike):
         data, size = self.data, self._size
         layout, message_at, body_at = self.layout, self._message_at, self._body_at
         return [Frame(data[start : start + size], layout, message_at, body_at) for start in range(0, len(data), size)]
+
+    @property
+    def last(self) -> Frame:
+        """The last of the frames."""
+        return Frame(self.data[-self._size :], self.layout, self._message_at, self._body_at)
 
     def with_metadata(self, metadata: bytes) -> Run:
         """The same with other metadata in each. Raises TooLong. What begins them is made once."""

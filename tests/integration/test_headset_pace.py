@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import struct
 import time
 from collections.abc import AsyncIterator, Hashable
 
@@ -10,8 +11,10 @@ import pytest
 
 import macs_zenoh
 from bridge.gateway import Gateway, questions
+from bridge.gateway.connection import Connection
 from bridge.headset.client import Headset
 from macs_zenoh.agent import Agent
+from macs_zenoh.protocol.halts import HALTS_PER_S
 from macs_zenoh.protocol.messages import Configuration, Metadata, Welcome, encode_management
 from macs_zenoh.protocol.rate_limit import Flow, Pace, Passing
 from macs_zenoh.protocol.reading import Message
@@ -35,10 +38,34 @@ def frame(number: int, node: tuple[str, str] = MOVE, node_type: int = 2) -> byte
     return encode_frame(1, (7,), message=encode_message(metadata.encode(), b"%d" % number))
 
 
+def moving(data: bytes) -> bytes:
+    metadata = Metadata(node_type=2, node_name=MOVE[0], data_exchange_type=MOVE[1])
+    return encode_frame(1, (7,), message=encode_message(metadata.encode(), data))
+
+
+FAST, STILL = (b"\0\1\0\0" + struct.pack("<6d", speed, 0, 0, 0, 0, -0.0) for speed in (0.5, 0.0))
+
+
+def fill(connection: Connection, data: bytes) -> int:
+    """Put data where a connection reads, in one piece; how much it was."""
+    connection.get_buffer(-1)[: len(data)] = data
+    return len(data)
+
+
+def velocities(robot: Agent) -> list[bytes]:
+    """What has come so far of `moving`."""
+    messages: list[Message] = list(robot._inbox)
+    return [bytes(message.data) for message in messages if bytes(message.data) in (FAST, STILL)]
+
+
 def taken(robot: Agent, node: tuple[str, str] = MOVE) -> list[int]:
     """What has come so far of one kind, and is forgotten."""
     messages: list[Message] = list(robot._inbox)
-    return [int(message.data) for message in messages if message.metadata.node_name == node[0]]
+    return [
+        int(message.data)
+        for message in messages
+        if message.metadata.node_name == node[0] and bytes(message.data) not in (FAST, STILL)
+    ]
 
 
 async def ready(gateway: Gateway, headset: Socket) -> None:
@@ -241,6 +268,11 @@ class Answering:
         """Nobody drives."""
         self._says.clear()
 
+    def let_go(self) -> None:
+        """Nobody drives, and the headset says so once."""
+        self.pause()
+        self._waiting.put_nowait(moving(STILL))
+
     def drive(self) -> None:
         """Somebody does again."""
         self._says.set()
@@ -304,3 +336,92 @@ async def test_after_a_long_pause_a_driver_is_asked_with_the_first_command(
             assert len(taken(robot)) == before + 1
         finally:
             headset.close()
+
+
+async def test_who_lets_go_while_his_network_stands_still_stops(start_gateway: StartGateway, robot: Agent) -> None:
+    """What he said before is too old, and the zero is as well, but nobody says it again: it goes on, and nothing that
+    was said before it does."""
+    gateway = await start_gateway()
+    async with socket(gateway) as link:
+        await ready(gateway, link)
+        connection = gateway.agents.find(2, link.id)
+        headset = Answering(link)
+        try:
+            await until(lambda: connection.pace.recency.is_quick)
+            headset.moves.clear()
+            await until(lambda: taken(robot) and taken(robot)[-1] <= headset.said - 100)
+            headset.let_go()
+            said = headset.said
+            headset.moves.set()
+            await until(lambda: velocities(robot) == [STILL])
+            assert taken(robot)[-1] < said - 90
+            await until(lambda: not connection.pace.in_doubt)
+            headset.drive()
+            await until(lambda: taken(robot)[-1] > said)
+            assert not [number for number in taken(robot) if said - 90 <= number < said]
+            assert drops(gateway, link)["too_old"] >= 90
+        finally:
+            headset.close()
+
+
+class Said(Pace):
+    """Of a connection about whose commands it is said this, one after the other; of all later ones the last."""
+
+    def __init__(self, *passings: Passing) -> None:
+        super().__init__(0, 0, 0.0)
+        self._passings = [*passings]
+
+    def command(self, kind: Hashable, count: int, now: float) -> Passing:
+        return self._passings.pop(0) if len(self._passings) > 1 else self._passings[0]
+
+
+async def test_of_what_is_too_old_the_last_zero_goes_on(start_gateway: StartGateway, robot: Agent) -> None:
+    """Also out of the middle of what came at once."""
+    gateway = await start_gateway()
+    async with socket(gateway) as headset:
+        await ready(gateway, headset)
+        connection = gateway.agents.find(2, headset.id)
+        connection.pace = Said(Passing.TOO_OLD)
+        connection.buffer_updated(fill(connection, moving(FAST) * 3 + moving(STILL) + moving(FAST) * 2))
+        await until(lambda: velocities(robot) == [STILL])
+        assert drops(gateway, headset) == {"too_old": 5}
+
+
+async def test_of_what_is_too_much_the_last_goes_on_if_it_is_zero(start_gateway: StartGateway, robot: Agent) -> None:
+    """Or who sends what waited all at once would never be heard to stop."""
+    gateway = await start_gateway()
+    async with socket(gateway) as headset:
+        await ready(gateway, headset)
+        connection = gateway.agents.find(2, headset.id)
+        connection.pace = Said(Passing.FLOODED)
+        connection.buffer_updated(fill(connection, moving(FAST) * 3 + moving(STILL)))
+        await until(lambda: velocities(robot) == [STILL])
+        assert drops(gateway, headset) == {"flooded": 3}
+
+
+@pytest.mark.parametrize("passing", [Passing.TOO_OLD, Passing.FLOODED])
+async def test_a_zero_is_not_followed_by_what_waited_before_it(
+    start_gateway: StartGateway, robot: Agent, passing: Passing
+) -> None:
+    """Motion that waits for something newer has it."""
+    gateway = await start_gateway()
+    async with socket(gateway) as headset:
+        await ready(gateway, headset)
+        gateway.agents.find(2, headset.id).pace = Said(Passing.WAITED, passing)
+        headset.writer.write(moving(FAST) + frame(1, STOP) + moving(STILL))
+        await until(lambda: velocities(robot)[-1:] == [STILL])
+        await until(lambda: drops(gateway, headset) == {"too_old": 1} or len(velocities(robot)) > 1)
+        assert velocities(robot) == [STILL]
+
+
+async def test_zeros_are_a_flood_as_well(start_gateway: StartGateway, robot: Agent) -> None:
+    """Of a thousand that are too many a few go on."""
+    gateway = await start_gateway(max_commands_per_s=1)
+    async with socket(gateway) as headset:
+        await ready(gateway, headset)
+        began = time.monotonic()
+        for _ in range(200):
+            headset.writer.write(moving(FAST) + moving(STILL) + frame(0, ("nd__arm", MOVE[1])))
+        headset.writer.write(frame(1, STOP))
+        await until(lambda: taken(robot, STOP) == [1])
+        assert 1 <= velocities(robot).count(STILL) <= 2 + HALTS_PER_S * (1 + time.monotonic() - began)
