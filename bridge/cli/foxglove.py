@@ -1,14 +1,17 @@
 """Show a mesh in Foxglove or Lichtblick, live: robots' topics as they are, who is there, stops, control, refusals.
 
 Open ws://127.0.0.1:8765 there (Open connection, Foxglove WebSocket). A robot is asked for a topic while somebody looks
-at it. The publish and service panels work on /ROBOT/TOPIC: they may move a robot, whose rules, dead-man and emergency
-stop hold as for any headset. The server has no passwords, so it listens on this machine only; with --view-only nobody
-can move anything through it, and it may listen elsewhere.
+at it. The server has no passwords, and cannot tell one program of this machine from another, nor from a web page that
+is open in a browser here: whoever reaches it sees the robots, and so it only shows them, and listens on this machine.
+
+With --publish the publish and service panels work on /ROBOT/TOPIC. So does any web page that is open in a browser on
+this machine: IT MAY MOVE EVERY ROBOT, as far as their rules, control, dead-man and emergency stop let a headset do so.
 
 examples:
   macs foxglove -e tcp/192.168.1.10:7447
   macs foxglove --robot 7 --topics '/camera/**' --port 9000
-  macs foxglove --host 0.0.0.0 --view-only --tls-cert cert.pem --tls-key key.pem
+  macs foxglove --robot 7 --publish
+  macs foxglove --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem
 
 what it prints:
   ready: foxglove on 127.0.0.1:8765"""
@@ -16,6 +19,7 @@ what it prints:
 from __future__ import annotations
 
 import argparse
+import logging
 from pathlib import Path
 
 from bridge.cli import options, running
@@ -23,6 +27,8 @@ from bridge.cli.amounts import pattern
 from bridge.settings import Settings
 from macs_zenoh.errors import ConfigError, Unreachable, UsageError
 from macs_zenoh.protocol.addresses import is_local, joined
+
+log = logging.getLogger("macs.foxglove")
 
 SUMMARY = "show a mesh in Foxglove, live"
 
@@ -32,7 +38,11 @@ PORT = 8765
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=_port, default=PORT, help=f"where to listen, 0 for any (default: {PORT})")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
-    parser.add_argument("--view-only", action="store_true", help="nobody can publish or call services")
+    parser.add_argument(
+        "--publish",
+        action="store_true",
+        help="clients may publish and call services: any web page here may move robots",
+    )
     parser.add_argument("--robot", type=int, action="append", default=[], metavar="ID", help="this one; repeat (all)")
     parser.add_argument(
         "--topics", type=pattern, action="append", default=[], metavar="PATTERN", help="as '/camera/**'; repeat (all)"
@@ -49,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
 
     need_foxglove()
     need_mcap()
-    if not is_local(args.host) and not args.view_only:
-        raise UsageError("whoever reaches this server could move robots: --host with --view-only, or a tunnel to it")
+    if not is_local(args.host) and args.publish:
+        raise UsageError("whoever reaches this server could move robots: --host without --publish, or a tunnel to it")
     if (args.tls_cert is None) != (args.tls_key is None):
         raise UsageError("--tls-cert and --tls-key go together")
     if args.principal is not None and not args.principal.joins:
@@ -77,12 +87,16 @@ async def _show(args: argparse.Namespace, settings: Settings) -> int:
     async with macs_zenoh.join(
         type_name(kind), id=number or None, settings=settings.mesh, on_waiting=waiting
     ) as agent:
-        live = Live(agent, wanted, view_only=args.view_only)
+        live = Live(agent, wanted, publishes=args.publish)
         try:
             port = live.start(args.host, args.port, **tls)
         except Exception as error:  # of the SDK's own kinds, as where the port is taken
             raise Unreachable(joined(args.host, args.port), str(error)) from error
         try:
+            if args.publish:
+                log.warning(
+                    "whoever reaches this port may move robots, as may any web page in a browser on this machine"
+                )
             running.say_ready(f"foxglove on {joined(args.host, port)}")
             await asyncio.Event().wait()
         finally:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
@@ -17,11 +18,12 @@ from typing import Any
 import foxglove
 from foxglove.websocket import Capability, ServerListener, WebSocketServer
 
+from bridge.foxglove.publishing import ClientTopics
 from bridge.recording.disk import Entry
 from bridge.recording.recorder import Recorder, Wanted
 from bridge.recording.streams import CDR, JSON, ROS2MSG, STATUS, robot_topic, split_topic
 from macs_zenoh.agent import Agent
-from macs_zenoh.errors import MacsError, UsageError
+from macs_zenoh.errors import MacsError
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.robot_state import Offered
@@ -39,13 +41,14 @@ KEPT = 4096
 class Live(ServerListener):  # type: ignore[misc, unused-ignore]  # of a checkout without the SDK
     """One server for one mesh. The SDK calls in threads of its own; all else belongs to the loop."""
 
-    def __init__(self, agent: Agent, wanted: Wanted, *, view_only: bool) -> None:
+    def __init__(self, agent: Agent, wanted: Wanted, *, publishes: bool) -> None:
+        """``publishes``: clients may publish and call services, which may move robots."""
         self.recorder = Recorder(agent, self, wanted)
         self.recorder.demand = self._is_demanded
         self.recorder.on_offered = self._offered
         self.shown = 0
         self._agent = agent
-        self._view_only = view_only
+        self._publishes = publishes
         self._loop = asyncio.get_running_loop()
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
@@ -53,14 +56,16 @@ class Live(ServerListener):  # type: ignore[misc, unused-ignore]  # of a checkou
         self._looking: Counter[str] = Counter()
         self._services: dict[str, tuple[int, str, str]] = {}
         self._nodes: dict[int, list[dict[str, Any]]] = {}
-        self._advertised: dict[tuple[int, int], tuple[str, str, str]] = {}
+        self._published = ClientTopics(
+            agent, lambda robot, topic: wanted.robot(robot) and wanted.topic(topic), self._tell
+        )
         self._tasks: set[asyncio.Task[None]] = set()
         self._server: WebSocketServer | None = None
 
     def start(self, host: str, port: int, **tls: bytes) -> int:
         """Serve; the port. Raises OSError, RuntimeError: the SDK's."""
         capabilities = [Capability.ConnectionGraph]
-        if not self._view_only:
+        if self._publishes:
             capabilities += [Capability.ClientPublish, Capability.Services]
         self._server = foxglove.start_server(
             name="macs-zenoh",
@@ -81,6 +86,7 @@ class Live(ServerListener):  # type: ignore[misc, unused-ignore]  # of a checkou
         """End."""
         for task in self._tasks:
             task.cancel()
+        self._published.close()
         self.recorder.close()
         if self._server is not None:
             self._server.stop()
@@ -132,7 +138,7 @@ class Live(ServerListener):  # type: ignore[misc, unused-ignore]  # of a checkou
             if name not in self._channels:
                 about = {"robot": str(robot), "topic": topic}
                 self._open(name, CDR, _schema(full_type(of_type), schema.text), about)
-        if self._view_only:
+        if not self._publishes:
             return
         for service, of_type in offered.services.items():
             name = robot_topic(robot, service)
@@ -202,17 +208,17 @@ class Live(ServerListener):  # type: ignore[misc, unused-ignore]  # of a checkou
 
     def on_client_advertise(self, client: Any, channel: Any) -> None:
         """Somebody will publish."""
-        self._advertised[client.id, channel.id] = (channel.topic, channel.schema_name, channel.encoding)
+        key, said = (client.id, channel.id), (channel.topic, channel.schema_name or "", channel.encoding)
+        if self._publishes:  # whatever the SDK lets through
+            self._from_thread(self._published.advertise, key, *said)
 
     def on_client_unadvertise(self, client: Any, client_channel_id: int) -> None:
         """No more."""
-        self._advertised.pop((client.id, client_channel_id), None)
+        self._from_thread(self._published.unadvertise, (client.id, client_channel_id))
 
     def on_message_data(self, client: Any, client_channel_id: int, data: bytes) -> None:
         """Somebody publishes."""
-        named = self._advertised.get((client.id, client_channel_id))
-        if named is not None:
-            self._from_thread(lambda: self._spawn(self._publish(*named, bytes(data))))
+        self._from_thread(self._published.publish, (client.id, client_channel_id), bytes(data), time.monotonic())
 
     def _from_thread(self, callback: Callable[..., None], *args: object) -> None:
         with suppress(RuntimeError):  # the loop is closed: clients look away when the server ends
@@ -241,17 +247,11 @@ class Live(ServerListener):  # type: ignore[misc, unused-ignore]  # of a checkou
             for entry in list(self._kept.get(name, {}).values()):
                 channel.log(entry.data, log_time=entry.log_ns)
 
-    async def _publish(self, name: str, of_type: str, encoding: str, data: bytes) -> None:
-        named = split_topic(name)
-        try:
-            if named is None:
-                raise UsageError(f"{name} names no robot; publish to /7/cmd_vel for robot 7")
-            value: Any = json.loads(data) if encoding == JSON else data
-            await self._agent.publish(named[1], value, robot=named[0], type=of_type)
-        except (MacsError, ValueError) as error:
-            log.warning("what was published to %s is not sent: %s", name, error)
-            if self._server is not None:
-                self._server.publish_status(f"{name}: {error}", foxglove.StatusLevel.Warning, name)
+    def _tell(self, name: str, why: str) -> None:
+        """Something that a client published is not sent."""
+        log.warning("what was published to %s is not sent: %s", name, why)
+        if self._server is not None:
+            self._server.publish_status(f"{name}: {why}", foxglove.StatusLevel.Warning, name)
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
         task = self._loop.create_task(work)

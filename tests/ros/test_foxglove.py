@@ -7,7 +7,9 @@ import json
 import re
 import struct
 import sys
+import time
 from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from typing import Any
 
 import aiohttp
@@ -22,6 +24,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 import macs_zenoh
+from bridge.foxglove.publishing import ClientTopics
 from tests.support.processes import Process
 from tests.support.programs import ROOT, Program, ended, macs
 from tests.support.ros_peer import Peer, set_bool
@@ -81,11 +84,30 @@ async def site(domain: int) -> AsyncIterator[tuple[str, Client]]:
         Router() as router,
         Program("agent", "--id", "7", "-e", router.endpoint, env={"ROS_DOMAIN_ID": str(domain)}),
         Program("foxglove", "--port", "0", "-e", router.endpoint) as server,
+        client_of(server) as client,
+    ):
+        yield router.endpoint, client
+
+
+@asynccontextmanager
+async def client_of(server: Program) -> AsyncIterator[Client]:
+    """A client of a Foxglove server."""
+    async with (
         aiohttp.ClientSession() as session,
         session.ws_connect(f"ws://127.0.0.1:{server.port}", protocols=[SUBPROTOCOL], max_msg_size=0) as socket,
     ):
         assert socket.protocol == SUBPROTOCOL
-        yield router.endpoint, Client(socket)
+        yield Client(socket)
+
+
+COMMANDED = {"id": 5, "topic": "/7/cmd_vel", "encoding": "cdr", "schemaName": "geometry_msgs/msg/Twist"}
+
+
+def command(speed: float) -> bytes:
+    """What a client sends on the channel above."""
+    twist = Twist()
+    twist.linear.x = speed
+    return b"\x01" + struct.pack("<I", 5) + bytes(serialize_message(twist))
 
 
 async def test_a_topic_comes_as_it_was_published(site: tuple[str, Client], peer: Peer) -> None:
@@ -123,24 +145,52 @@ async def test_what_is_said_of_robots_comes_as_json(site: tuple[str, Client]) ->
     assert (stop["robot"], stop["by"]) == (7, "operator/0")
 
 
-async def test_what_is_published_and_called_is_done(site: tuple[str, Client], peer: Peer) -> None:
-    """A command goes to the robot that its topic names, a call to its service."""
+async def test_nobody_moves_a_robot_unless_the_server_was_told_so(site: tuple[str, Client], peer: Peer) -> None:
+    """Without --publish no client can: any web page on the machine is one. Nothing is registered, no service shown."""
     _, client = site
     driven = await peer.subscription(Twist, "/cmd_vel", 10)
     node = peer.session.node
     await peer.session.run(lambda: node.create_service(SetBool, "/set", set_bool))
-    twist = Twist()
-    twist.linear.x = 0.5
-    advertised = {"id": 5, "topic": "/7/cmd_vel", "encoding": "cdr", "schemaName": "geometry_msgs/msg/Twist"}
-    await client.send(op="advertise", channels=[advertised])
-    command = b"\x01" + struct.pack("<I", 5) + bytes(serialize_message(twist))
+    await until(lambda: any(said["op"] == "serverInfo" for said in client.said))
+    (info,) = [said for said in client.said if said["op"] == "serverInfo"]
+    assert not {"clientPublish", "services"} & set(info["capabilities"])
+    await client.send(op="advertise", channels=[COMMANDED])
+    for _ in range(5):
+        await client.socket.send_bytes(command(0.5))
+    await client.subscribe(1, "/macs/status")  # all before it has been read
+    await client.next(1)
+    assert driven.empty()
+    assert not client.services
+
+
+@pytest.fixture
+async def publishing(domain: int) -> AsyncIterator[Client]:
+    """The same with a server that lets clients publish to robot 7."""
+    async with (
+        Router() as router,
+        Program("agent", "--id", "7", "-e", router.endpoint, env={"ROS_DOMAIN_ID": str(domain)}),
+        Program("foxglove", "--port", "0", "-e", router.endpoint, "--publish", "--robot", "7") as server,
+        client_of(server) as client,
+    ):
+        assert any("may move robots" in line for line in server.log)
+        yield client
+
+
+async def test_what_is_published_and_called_is_done(publishing: Client, peer: Peer) -> None:
+    """A command goes to the robot that its topic names, if the server is for it, a call to its service."""
+    client = publishing
+    driven = await peer.subscription(Twist, "/cmd_vel", 10)
+    node = peer.session.node
+    await peer.session.run(lambda: node.create_service(SetBool, "/set", set_bool))
+    await client.send(op="advertise", channels=[COMMANDED, {**COMMANDED, "id": 6, "topic": "/8/cmd_vel"}])
 
     async def arrived() -> bool:
-        await client.socket.send_bytes(command)  # the first may come before ROS has found the subscription
+        await client.socket.send_bytes(command(0.5))  # the first may come before ROS has found the subscription
         return not driven.empty()
 
     await until(arrived, every_s=0.2)
     assert driven.get_nowait().linear.x == 0.5
+    await until(lambda: any("not for it" in said.get("message", "") for said in client.said))
     await until(lambda: "/7/set" in client.services)
     service = client.services["/7/set"]
     request = bytes(serialize_message(SetBool.Request(data=True)))
@@ -149,13 +199,71 @@ async def test_what_is_published_and_called_is_done(site: tuple[str, Client], pe
     assert struct.unpack_from("<II", answer, 1) == (service["id"], 9)
     (length,) = struct.unpack_from("<I", answer, 9)
     assert deserialize_message(answer[13 + length :], SetBool.Response).message == "set to True"
+    assert node.count_publishers("/cmd_vel") == 1
+    await client.socket.close()  # nobody drives any more, which the robot is told
+    await until(lambda: node.count_publishers("/cmd_vel") == 0)
 
 
 async def test_a_server_that_could_move_robots_stays_on_this_machine() -> None:
     """Nobody reaches it from elsewhere by mistake: it has no passwords."""
-    code, out, errors = await ended("foxglove", "--host", "0.0.0.0", "--port", "0")
+    code, out, errors = await ended("foxglove", "--host", "0.0.0.0", "--port", "0", "--publish")
     assert (code, out) == (2, "")
-    assert "--view-only" in errors
+    assert "without --publish" in errors
+
+
+class SlowRobot:
+    """Robot 7, which answers no registration until it may, and keeps the commands that come."""
+
+    def __init__(self, agent: macs_zenoh.Agent) -> None:
+        self.may = asyncio.Event()
+        self.asked = 0
+        self.commands: list[bytes] = []
+        agent.serve("add_node", self._add)
+        agent.serve("remove_node", self._done)
+        agent.on_message(lambda message: self.commands.append(bytes(message.data)))
+
+    async def _add(self, _: Any) -> bytes:
+        self.asked += 1
+        await self.may.wait()
+        return b"{}"
+
+    async def _done(self, _: Any) -> bytes:
+        return b"{}"
+
+
+async def test_old_commands_are_not_sent() -> None:
+    """What a panel publishes while its registration hangs, or while our loop does, is dropped and counted: only what
+    comes afterwards is sent, in its order, over one registration."""
+    async with (
+        Router() as router,
+        macs_zenoh.join("ros", id=7, connect=[router.endpoint]) as ros,
+        macs_zenoh.join("unity", connect=[router.endpoint]) as agent,
+    ):
+        robot, told = SlowRobot(ros), list[tuple[str, str]]()
+        topics = ClientTopics(agent, lambda robot, topic: True, lambda *what: told.append(what))
+        await until(lambda: (1, 7) in agent.directory)
+        topics.advertise((1, 5), "/7/cmd_vel", "geometry_msgs/msg/Twist", "cdr")
+        for number in range(20):
+            topics.publish((1, 5), b"\0\1\0\0old%d" % number, time.monotonic())
+        await until(lambda: robot.asked)
+        robot.may.set()
+
+        def arrived() -> bool:
+            topics.publish((1, 5), b"\0\1\0\0late", time.monotonic() - 0.3)
+            topics.publish((1, 5), b"\0\1\0\0new", time.monotonic())
+            return bool(robot.commands)
+
+        await until(arrived, every_s=0.1)
+        for number in range(50):
+            topics.publish((1, 5), b"\0\1\0\0%02d" % number, time.monotonic())
+        await until(lambda: robot.commands[-1].endswith(b"49"))
+        assert robot.commands[-50:] == [b"\0\1\0\0%02d" % number for number in range(50)]
+        assert set(robot.commands[:-50]) == {b"\0\1\0\0new"}
+        assert robot.asked == 1
+        assert agent.drops["no_node"] >= 20
+        assert agent.drops["too_old"] >= 1
+        assert not told
+        topics.close()
 
 
 async def test_the_layout_is_for_the_demo_robot(domain: int) -> None:
