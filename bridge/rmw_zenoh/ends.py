@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from bridge.ros.side import Events, MessageType, OnRaw
+from bridge.ros.side import Events, MessageType, OnRaw, first_line
 from macs_zenoh.mesh.ros_network import CALL_S, Request, RosClient, RosPublisher, RosService, RosSubscription
 from macs_zenoh.protocol.rmw_zenoh.attachment import Attachment
 from macs_zenoh.protocol.rmw_zenoh.keyexpr import NO_HASH, Endpoint, Kind
-from macs_zenoh.protocol.rmw_zenoh.qos import Qos
+from macs_zenoh.protocol.rmw_zenoh.qos import Durability, Qos
 
 if TYPE_CHECKING:
     from bridge.rmw_zenoh.session import ZenohSession
 
 log = logging.getLogger("macs.ros")
+
+T = TypeVar("T")
+
+AGAIN_S = 1.0
+"""After so long what could not be had is tried again."""
 
 
 class Entity(Protocol):
@@ -37,7 +43,8 @@ class Held:
         self.topic = topic
         self.type = of_type
         self._lock = threading.Lock()
-        self._closed = False
+        self._closed = self._trying = False
+        self._problem = ""
         self.entity: Any = self.make(session.hash_of(topic, of_type))
         session.hold(self)
 
@@ -52,14 +59,52 @@ class Held:
             self.session.submit(self._follow)
 
     def _follow(self) -> None:
+        """What is had until then stays until the other is there, and when that cannot be had now: what a robot is
+        stopped by may be published at any moment."""
         there = self.session.graph.on(self.topic, others=True)
         hashes = {one.hash for one in there if one.type == self.type}
         with self._lock:
             if self._closed or not hashes or self.entity.endpoint.hash in hashes:
                 return
+            made: Any = None
+            try:
+                made = self.make(self.session.hash_of(self.topic, self.type))
+                self.take_over(made)
+            except Exception as error:  # noqa: BLE001 - Zenoh's, whatever it is
+                if made is not None:
+                    made.close()
+                self._try_again(first_line(error))
+                return
             log.info("%s: its type %s has another hash on this robot now", self.topic, self.type)
-            self.entity.close()
-            self.entity = self.make(self.session.hash_of(self.topic, self.type))
+            old, self.entity, self._problem = self.entity, made, ""
+            old.close()
+
+    def take_over(self, made: Any) -> None:
+        """What nobody uses yet has from now on what the one before it had."""
+
+    def _try_again(self, problem: str) -> None:
+        if problem != self._problem:
+            self._problem = problem
+            log.warning("%s: its type %s has another hash now, but %s", self.topic, self.type, problem)
+        if self._trying:
+            return
+        self._trying = True
+
+        def follow() -> None:
+            self._trying = False
+            self._follow()
+
+        self.session.later(AGAIN_S, follow)
+
+    def use(self, do: Callable[[Any], T]) -> T:
+        """Do something with the entity, in any thread: again, when it is another one meanwhile."""
+        entity = self.entity
+        try:
+            return do(entity)
+        except Exception:
+            if entity is self.entity:
+                raise
+            return do(self.entity)
 
     def close(self) -> None:
         """Have it no more."""
@@ -108,6 +153,9 @@ class ZenohPublisher(Held):
     def __init__(self, session: ZenohSession, of: Typed, topic: str, qos: Qos, matched: Callable[[int], None]) -> None:
         self._qos = qos
         self._matched = matched
+        latched = qos.durability is Durability.TRANSIENT_LOCAL
+        self._held: deque[bytes] | None = deque(maxlen=max(1, qos.depth)) if latched else None
+        """What nodes hear that come later."""
         super().__init__(session, topic, of.name)
         self._tell()
 
@@ -116,7 +164,16 @@ class ZenohPublisher(Held):
 
     def publish(self, cdr: bytes) -> None:
         """`Publisher.publish`."""
-        self.entity.publish(cdr)
+        if self._held is None:
+            self.use(lambda entity: entity.publish(cdr))
+            return
+        with self._lock:  # what is latched is told in its order, by whichever entity
+            self.entity.publish(cdr)
+            self._held.append(cdr)
+
+    def take_over(self, made: Any) -> None:
+        for cdr in self._held or ():
+            made.publish(cdr)
 
     def changed(self, found: Endpoint, alive: bool) -> None:
         super().changed(found, alive)
@@ -143,7 +200,7 @@ class ZenohClient(Held):
 
     def call(self, request: bytes, done: Callable[[bytes | None, str], None]) -> Callable[[], None]:
         """`Client.call`."""
-        forget: Callable[[], None] = self.entity.call(request, done)
+        forget: Callable[[], None] = self.use(lambda entity: entity.call(request, done))
         return forget
 
 

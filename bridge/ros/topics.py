@@ -37,6 +37,10 @@ log = logging.getLogger("macs.ros")
 
 
 TOO_LARGE = "too_large"
+STOP_AGAIN_S = 0.05
+"""After so long a stop message that ROS did not take is published again."""
+STOP_TIMES = 15
+"""As long as a publisher that is not needed any more is kept for it."""
 
 
 class TopicNode(InterfaceNode):
@@ -153,7 +157,7 @@ class PublisherNode(TopicNode):
         with self.lock:
             refusal = self._refusal(message)
             if refusal is None:
-                if self._publish(cdr):
+                if self._publish(cdr, self._publisher):
                     self.carried.count(len(cdr))
                     if self.deadman is not None:
                         self.deadman.command(Registrant.of(message), time.monotonic() - message.age_s)
@@ -183,10 +187,10 @@ class PublisherNode(TopicNode):
             return "not_in_control", f"{self.control.holder(time.monotonic())} has control"
         return None
 
-    def _publish(self, cdr: bytes) -> bool:
+    def _publish(self, cdr: bytes, publisher: Publisher | None) -> bool:
         try:
-            assert self._publisher is not None
-            self._publisher.publish(cdr)
+            assert publisher is not None
+            publisher.publish(cdr)
         except Exception as error:  # noqa: BLE001 - the middleware's, whatever it is
             self.robot.drops.note("failed", self.topic, f"ROS did not publish: {error}")
             return False
@@ -235,9 +239,24 @@ class PublisherNode(TopicNode):
                 self._watch = self.robot.alarms.at(deadline, self._watch_silence)
 
     def _publish_stop(self, why: str, level: int = logging.WARNING) -> None:
-        if self._publisher is not None and self._publish(self._stop_cdr):
-            self._stopped_at = time.monotonic()
+        if self._publisher is not None:
+            self._say_stop(self._publisher, why, level)
+
+    def _say_stop(self, publisher: Publisher, why: str, level: int, times: int = 1) -> None:
+        """Again when ROS does not take it, also while the publisher is closing: nothing else would."""
+        if times > 1 and self.deadman is not None and self.deadman.commander is not None:
+            return  # it is commanded anew
+        self._stopped_at = time.monotonic()
+        if self._publish(self._stop_cdr, publisher):
             log.log(level, "%s: %s; published the stop message", self.topic, why)
+        elif times < STOP_TIMES:
+            again = self._stopped_at + STOP_AGAIN_S
+
+            def say() -> None:
+                with self.lock:
+                    self._say_stop(publisher, why, level, times + 1)
+
+            self.robot.alarms.at(again, say)
 
     def status(self) -> NodeStatus:
         return structs.replace(super().status(), control=self._control_status(), deadman=self._deadman_status())
