@@ -349,8 +349,8 @@ class Agent:
     ) -> None:
         """Publish one message, as CDR or as a value, to a topic of robots: it may move them.
 
-        It stays advertised until the agent is closed; `advertise` gives more say. Raises what `subscribe` raises, and
-        MissingExtra, UnknownType and BadValue for what cannot be written.
+        It stays advertised until the agent is closed; `advertise` gives more say. Of those that wait for that only the
+        newest is sent (``too_old``). Raises what `subscribe` raises, and MissingExtra, UnknownType and BadValue.
         """
         await self._robot_nodes().publish(topic, data, robot, group, type, timeout_s)
 

@@ -74,6 +74,10 @@ KNOWN = 1024
 
 
 User = TypeVar("User", bound=NodeUser)
+Published = tuple[str, frozenset[int], frozenset[int]]
+"""A topic, robots and groups."""
+Asked = tuple[str, frozenset[int], frozenset[int], str | None]
+"""The same with a type."""
 
 
 class Nodes:
@@ -86,7 +90,10 @@ class Nodes:
         self._reader = StreamReader(layout, self._bad_frame)
         self._types: Types | None = None
         self._services: dict[tuple[str, int], ServiceUser] = {}
-        self._publishers: dict[tuple[str, frozenset[int], frozenset[int]], TopicPublisher] = {}
+        self._publishers: dict[Published, TopicPublisher] = {}
+        self._registering: dict[Asked, asyncio.Task[TopicPublisher]] = {}
+        self._newest: dict[Published, int] = {}
+        """How many messages `publish` was given: of those that wait only the newest is sent."""
         self._next_request = itertools.count().__next__
         self._open: dict[tuple[int, str, int], asyncio.Future[bytes]] = {}
         """Calls by robot, node name and request id."""
@@ -136,13 +143,39 @@ class Nodes:
     ) -> None:
         """See `Agent.publish`."""
         key = (topic, *chosen(robot, group))
+        number = self._newest[key] = self._newest.get(key, 0) + 1
         publisher = self._publishers.get(key)
         if publisher is None or is_other(of_type, publisher):
-            if publisher is not None:
-                publisher.close()
-            publisher = await self.advertise(topic, robot, group, of_type, timeout_s)
-            self._publishers[key] = publisher
+            publisher = await self._advertised((*key, of_type), key, timeout_s)
+            if number != self._newest[key]:  # a newer one may have gone out already
+                self.agent.drops.note("too_old", topic, "waited for its registration while a newer message came")
+                return
         publisher.publish(data)
+
+    async def _advertised(self, asked: Asked, key: Published, timeout_s: float) -> TopicPublisher:
+        """The publisher of `publish`, with one registration for all that wait for it."""
+        registering = self._registering.get(asked)
+        if registering is None:
+            former = self._publishers.pop(key, None)
+            if former is not None:
+                former.close()
+            registering = asyncio.ensure_future(self.advertise(asked[0], asked[1], asked[2], asked[3], timeout_s))
+            self._registering[asked] = registering
+            registering.add_done_callback(lambda done: self._has_advertised(asked, key, done))
+            return await asyncio.shield(registering)
+        try:
+            return await within(asyncio.shield(registering), timeout_s)
+        except asyncio.TimeoutError as error:
+            raise CallTimeout(f"registration of {asked[0]}", timeout_s) from error
+
+    def _has_advertised(self, asked: Asked, key: Published, done: asyncio.Task[TopicPublisher]) -> None:
+        del self._registering[asked]
+        if done.cancelled() or done.exception() is not None:
+            return
+        former = self._publishers.get(key)
+        if former is not None:
+            former.close()
+        self._publishers[key] = done.result()
 
     async def call(
         self, service: str, request: bytes | Value, robot: int, of_type: str | None, timeout_s: float
@@ -422,7 +455,7 @@ class Nodes:
         """The agent leaves: robots see that by its presence."""
         self._closed = True
         self._following.close()
-        for task in self._tasks:
+        for task in [*self._tasks, *self._registering.values()]:
             task.cancel()
         self._calls.close()
         for node in list(self._nodes.values()):

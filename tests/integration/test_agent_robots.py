@@ -38,6 +38,8 @@ class Robot:
         self.registrants: set[int] = set()
         self.asked: list[AddNode | RemoveNode] = []
         self.refusal = refusal
+        self.may_answer = asyncio.Event()
+        self.may_answer.set()
         self._streams = Streams(agent)
         agent.serve("add_node", self._add)
         agent.serve("remove_node", self._remove)
@@ -45,6 +47,7 @@ class Robot:
     async def _add(self, call: macs_zenoh.Call) -> bytes:
         node = decode_data(AddNode, call.data)
         self.asked.append(node)
+        await self.may_answer.wait()
         if self.refusal:
             raise Refused(self.refusal)
         self.registrants.add(node.registrant_agent_id)
@@ -168,6 +171,29 @@ async def test_a_silent_robot_is_a_timeout_and_leaves_nothing(router: str) -> No
             await agent.subscribe(TOPIC, robot=1, type=STRING, timeout_s=0.5)
         with pytest.raises(macs_zenoh.Unreachable):
             await agent.subscribe(TOPIC, robot=1, timeout_s=0.5)
+
+
+async def test_what_waited_for_its_registration_is_no_burst(router: str) -> None:
+    """Of commands that were published while the robot did not answer the newest is sent, in front of what comes then,
+    over one registration; the others are counted."""
+    async with robot(router, 1) as one, macs_zenoh.join("unity", settings=patient(router)) as agent:
+        received: list[bytes] = []
+        one.agent.on_message(lambda message: received.append(bytes(message.data)))
+        await until(lambda: (1, 1) in agent.directory)
+        one.may_answer.clear()
+
+        async def publish(number: int) -> None:
+            await agent.publish("/drive", b"\0\1\0\0%02d" % number, robot=1, type=STRING, timeout_s=PATIENCE_S)
+
+        waiting = [asyncio.create_task(publish(number)) for number in range(20)]
+        await until(lambda: one.asked)
+        one.may_answer.set()
+        await asyncio.gather(*waiting)
+        await publish(20)
+        await until(lambda: received and received[-1].endswith(b"20"))
+        assert received == [b"\0\1\0\x0019", b"\0\1\0\x0020"]
+        assert len(one.asked) == 1
+        assert agent.drops["too_old"] == 19
 
 
 async def test_one_of_several_users_leaves(router: str) -> None:

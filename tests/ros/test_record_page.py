@@ -64,8 +64,13 @@ async def test_every_command_on_the_page(peer: Peer, domain: int, tmp_path: Path
                         line.replace("robots N, N", "robot N") for line in shown
                     ]
                     if words[0] == "record" and "--ring" not in words:
-                        await until(lambda: publisher.get_subscription_count())
-                        publisher.publish(String(data="hello"))
+                        file = tmp_path / "monday.mcap"
+
+                        def recorded(file: Path = file) -> bool:
+                            publisher.publish(String(data="hello"))
+                            return b"/7/chatter" in file.read_bytes()
+
+                        await until(recorded, every_s=0.1)
                     assert await program.stop(signal.SIGINT) == 0, program.tail
             else:
                 code, out, errors = await ended(*words)
