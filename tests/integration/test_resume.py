@@ -449,7 +449,9 @@ async def test_a_thousand_times_leave_nothing_behind(start_site: StartSite, capl
         tracemalloc.stop()
         print(f"1 000 times: {after - before} bytes more")
         assert headset.id == own_id
-        assert after - before < 512 << 10  # a leak of a connection would be megabytes
+        # Timers that were cancelled wait in the event loop until they are a hundred: some 30 KB, more or less. One
+        # string for each return would be more than all that may remain.
+        assert after - before < 64 << 10
         assert len(site.gateway.agents) == 2
         assert len(site.gateway._sleepers) == 0
         everybody = sorted({own_id, other.id})
