@@ -41,6 +41,7 @@ from macs_zenoh.protocol.messages import (
     UNITY,
     AccessRefused,
     AddNode,
+    AgentsGone,
     Configuration,
     NodeRefused,
     NodeType,
@@ -326,7 +327,7 @@ async def test_changed_rights_hold_at_once(start_door: StartDoor, robots: list[A
 
 
 async def test_a_token_knows_of_its_own_robots_only(start_door: StartDoor, router: str) -> None:
-    """Who is online: of robots those that it names, by id or by group; without a token, all."""
+    """Who is online, and who leaves: of robots those that it names, by id or by group; without a token, all."""
     door = await start_door(tls_without_token="everybody")
     tokens = {
         "one": door.tokens.make("one", may=["see"], robots=[1]),
@@ -350,6 +351,17 @@ async def test_a_token_knows_of_its_own_robots_only(start_door: StartDoor, route
                     online = await headset.online()
                     assert online.ros_agent_ids == sees[name], name
                     assert len(online.unity_agent_ids) == len(tokens)
+        await until(lambda: door.gateway.directory.ids(ROS) == [])
+        async with await door.come("plain") as last:
+            pass  # everybody is told of all who leave in the order in which they do
+        for name, headset in headsets.items():
+            gone: list[tuple[int, int]] = []
+            while (UNITY, last.id) not in gone:
+                message = await headset.receive(PATIENCE_S)
+                if message.metadata.message_manager == AgentsGone.manager:
+                    agents = decode_data(AgentsGone, message.data).agents
+                    gone += [(agent.agent_type, agent.agent_id) for agent in agents]
+            assert sorted(gone) == [(ROS, robot) for robot in sees[name]] + [(UNITY, last.id)], name
 
 
 async def test_loopback_needs_no_token_unless_it_is_said(start_door: StartDoor) -> None:
