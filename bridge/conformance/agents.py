@@ -68,6 +68,8 @@ class Agent:
         self.group = 0
         self.kind = 2
         self.messages: list[Received] = []
+        self.looked_at = 0
+        """How many messages have come and were waited for, or let go of."""
         self.ended = False
         self.problem = ""
         self._reader = reader
@@ -124,6 +126,7 @@ class Agent:
         def look() -> bool:
             while self.messages and not found:
                 message = self.messages.pop(0)
+                self.looked_at += 1
                 if wanted(message):
                     found.append(message)
             return bool(found) or self.ended

@@ -100,6 +100,32 @@ async def _missed(scene: Scene) -> None:
     expect_copies(await scene.fence(other, again, word), 1)
 
 
+@TRIALS.add("sessions.again", "What it has received is not sent again, and what it has not is.", Level.STRICT)
+async def _again(scene: Scene) -> None:
+    agent, secret = await _opened(scene)
+    before = agent.looked_at
+    other = await scene.headset()
+    one, two = scene.word(), scene.word()
+    for word in (one, two):
+        await other.send(other.frame("unicast", peer=agent.id, text=word))
+    await agent.wait(lambda message: one.encode() in message.data, "a message to it")
+    received = agent.looked_at - before  # with news of who has left, of which there may be some
+    await agent.wait(lambda message: two.encode() in message.data, "the next message to it")
+    agent.reset()
+    again, _ = await _back(scene, secret, received)
+    last = scene.word()
+    await other.send(other.frame("unicast", peer=again.id, text=last))
+    seen: list[Received] = []
+
+    def is_last(message: Received) -> bool:
+        seen.append(message)
+        return last.encode() in message.data
+
+    await again.wait(is_last, "a message to it")
+    expect_copies([message for message in seen if one.encode() in message.data], 0)
+    expect_copies([message for message in seen if two.encode() in message.data], 1)
+
+
 @TRIALS.add("sessions.frames", "It is told how many of its frames have come.", Level.STRICT)
 async def _frames(scene: Scene) -> None:
     agent, secret = await _opened(scene)
