@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import time
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from aiohttp import web
 
-from bridge.metrics.answers import Answers
+from bridge.metrics.answers import Answered, Answers
 from bridge.metrics.families import Family, by_type, counter, gauge
 from bridge.metrics.watched import Watched
 from macs_zenoh.protocol.keyexpr import type_name
@@ -19,6 +20,12 @@ from .site import Site
 
 if TYPE_CHECKING:
     from .server import Gateway
+
+
+GOOD_S = 0.5
+"""So long an answer is given again: of many agents it takes the loop longer than many frames."""
+OPEN_METRICS = "application/openmetrics-text"
+"""Who accepts this in whatever version is answered in it: one answer for all who do."""
 
 
 def watched(gateway: Gateway) -> Watched:
@@ -57,7 +64,7 @@ def _of_connections(gateway: Gateway) -> Mapping[str, int]:
 
 def _figures(gateway: Gateway) -> Iterator[Family]:
     online = list(gateway.agents.online())
-    now = time.monotonic()
+    now = monotonic()
     yield by_type("macs_own_agents", "agents of this gateway", (type_name(each.peer.agent_type) for each in online))
     yield gauge("macs_connections", "connections, with those that have not said who they are").add(len(gateway.agents))
     yield gauge("macs_away_agents", "agents of which nothing was heard for 10 s").add(
@@ -90,16 +97,22 @@ def add_figures(site: Site) -> None:
     """Answer who watches, at the web port: figures and diagnostics to who shows a token where one is wanted, to all
     others whether the gateway lives and is ready."""
     answers = Answers(watched(site.gateway))
+    kept: dict[tuple[str, str], tuple[float, Answered]] = {}
 
-    def answered(request: web.Request) -> web.Response:
-        said = answers.answer(request.path, request.headers.get("Accept", ""))
+    def written(said: Answered) -> web.Response:
         return web.Response(status=said.status, body=said.body, headers={"Content-Type": said.media_type})
 
     async def for_visitors(request: web.Request, visitor: Grant) -> web.StreamResponse:
-        return answered(request)
+        accept = OPEN_METRICS if OPEN_METRICS in request.headers.get("Accept", "") else ""
+        about, now = (request.path, accept), monotonic()
+        at, said = kept.get(about, (-math.inf, None))
+        if said is None or now - at > GOOD_S:
+            said = answers.answer(request.path, accept)
+            kept[about] = now, said
+        return written(said)
 
     async def for_all(request: web.Request) -> web.StreamResponse:
-        return answered(request)
+        return written(answers.answer(request.path))
 
     for path in ("/metrics", "/diagnostics"):
         site.get(path, for_visitors)

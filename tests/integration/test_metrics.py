@@ -9,12 +9,14 @@ import shutil
 import socket
 import subprocess
 import time
+from collections import Counter
 from contextlib import AsyncExitStack
 from typing import Any
 
 import aiohttp
 import pytest
 
+from bridge.gateway import figures
 from bridge.headset.client import Headset
 from bridge.tokens import store
 from macs_zenoh.protocol.messages import Configuration, encode_management
@@ -134,6 +136,29 @@ async def test_a_token_is_wanted_where_the_port_wants_one(start_gateway: StartGa
         assert (await get(f"{where}/{page}", Authorization=f"Bearer {secret}"))[0] == 200
     for page in ("healthz", "readyz"):
         assert (await get(f"{where}/{page}"))[0] == 200
+
+
+async def test_who_asks_again_and_again_is_told_the_same(
+    start_gateway: StartGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Working figures out takes the loop the longer the more agents there are: it is done once for a while, whoever
+    asks and in whatever version he wants them, and then anew."""
+    gateway = await start_gateway(web_port=0)
+    where = f"http://127.0.0.1:{gateway.listeners.web_port}"
+    now, worked_out = [1000.0], Counter[str]()
+    carried, tells = gateway.carried, gateway.mesh.tells
+    monkeypatch.setattr(gateway, "carried", lambda: worked_out.update(["metrics"]) or carried())
+    monkeypatch.setattr(gateway.mesh, "tells", lambda: worked_out.update(["diagnostics"]) or tells())
+    monkeypatch.setattr(figures, "monotonic", lambda: now[0])
+    accepted = ("", *(f"{figures.OPEN_METRICS}; version={number}.0.0; escaping=x{number}" for number in range(5)))
+    for times in (1, 2):
+        for accept in accepted:
+            status, text = await get(f"{where}/metrics", Accept=accept)
+            assert status == 200
+            assert text.endswith("# EOF\n") is bool(accept)
+            assert json.loads((await get(f"{where}/diagnostics", Accept=accept))[1])["program"] == "gateway"
+        assert worked_out == {"metrics": 2 * times, "diagnostics": 2 * times}
+        now[0] += figures.GOOD_S + 0.01
 
 
 async def test_a_thousand_agents_make_no_more_figures(
