@@ -6,11 +6,13 @@ rosbags brings serve.
 
 from __future__ import annotations
 
+import asyncio
 import importlib
+import math
 import re
 import time
 from collections import OrderedDict
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 from macs_zenoh.errors import MacsError
 from macs_zenoh.protocol import schemas
@@ -22,6 +24,8 @@ KEPT = 1024
 """So many texts are remembered."""
 GOOD_S = 60.0
 """A robot that comes back may have other types."""
+UNKNOWN_S = 5.0
+"""So long nobody is asked again for what nobody knew."""
 
 _NAME = re.compile(r"[A-Za-z]\w{0,99}/(msg/|(srv|action)/\w+_)[A-Za-z]\w{0,99}", re.ASCII)
 
@@ -36,32 +40,43 @@ _SERVICES = {
 """What everybody uses and rosbags does not have."""
 
 
+T = TypeVar("T")
+
+
 class Definitions:
     """Texts by robot and type, each asked for once."""
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
         self._kept: OrderedDict[tuple[int, str], tuple[float, str]] = OrderedDict()
+        self._unknown: OrderedDict[tuple[int, str], float] = OrderedDict()
+        """When nobody knew it: names that somebody makes up displace no texts."""
         self._store: Any = None
+        self._loading = asyncio.Lock()
 
-    async def text(self, robot: int, name: str) -> str | None:
-        """The text of ``pkg/msg/Name``, ``pkg/srv/Name_Request`` and the like on this robot; None where nobody has
-        it."""
-        now = time.monotonic()
-        at, text = self._kept.get((robot, name), (now, None))
-        if text is None or now - at > GOOD_S:
-            text = await self._of_robot(robot, name)
-            if text is None:
-                text = self._of_everybody(name)
-            if text is not None:
-                self._kept[robot, name] = (now, text)
-                while len(self._kept) > KEPT:
-                    self._kept.popitem(last=False)
+    async def text(self, robot: int | None, name: str) -> str | None:
+        """The text of ``pkg/msg/Name``, ``pkg/srv/Name_Request`` and the like on this robot, or as everybody has it;
+        None where nobody has it."""
+        if not _NAME.fullmatch(name):
+            return None
+        if robot is None:
+            return await self._of_everybody(name)
+        about, now = (robot, name), time.monotonic()
+        at, text = self._kept.get(about, (now, None))
+        if text is not None and now - at <= GOOD_S:
+            return text
+        if now - self._unknown.get(about, -math.inf) <= UNKNOWN_S:
+            return None
+        text = await self._of_robot(robot, name)
+        if text is None:
+            text = await self._of_everybody(name)
+        if text is None:
+            _keep(self._unknown, about, now)
+        else:
+            _keep(self._kept, about, (now, text))
         return text
 
     async def _of_robot(self, robot: int, name: str) -> str | None:
-        if not _NAME.fullmatch(name):
-            return None
         whole = name if "/msg/" in name else name.rpartition("_")[0]
 
         async def ask(verb: str, data: bytes) -> bytes:
@@ -73,16 +88,34 @@ class Definitions:
             return None  # an existing program, or one that does not answer in time
         return schemas.schema(name, told.definitions)
 
-    def _of_everybody(self, name: str) -> str | None:
+    async def _of_everybody(self, name: str) -> str | None:
         if name in _SERVICES:
             return _SERVICES[name]
-        if self._store is None:
-            try:
-                typesys = importlib.import_module("rosbags.typesys")
-            except ImportError:
-                return None
-            self._store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+        async with self._loading:
+            if self._store is None:
+                self._store = await asyncio.to_thread(_load)  # it takes as long as many frames
         if name not in self._store.fielddefs:
             return None
         text: str = self._store.generate_msgdef(name, ros_version=2)[0]
         return text
+
+
+class _Nothing:
+    """Where rosbags is not installed."""
+
+    fielddefs: ClassVar[dict[str, Any]] = {}
+
+
+def _load() -> Any:
+    try:
+        typesys = importlib.import_module("rosbags.typesys")
+    except ImportError:
+        return _Nothing()
+    return typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+
+
+def _keep(kept: OrderedDict[tuple[int, str], T], about: tuple[int, str], what: T) -> None:
+    kept.pop(about, None)
+    kept[about] = what
+    while len(kept) > KEPT:
+        kept.popitem(last=False)
