@@ -16,6 +16,7 @@ from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol import keyexpr, ping
 from macs_zenoh.protocol.directory import Directory, published
 from macs_zenoh.protocol.keyexpr import LEASE, PING
+from macs_zenoh.protocol.limits import NAME_BYTES
 from macs_zenoh.protocol.messages import ROS, UNITY
 from macs_zenoh.protocol.rights import Grant
 from macs_zenoh.versions import installed
@@ -28,6 +29,8 @@ PINGS_PER_S = 50.0
 PING_GOOD_S = 2.0
 PING_S = 2.0
 PINGS_AT_ONCE = 16
+DROPS = 200
+"""So many names of losses are shown of a robot."""
 SESSIONS = 1024
 """More are shown without the length of the way to them."""
 
@@ -147,18 +150,39 @@ class Picture:
         return found
 
 
+class _Control(msgspec.Struct):
+    holder: str | None = None
+
+
+class _Node(msgspec.Struct):
+    name: str
+    control: _Control | None = None
+
+
+class _Stop(msgspec.Struct):
+    by: str = ""
+
+
+class _Status(msgspec.Struct):
+    """Of a robot's state what the picture shows: a robot may answer whatever it likes."""
+
+    stopped: bool = False
+    stop: _Stop | None = None
+    nodes: list[_Node] = []
+    drops: dict[str, int] = {}
+
+
 def _state(status: dict[str, Any] | None) -> dict[str, Any]:
-    """Of a robot's state what the picture shows."""
-    if status is None:
+    """What the picture shows of a robot's state; of one that makes no sense nothing."""
+    try:
+        said = msgspec.convert(status, _Status)
+    except msgspec.ValidationError:  # None as well
         return {"known": False}
-    nodes = [node for node in status.get("nodes", []) if isinstance(node, dict)]
-    holders = {
-        node.get("name"): node["control"].get("holder") for node in nodes if isinstance(node.get("control"), dict)
-    }
+    held = {node.name[:NAME_BYTES]: node.control.holder for node in said.nodes if node.control is not None}
     return {
         "known": True,
-        "stopped": status.get("stopped") is True,
-        "stoppedBy": str((status.get("stop") or {}).get("by", "")),
-        "control": {name: holder for name, holder in holders.items() if holder},
-        "drops": status.get("drops", {}),
+        "stopped": said.stopped,
+        "stoppedBy": said.stop.by[:NAME_BYTES] if said.stop is not None else "",
+        "control": {name: holder[:NAME_BYTES] for name, holder in held.items() if holder},
+        "drops": {name[:NAME_BYTES]: count for name, count in list(said.drops.items())[:DROPS]},
     }
