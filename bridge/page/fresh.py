@@ -25,6 +25,11 @@ class Fresh(Generic[T]):
         self._problem: MacsError | None = None
         self._asking: asyncio.Task[None] | None = None
 
+    @property
+    def asking(self) -> bool:
+        """Whether somebody may wait for an answer."""
+        return self._asking is not None
+
     def last(self, good_s: float | None = None) -> T | None:
         """What is known now. An old answer (``good_s``) is given as well, and a new one asked for."""
         self._look(good_s)

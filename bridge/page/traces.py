@@ -10,6 +10,7 @@ from typing import Any, cast
 
 from bridge.graph.site import Site
 from bridge.graph.traces import Noting, Tracing
+from macs_zenoh.errors import Refused
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.directory import Directory
 
@@ -21,7 +22,7 @@ COUNT = 100
 GOOD_S = 0.3
 ANSWER_S = 1.0
 TOPICS = 16
-"""So many topics are traced at one time; who looks at more makes the ones before be forgotten."""
+"""So many topics are traced at one time; whose messages are awaited is not forgotten for another."""
 
 
 @dataclass
@@ -58,11 +59,14 @@ class Traces:
 
     async def of(self, robot: int, topic: str) -> list[dict[str, Any]]:
         """Each way that messages took, as `bridge.graph.traces.Traced` tells it; none where no message came. Raises
-        Unreachable, UsageError."""
+        Refused, Unreachable, UsageError."""
         fresh = self._kept.get((robot, topic))
         if fresh is None:
-            while len(self._kept) >= TOPICS:
-                self._kept.popitem(last=False)[1].close()
+            if len(self._kept) >= TOPICS:
+                idle = next((about for about, kept in self._kept.items() if not kept.asking), None)
+                if idle is None:
+                    raise Refused(f"{TOPICS} topics are traced for pages already")
+                del self._kept[idle]
             fresh = self._kept[robot, topic] = Fresh(partial(self._collect, robot, topic), GOOD_S)
         self._kept.move_to_end((robot, topic))
         return await fresh.now()
