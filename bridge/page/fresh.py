@@ -41,7 +41,7 @@ class Fresh(Generic[T]):
         if self._asking is not None:
             await asyncio.shield(self._asking)
         if self._problem is not None:
-            raise self._problem
+            raise self._problem.with_traceback(None)  # each raising would lengthen it
         assert self._answer is not None
         return self._answer
 
@@ -62,7 +62,8 @@ class Fresh(Generic[T]):
             self._answer = await self._ask()
             self._problem = None
         except MacsError as error:
-            self._answer, self._problem = None, error
+            self._answer, self._problem = None, error.with_traceback(None)  # which keeps all that was at work
+            error.__cause__ = error.__context__ = None
         finally:
             self._answered_at = asyncio.get_running_loop().time()
             self._asking = None

@@ -65,12 +65,14 @@ class Picture:
     def now(self, visitor: Grant, address: str, drops: Mapping[str, int]) -> dict[str, Any]:
         """All of it, as far as it is known and the visitor may know; the rest is asked for meanwhile. ``address`` and
         ``drops`` are this gateway's own."""
-        agents = [agent for agent in self._directory if agent.type in (ROS, UNITY)]
-        robots = [agent for agent in agents if agent.type == ROS]
-        seen = [agent.id for agent in robots if may_see(visitor, agent.id)]
-        states = self._robots.known(seen)
+        rights = visitor.rights
+        everybody = [agent for agent in self._directory if agent.type in (ROS, UNITY)]
+        robots = [a for a in everybody if a.type == ROS and (rights is None or rights.sees(a.id, a.group))]
+        headsets = [agent for agent in everybody if agent.type == UNITY]
+        states = self._robots.known(agent.id for agent in robots if may_see(visitor, agent.id, agent.group))
         gateways = {*(self._gateways.last() or ()), self._mesh.zid}
-        sessions = {agent.zid for agent in agents} | gateways
+        sessions = {agent.zid for agent in (*robots, *headsets)} | gateways
+        self._forget({agent.zid for agent in everybody} | gateways)
         return {
             "time": time.time(),
             "own": self._mesh.zid,
@@ -85,9 +87,7 @@ class Picture:
                 {"id": agent.id, "group": agent.group, "session": agent.zid, **_state(states.get(agent.id))}
                 for agent in robots
             ],
-            "headsets": [
-                {"id": agent.id, "group": agent.group, "session": agent.zid} for agent in agents if agent.type == UNITY
-            ],
+            "headsets": [{"id": agent.id, "group": agent.group, "session": agent.zid} for agent in headsets],
         }
 
     def close(self) -> None:
@@ -115,9 +115,12 @@ class Picture:
             )
         return shown
 
-    def _shown_sessions(self, sessions: set[str]) -> dict[str, dict[str, Any]]:
+    def _forget(self, sessions: set[str]) -> None:
+        """Ping none but these, whoever may know of them."""
         for gone in self._pings.keys() - sessions:
             self._pings.pop(gone).close()
+
+    def _shown_sessions(self, sessions: set[str]) -> dict[str, dict[str, Any]]:
         good_s = max(PING_GOOD_S, len(sessions) / PINGS_PER_S)
         shown: dict[str, dict[str, Any]] = {}
         for zid in sorted(sessions)[:SESSIONS]:

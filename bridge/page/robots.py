@@ -74,6 +74,7 @@ class Robots:
     def _fresh(self, robot: int, verb: str, good_s: float) -> Fresh[dict[str, Any]]:
         fresh = self._asked.get((robot, verb))
         if fresh is None:
+            self._forget()
             fresh = self._asked[robot, verb] = Fresh(partial(self._ask_json, robot, verb), good_s)
         return fresh
 
@@ -97,10 +98,10 @@ class Robots:
         return document
 
 
-def may_see(visitor: Grant, robot: int) -> bool:
-    """Whether who asks may be told of a robot."""
+def may_see(visitor: Grant, robot: int, group: int) -> bool:
+    """Whether who asks may be told of a robot of this group."""
     rights = visitor.rights
-    return rights is None or (rights.has("see") and (rights.robots == "any" or robot in rights.robots))
+    return rights is None or (rights.has("see") and rights.sees(robot, group))
 
 
 def problem_of(error: MacsError) -> str:

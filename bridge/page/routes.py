@@ -14,6 +14,7 @@ from bridge.gateway.site import Site
 from macs_zenoh.errors import MacsError
 from macs_zenoh.protocol.credit import Credit
 from macs_zenoh.protocol.limits import NAME_BYTES
+from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.rights import RIGHTS, Grant
 from macs_zenoh.versions import installed
 
@@ -117,10 +118,9 @@ class Page:
 
     async def _robot(self, request: web.Request, visitor: Grant) -> web.StreamResponse:
         robot = int(request.match_info["robot"])
-        if not may_see(visitor, robot):
-            return _json({"error": "this token does not give the right to see this robot"})
-        if not self._site.gateway.mesh.linked:
-            return _json({"error": "this gateway has lost its router"})
+        problem = self._problem(robot, visitor)
+        if problem is not None:
+            return _json({"error": problem})
         asking = self._robots.status if request.match_info["what"] == "status" else self._robots.offers
         try:
             return _json(await asking(robot))
@@ -129,8 +129,11 @@ class Page:
 
     async def _trace(self, request: web.Request, visitor: Grant) -> web.StreamResponse:
         robot, topic = int(request.match_info["robot"]), request.query.get("topic", "")[:NAME_BYTES]
-        if not may_see(visitor, robot):
-            return _json({"error": "this token does not give the right to see this robot"})
+        problem = self._problem(robot, visitor)
+        if problem is None and visitor.rights is not None:
+            problem = visitor.rights.of_topic(topic)
+        if problem is not None:
+            return _json({"error": problem})
         try:
             return _json({"ways": await self._traces.of(robot, topic)})
         except MacsError as error:
@@ -139,10 +142,27 @@ class Page:
     async def _type(self, request: web.Request, visitor: Grant) -> web.StreamResponse:
         said = request.match_info
         robot, name = int(said["robot"]), f"{said['package']}/{said['kind']}/{said['name']}"
-        text = await self._definitions.text(robot, name) if may_see(visitor, robot) else None
+        text = None
+        if self._may_see(robot, visitor):
+            text = await self._definitions.text(robot if self._is_online(robot) else None, name)
         if text is None:
             return _json({"error": f"nobody here knows the type {name}"})
         return _json({"text": text})
+
+    def _is_online(self, robot: int) -> bool:
+        return (ROS, robot) in self._site.gateway.directory
+
+    def _may_see(self, robot: int, visitor: Grant) -> bool:
+        agent = self._site.gateway.directory.get(ROS, robot)
+        return may_see(visitor, robot, agent.group if agent is not None else 0)
+
+    def _problem(self, robot: int, visitor: Grant) -> str | None:
+        """Why a robot is not even asked: nothing is remembered of robots that are not there."""
+        if not self._may_see(robot, visitor):
+            return "this token does not give the right to see this robot"
+        if not self._site.gateway.mesh.linked:
+            return "this gateway has lost its router"
+        return None if self._is_online(robot) else f"robot {robot} is not online"
 
 
 def _json(document: Mapping[str, Any]) -> web.Response:

@@ -129,6 +129,10 @@ class Rights(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     # -- pieces --------------------------------------------------------------------------------------------------
 
+    def of_topic(self, name: str) -> str | None:
+        """Why an agent may not see a topic, on any robot; None: it may."""
+        return self._of_node(int(NodeType.SUBSCRIBER), name)
+
     def _named(self, agent_type: int, ids: Iterable[int], groups: Iterable[int]) -> str | None:
         if agent_type == ROS and self.robots != ANY:
             for robot in ids:

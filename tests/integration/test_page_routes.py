@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import threading
+import traceback
 from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
@@ -15,11 +17,11 @@ import aiohttp
 import pytest
 
 from bridge.gateway import Gateway
-from bridge.page import files, routes
+from bridge.page import definitions, files, mesh, robots, routes, traces
 from bridge.page.fresh import Fresh
 from bridge.tokens import store
 from macs_zenoh import join
-from macs_zenoh.errors import Unreachable
+from macs_zenoh.errors import Refused, Unreachable
 from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.rights import Rights
 from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
@@ -213,9 +215,9 @@ async def test_who_has_a_token_is_told_what_it_permits(
     assert "error" in await one.told("/types/6/own_msgs/msg/Level", **cookie)
 
     async def told_of_five() -> bool:
-        known = {robot["id"]: robot["known"] for robot in (await one.told("/view/mesh", **cookie))["robots"]}
-        assert known[6] is False
-        return known[5] is True
+        robots = (await one.told("/view/mesh", **cookie))["robots"]
+        assert [robot["id"] for robot in robots] == [5]
+        return robots[0]["known"] is True
 
     await until(told_of_five)
     assert asked.counts[6, "status"] == asked.counts[6, "definitions"] == 0
@@ -246,3 +248,230 @@ async def test_an_answer_is_asked_for_once() -> None:
     assert fresh.last(0.0) is None
     assert await fresh.now() == 3
     fresh.close()
+
+
+async def test_a_kept_problem_keeps_nothing_else_alive() -> None:
+    """Whoever hears of it hears the same: what was at work is not remembered, and it does not grow."""
+
+    async def ask() -> int:
+        try:
+            json.loads("no")
+        except ValueError as error:
+            raise Unreachable("robot 7", "its answer makes no sense") from error
+        return 1
+
+    fresh, lengths = Fresh(ask, 1000.0), []
+    for _ in range(5):
+        with pytest.raises(Unreachable) as raised:
+            await fresh.now()
+        assert raised.value.__cause__ is raised.value.__context__ is None
+        lengths.append(len(traceback.extract_tb(raised.value.__traceback__)))
+    assert len(set(lengths)) == 1
+    fresh.close()
+
+
+async def test_nothing_is_remembered_of_robots_that_are_not_there(
+    start_gateway: StartGateway, session: aiohttp.ClientSession, asked: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever asks for each id there could be costs a gateway nothing that stays; nor does who makes up types."""
+    made: list[robots.Robots] = []
+    made_types: list[definitions.Definitions] = []
+    keep(monkeypatch, routes, "Robots", made)
+    keep(monkeypatch, routes, "Definitions", made_types)
+    gateway = await start_gateway(web_port=0)
+    one = Browser(session, gateway)
+    await until(lambda: gateway.directory.ids(ROS) == [5, 6])
+    for number in (1, 77, 65_535, 99_999):
+        for what in ("status", "offers"):
+            told = await one.told(f"/view/robots/{number}/{what}")
+            assert told == {"error": f"robot {number} is not online"}
+        assert "not online" in (await one.told(f"/view/trace/{number}?topic=/a"))["error"]
+        assert "nobody here" in (await one.told(f"/types/{number}/own_msgs/msg/Level"))["error"]
+    assert not made[0]._asked
+    monkeypatch.setattr(definitions, "KEPT", 10)
+    for number in range(30):
+        assert "nobody here" in (await one.told(f"/types/5/own_msgs/msg/Other{number}"))["error"]
+    before = asked.counts[5, "definitions"]
+    assert "nobody here" in (await one.told("/types/5/own_msgs/msg/Other29"))["error"]
+    assert asked.counts[5, "definitions"] == before == 30
+    assert len(made_types[0]._unknown) == 10
+
+
+def keep(monkeypatch: pytest.MonkeyPatch, module: Any, name: str, made: list[Any]) -> None:
+    """Note what a module makes of a class."""
+    original = getattr(module, name)
+
+    def make(*arguments: Any) -> Any:
+        made.append(original(*arguments))
+        return made[-1]
+
+    monkeypatch.setattr(module, name, make)
+
+
+async def test_a_robot_that_nobody_looks_at_is_forgotten(
+    start_gateway: StartGateway, session: aiohttp.ClientSession, asked: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where nobody looks at the mesh."""
+    made: list[robots.Robots] = []
+    keep(monkeypatch, routes, "Robots", made)
+    monkeypatch.setattr(robots, "FORGET_S", 0.0)
+    gateway = await start_gateway(web_port=0)
+    one = Browser(session, gateway)
+    await until(lambda: gateway.directory.ids(ROS) == [5, 6])
+    assert await one.told("/view/robots/5/status") == STATUS
+    assert await one.told("/view/robots/6/status") == STATUS
+    assert [*made[0]._asked] == [(6, "status")]
+
+
+async def test_types_of_everybody_are_loaded_beside_the_loop(
+    start_gateway: StartGateway, session: aiohttp.ClientSession, asked: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames do not wait for it, and it is done once for all who ask meanwhile."""
+    threads: list[int] = []
+    load = definitions._load
+
+    def noted() -> Any:
+        threads.append(threading.get_ident())
+        return load()
+
+    monkeypatch.setattr(definitions, "_load", noted)
+    one = Browser(session, await start_gateway(web_port=0))
+    told = await asyncio.gather(*(one.told("/types/5/geometry_msgs/msg/Twist") for _ in range(5)))
+    assert all("float64 x" in each["text"] or "linear" in each["text"] for each in told)
+    assert len(threads) == 1
+    assert threads[0] != threading.get_ident()
+
+
+HOSTILE = [
+    *({"stop": value} for value in ("x", 5, [1])),
+    *({"nodes": value} for value in (5, "x", [5], [{}], [{"name": ["a"]}], [{"name": "a", "control": "x"}])),
+    {"nodes": [{"name": "a", "control": {"holder": {"a": 1}}}]},
+    *({"drops": value} for value in (5, ["x"], {"a": "b"}, {"a": {"b": 1}})),
+    {"stopped": "yes"},
+]
+
+
+@pytest.mark.parametrize("said", HOSTILE, ids=json.dumps)
+def test_a_state_that_makes_no_sense_is_unknown(said: dict[str, Any]) -> None:
+    """One robot that answers whatever it likes takes the mesh from nobody."""
+    assert mesh._state({**STATUS, **said}) == {"known": False}
+
+
+def test_of_a_state_only_so_much_is_shown() -> None:
+    """To everybody who looks, twice a second."""
+    nodes = [
+        {"name": "/a", "control": {"holder": "unity/5"}},
+        {"name": "/b", "more": 1},
+        {"name": "/c", "control": {}},
+    ]
+    shown = mesh._state({**STATUS, "nodes": nodes, "drops": {str(number): 1 for number in range(10_000)}})
+    assert (shown["known"], shown["stopped"], shown["stoppedBy"]) == (True, True, "unity/5")
+    assert shown["control"] == {"/a": "unity/5"}
+    assert len(shown["drops"]) == mesh.DROPS
+    assert mesh._state(None) == {"known": False}
+    assert len(mesh._state({**STATUS, "stop": {"by": "x" * 100_000}})["stoppedBy"]) < 1000
+
+
+async def test_a_hostile_robot_takes_the_mesh_from_nobody(
+    start_gateway: StartGateway, session: aiohttp.ClientSession, asked: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others are shown as before."""
+    gateway = await start_gateway(web_port=0)
+    one = Browser(session, gateway)
+    monkeypatch.setitem(STATUS, "nodes", [{"name": []}])
+
+    async def answered() -> bool:
+        robots = (await one.told("/view/mesh"))["robots"]
+        return len(robots) == 2 and asked.counts[5, "status"] > 1
+
+    await until(answered)
+    monkeypatch.setitem(STATUS, "nodes", [])
+
+    async def known() -> bool:
+        return all(robot["known"] for robot in (await one.told("/view/mesh"))["robots"])
+
+    await until(known)
+
+
+async def test_a_group_s_token_sees_the_robots_of_its_group(
+    start_gateway: StartGateway, router: str, session: aiohttp.ClientSession, tmp_path: Path
+) -> None:
+    """And of others not even that they are there, nor their sessions; who may not look is shown no state."""
+    path, secrets = tmp_path / "tokens.json", {}
+    for name, may in (("looks", ["see"]), ("stops", ["stop"])):
+        secrets[name] = new_secret(os.urandom(32))
+        token = Token(name=name, rights=Rights(may=may, groups=[3]), hashes=[hash_of(secrets[name])])
+        store.change(path, lambda tokens, token=token: (tokens.with_token(token), None))
+    async with AsyncExitStack() as stack:
+        zids = {}
+        for number, group in ((5, 3), (6, 4)):
+            agent = await stack.enter_async_context(join(ROS, id=number, group=group, settings=patient(router)))
+            agent.serve("status", lambda call: answer_status())
+            zids[number] = agent.mesh.zid
+        gateway = await start_gateway(web_port=0, web_without_token="nobody", tokens_file=str(path))
+        one = Browser(session, gateway)
+        await until(lambda: gateway.directory.ids(ROS) == [5, 6])
+        looks, stops = ({"Cookie": f"macs_token={secrets[name]}"} for name in ("looks", "stops"))
+
+        async def seen() -> bool:
+            told = await one.told("/view/mesh", **looks)
+            assert [robot["id"] for robot in told["robots"]] == [5]
+            assert zids[6] not in told["sessions"]
+            return told["robots"][0]["known"] and zids[5] in told["sessions"]
+
+        await until(seen)
+        (robot,) = (await one.told("/view/mesh", **stops))["robots"]
+        assert (robot["id"], robot["known"]) == (5, False)
+        assert await one.told("/view/robots/5/status", **looks) == STATUS
+        for number, who in ((6, looks), (5, stops)):
+            assert "does not give the right" in (await one.told(f"/view/robots/{number}/status", **who))["error"]
+
+
+async def answer_status() -> bytes:
+    return json.dumps(STATUS).encode()
+
+
+async def test_whose_trace_is_awaited_does_not_lose_it_to_another(
+    start_gateway: StartGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So many topics are traced at one time, and one more is refused; once one is done, another takes its place."""
+    gateway = await start_gateway()
+    made = traces.Traces(gateway.mesh, gateway.directory)
+    done = {f"/{number}": asyncio.Event() for number in range(traces.TOPICS + 1)}
+
+    async def collect(_: traces.Traces, robot: int, topic: str) -> list[dict[str, Any]]:
+        await done[topic].wait()
+        return [{"topic": topic}]
+
+    monkeypatch.setattr(traces.Traces, "_collect", collect)
+    *first, late = done
+    asking = {topic: asyncio.create_task(made.of(5, topic)) for topic in first}
+    await asyncio.sleep(0)
+    with pytest.raises(Refused, match="16 topics are traced"):
+        await made.of(5, late)
+    done[first[3]].set()
+    assert await asking.pop(first[3]) == [{"topic": first[3]}]
+    done[late].set()
+    assert await made.of(5, late) == [{"topic": late}]
+    assert len(made._kept) == traces.TOPICS
+    for topic, task in asking.items():
+        done[topic].set()
+        assert await task == [{"topic": topic}]
+    made.close()
+
+
+async def test_a_trace_takes_the_right_to_see_its_topic(
+    start_gateway: StartGateway, session: aiohttp.ClientSession, asked: Asked, tmp_path: Path
+) -> None:
+    """A token's topics count for what is traced as for what is seen."""
+    path, secret = tmp_path / "tokens.json", new_secret(os.urandom(32))
+    rights = Rights(may=["see"], robots=[5], topics=["/camera/**"])
+    token = Token(name="anna", rights=rights, hashes=[hash_of(secret)])
+    store.change(path, lambda tokens: (tokens.with_token(token), None))
+    gateway = await start_gateway(web_port=0, web_without_token="nobody", tokens_file=str(path))
+    one, cookie = Browser(session, gateway), {"Cookie": f"macs_token={secret}"}
+    await until(lambda: gateway.directory.ids(ROS) == [5, 6])
+    for topic in ("/scan", "", "camera/image"):
+        assert "this token" in (await one.told(f"/view/trace/5?topic={topic}", **cookie))["error"]
+    assert "not give the right" in (await one.told("/view/trace/6?topic=/camera/image", **cookie))["error"]
+    assert await one.told("/view/trace/5?topic=/camera/image", **cookie) == {"ways": []}
