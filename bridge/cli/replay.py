@@ -4,8 +4,11 @@ behind.
 
 With --to ros the topics are behind /replay/robot_7, where no robot listens.
 
-With --commands-to ROBOT it sends what headsets sent to that robot once more, which MOVES IT: it asks first, and wants
-the robot's id a second time, from a terminal or with --confirm. The robot's rules and its emergency stop hold.
+With --commands-to ROBOT it sends what headsets sent to that robot once more, which MOVES IT: it asks first, and
+wants the robot's id a second time, from a terminal or with --confirm. The robot's rules and its emergency stop
+hold. It sends wants those of one headset (--sender), with those that were refused then, never an emergency stop or
+what is 0.2 s late, and ends when the robot leaves or refuses one.
+
 --own-names ROBOT, which may move any robot of the ROS graph, asks in the same way: that robot's topics then keep their
 names, but for its emergency stop and those that its nodes listened to, unless --topics has the whole name of one.
 
@@ -63,6 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--own-names", type=_robot, metavar="ID", help="to ros: this one's topics under their own names"
     )
     parser.add_argument("--commands-to", type=_robot, metavar="ID", help="send recorded commands to this robot")
+    parser.add_argument("--sender", default="", metavar="unity/256", help="whose recorded commands, if several's")
     parser.add_argument("--confirm", type=_robot, metavar="ID", help="its id again, instead of being asked")
     options.add_as_option(parser)
     options.add_mesh_options(parser)
@@ -92,6 +96,10 @@ def _order(args: argparse.Namespace) -> Order:
         raise UsageError("--as says who sends commands, as unity/5 does, with --commands-to")
     if args.commands_to and kind != "mesh":
         raise UsageError("commands are sent over the mesh")
+    if args.commands_to and args.robot:
+        raise UsageError("--robot chooses what robots are played; commands to robot 7 go to 17 by --as-robot 7:17")
+    if args.sender and not args.commands_to:
+        raise UsageError("--sender says whose commands are sent, with --commands-to")
     if args.own_names and kind != "ros":
         raise UsageError("--own-names says how topics are called in ROS, with --to ros")
     return Order(
@@ -106,6 +114,7 @@ def _order(args: argparse.Namespace) -> Order:
         start_s=args.start,
         own_names=args.own_names or 0,
         commands_to=args.commands_to or 0,
+        sender=args.sender,
         agent=args.principal.agent if args.principal is not None else None,
     )
 
@@ -143,9 +152,10 @@ async def _replay(order: Order, settings: Settings) -> int:
     )
     lost = f", {played.lost} lost on the way to the gateway" if played.lost else ""
     late = f"99 % of them at most {played.late_p99_s * 1000:.1f} ms late"
-    output.say_if_possible(f"{played.messages} messages, {late}{lost}")
+    left_out = f", {played.left_out} left out, as they were too late to be sent" if played.left_out else ""
+    output.say_if_possible(f"{played.messages} messages, {late}{lost}{left_out}")
     for reason, count in played.refused.items():
-        output.say_if_possible(plain(f"robot {order.commands_to} refused some ({count} times): {reason}"))
+        output.say_if_possible(plain(f"ended, robot {order.commands_to} refused ({count} times): {reason}"))
     return int(bool(played.refused))
 
 

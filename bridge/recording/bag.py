@@ -233,7 +233,11 @@ class Bag:
             else:
                 heapq.heappop(opened)
                 self._forget(number)
-            yield message_in(raw, at, length)
+            try:
+                message = message_in(raw, at, length)
+            except ValueError as error:
+                raise BadBag(self.path, f"in chunk {number}: {error}") from error
+            yield message
 
     def _entries(self, number: int, ids: set[int], start_ns: int, end_ns: int) -> array[int]:
         """Time, offset and length of each message wanted in a chunk, latest first."""

@@ -6,6 +6,8 @@ before a message is due and looks at the clock for the rest.
 
 from __future__ import annotations
 
+import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -14,6 +16,8 @@ from bridge.recording.mcap_records import Message
 from bridge.replay.timeline import Timeline
 from macs_zenoh.errors import MacsError
 
+log = logging.getLogger("macs.replay")
+
 SPIN_S = 0.0002
 """So long before a message is due the thread stays awake: to wake up takes about half of that."""
 REMEMBERED = 100_000
@@ -21,20 +25,25 @@ REMEMBERED = 100_000
 
 
 class Player:
-    """``play(message)`` is called in the thread for each message; ``on_end(error)`` when there are no more."""
+    """``play(message)`` is called in the thread for each message; ``on_end(error)`` when there are no more, or one
+    cannot be read or played. What is more than ``max_late_s`` late is left out, as after a program was stopped and
+    continued."""
 
     def __init__(
         self,
         timeline: Timeline,
         play: Callable[[Message], None],
         on_end: Callable[[MacsError | None], None],
+        max_late_s: float = math.inf,
     ) -> None:
         self.played = 0
+        self.left_out = 0
         self.late_s: list[float] = []
         """How late messages were, the last ones."""
         self._timeline = timeline
         self._play = play
         self._on_end = on_end
+        self._max_late_s = max_late_s
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="macs-player", daemon=True)
 
@@ -65,6 +74,9 @@ class Player:
                 if not self._wait(began + due.at_s):
                     return
                 late_s = time.monotonic() - began - due.at_s
+                if late_s > self._max_late_s:
+                    self.left_out += 1
+                    continue
                 self._play(due.message)
                 self.played += 1
                 if len(self.late_s) >= REMEMBERED:
@@ -72,6 +84,11 @@ class Player:
                 self.late_s.append(late_s)
         except MacsError as problem:
             error = problem
+        except (
+            Exception
+        ) as problem:  # of whatever takes messages: a recording that stops half way must not look played
+            log.exception("a message could not be played")
+            error = MacsError(f"a message cannot be played: {problem}")
         finally:
             if not self._stopping.is_set():
                 self._on_end(error)

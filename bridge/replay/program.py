@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import sys
+import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
@@ -12,7 +14,7 @@ from pathlib import Path
 
 import macs_zenoh
 from bridge.recording.mcap_records import ChannelRecord, Message
-from bridge.replay.commands import Commands
+from bridge.replay.commands import LATE_S, Commands
 from bridge.replay.player import Player
 from bridge.replay.recorded import RecordedRobot, RecordedTopic, recorded_robots
 from bridge.replay.robot import ReplayedRobot
@@ -47,6 +49,7 @@ class Order:
         topics: patterns; none: all.
         own_names: the recorded robot whose topics keep their names in ROS, where they may move one; 0: none's do.
         commands_to: the robot to play commands to; 0: none are.
+        sender: the headset whose commands are played, as ``unity/256``; empty: the only one's.
         agent: who plays them, if not any free headset's id.
     """
 
@@ -61,6 +64,7 @@ class Order:
     start_s: float = 0.0
     own_names: int = 0
     commands_to: int = 0
+    sender: str = ""
     agent: tuple[int, int] | None = None
 
     def wants(self, topic: str) -> bool:
@@ -80,6 +84,8 @@ class Played:
     late_p99_s: float
     refused: Mapping[str, int]
     lost: int = 0
+    left_out: int = 0
+    """Commands that were due too long ago."""
 
 
 async def replay(
@@ -114,7 +120,9 @@ async def replay(
     return Played(player.played, player.late(0.99), {}, sum(robot.lost for robot in lost))
 
 
-async def _played(timeline: Timeline, play: Callable[[Message], None], ended: asyncio.Event) -> Player:
+async def _played(
+    timeline: Timeline, play: Callable[[Message], None], ended: asyncio.Event, max_late_s: float = math.inf
+) -> Player:
     """Play a timeline to its end, or until the place that it is played to ends. Raises what reading it raises."""
     loop = asyncio.get_running_loop()
     done: asyncio.Future[object] = loop.create_future()
@@ -128,7 +136,7 @@ async def _played(timeline: Timeline, play: Callable[[Message], None], ended: as
     def end(error: MacsError | None) -> None:
         loop.call_soon_threadsafe(settle, error)
 
-    player = Player(timeline, play, end)
+    player = Player(timeline, play, end, max_late_s)
     player.start()
     ending: asyncio.Future[object] = asyncio.ensure_future(ended.wait())
     try:
@@ -212,7 +220,7 @@ async def _commands(
     order: Order, mesh: MeshSettings, on_waiting: Callable[[str], None], on_ready: Callable[[str], None]
 ) -> Played:
     recorded = next((old for old, new in order.names.items() if new == order.commands_to), order.commands_to)
-    commands = Commands(order.path, recorded, order.commands_to)
+    commands = Commands(order.path, recorded, order.commands_to, order.wants, order.sender)
     kind, number = order.agent or (2, 0)
     async with macs_zenoh.join(type_name(kind), id=number or None, settings=mesh, on_waiting=on_waiting) as agent:
         await commands.open(agent)
@@ -221,10 +229,10 @@ async def _commands(
             loop = asyncio.get_running_loop()
 
             def play(message: Message) -> None:
-                loop.call_soon_threadsafe(commands.put, message.channel, message.data)
+                loop.call_soon_threadsafe(commands.put, message.channel, message.data, time.monotonic())
 
-            player = await _played(order.timeline(commands.wants), play, asyncio.Event())
+            player = await _played(order.timeline(commands.wants), play, commands.ended, LATE_S)
             await agent.drain()
         finally:
             commands.close()
-    return Played(player.played, player.late(0.99), commands.refused)
+    return Played(commands.sent, player.late(0.99), commands.refused, left_out=player.left_out + commands.late)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from bridge.recording.bag import Bag
+from bridge.recording.bag import BadBag, Bag
 from bridge.recording.mcap_records import ChannelRecord, Message
 from macs_zenoh.errors import MacsError
+
+log = logging.getLogger("macs.replay")
 
 AHEAD = 512
 """Messages that are read ahead."""
@@ -69,6 +73,8 @@ class Timeline:
                 self._queue.get_nowait()
             except queue.Empty:
                 self._thread.join(0.01)
+        with suppress(queue.Full):  # who waits for a message waits no longer
+            self._queue.put_nowait(None)
 
     def __iter__(self) -> Iterator[Due]:
         while not self._closed:
@@ -100,6 +106,9 @@ class Timeline:
                         return
         except MacsError as error:
             self._error = error
+        except Exception as error:  # a file that is damaged in a way nobody has thought of
+            log.exception("reading a recording failed")
+            self._error = BadBag(self._path, f"cannot be read: {error}")
         finally:
             if not self._closed:
                 self._queue.put(None)

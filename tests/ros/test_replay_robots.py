@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ from std_msgs.msg import String
 import macs_zenoh
 from bridge.headset.client import Headset
 from bridge.headset.nodes import Subscription
+from bridge.recording.bag import Bag
 from bridge.recording.mcap_file import McapFile
+from bridge.recording.mcap_records import Message
 from bridge.recording.streams import CDR, OFFERS, PRESENCE, Channel, command_topic, robot_channel
 from bridge.replay.player import Player
 from bridge.replay.recorded import recorded_robots
@@ -31,7 +34,7 @@ from tests.support.bags import BEGIN, STRING, cdr
 from tests.support.programs import Program, ended, macs
 from tests.support.ros_peer import Peer
 from tests.support.routers import Router
-from tests.support.waiting import get, until
+from tests.support.waiting import PATIENCE_S, get, until
 
 TWIST = f"Vector3 linear\nVector3 angular\n{'=' * 80}\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
 
@@ -258,6 +261,133 @@ async def test_commands_go_only_to_a_robot_that_was_named_twice(
         assert len(speeds) > 7  # the first may come before ROS has found the subscription
 
 
+@pytest.fixture
+def mixed(tmp_path: Path) -> Path:
+    """Two headsets drove robot 7 on two topics, for a minute, and one of them released its stop all the time."""
+    writing = Writing(tmp_path / "mixed.mcap")
+    for number in range(600):
+        for sender, topic, of_type, text, data in (
+            ("unity/256", "/cmd_vel", "geometry_msgs/msg/Twist", TWIST, twist(number)),
+            ("unity/257", "/cmd_vel", "geometry_msgs/msg/Twist", TWIST, twist(-1)),
+            ("unity/256", "/arm", "geometry_msgs/msg/Twist", TWIST, twist(5)),
+            ("unity/256", "/emergency_stop", "std_msgs/msg/Bool", "bool data\n", b"\0\1\0\0\0"),
+        ):
+            metadata = {"as": "sent", "robot": "7", "topic": topic, "sender": sender}
+            sent = Channel(command_topic(sender, "7", topic), CDR, of_type, text, metadata)
+            writing.add(sent, number / 10, data)
+    writing.file.close()
+    return writing.path
+
+
+async def is_stopped(endpoint: str) -> bool:
+    async with macs_zenoh.join("unity", connect=[endpoint]) as agent:
+        return bool(json.loads(await agent.call("ros", 7, "status"))["stopped"])
+
+
+async def test_no_more_commands_are_sent_than_were_asked_for(
+    mixed: Path, router: Router, peer: Peer, domain: int
+) -> None:
+    """One headset's, of the topics that were named; a stop ends it, and no recorded release ends the stop."""
+    driven, arm = await peer.subscription(Twist, "/cmd_vel", 1000), await peer.subscription(Twist, "/arm", 1000)
+    command = ("replay", str(mixed), "-e", router.endpoint, "--commands-to", "7", "--confirm", "7")
+    code, out, errors = await ended(*command)
+    assert (code, out) == (2, "")
+    assert "unity/256, unity/257; say whose: --sender" in errors
+    code, out, errors = await ended(*command, "--topics", "/emergency_stop")
+    assert (code, out) == (2, "")
+    assert "no commands to robot 7" in errors
+    async with Program("agent", "--id", "7", "-e", router.endpoint, env={"ROS_DOMAIN_ID": str(domain)}):
+        async with Program(*command, "--sender", "unity/256", "--topics", "/cmd_vel") as playing:
+            assert playing.ready.endswith("to robot 7: /cmd_vel")
+            speeds = [(await get(driven)).linear.x for _ in range(5)]
+            await macs("stop", "7", "--json", "-e", router.endpoint)
+            assert await playing.wait() == 1
+        assert await is_stopped(router.endpoint)
+        assert speeds == [speeds[0] + number for number in range(5)]
+        assert arm.empty()
+        # all topics of one who released the stop again and again: the robot stays stopped, and that ends it too
+        code, out, errors = await ended(*command, "--sender", "unity/256")
+        assert code == 1
+        assert "refused" in out + errors
+        assert await is_stopped(router.endpoint)
+
+
+def test_what_is_late_is_left_out(tmp_path: Path) -> None:
+    """Where that is wanted, as for commands: a program that was stopped and continued sends nothing overdue."""
+    writing = Writing(tmp_path / "a.mcap")
+    for number in range(100):
+        writing.add(text_topic(7, "/chatter"), number / 100, cdr(str(number)))
+    writing.file.close()
+    played: list[bytes] = []
+    errors: list[object] = []
+
+    def play(message: Message) -> None:
+        if not played:
+            time.sleep(0.6)
+        played.append(message.data)
+
+    player = Player(Timeline(writing.path, lambda channel: True), play, errors.append, max_late_s=0.2)
+    player.start()
+    wait_for(lambda: errors)
+    player.stop()
+    assert errors == [None]
+    assert played[0] == cdr("0")
+    assert player.left_out >= 35
+    assert len(played) + player.left_out == 100
+    assert played[1:] == [cdr(str(number)) for number in range(100)][-len(played) + 1 :]
+
+
+def test_what_cannot_be_played_is_told(tmp_path: Path) -> None:
+    """Whatever fails, the end is an error and not the end of the recording."""
+    writing = Writing(tmp_path / "a.mcap")
+    writing.add(text_topic(7, "/chatter"), 0, cdr("a"))
+    writing.file.close()
+    errors: list[object] = []
+
+    def fail(message: Message) -> None:
+        raise ValueError("the middleware has had enough")
+
+    player = Player(Timeline(writing.path, lambda channel: True), fail, errors.append)
+    player.start()
+    wait_for(lambda: errors)
+    player.stop()
+    assert isinstance(errors[0], macs_zenoh.MacsError)
+    assert "has had enough" in str(errors[0])
+
+
+def test_it_can_be_stopped_while_the_disk_is_slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who waits for the first message waits no longer once it is stopped."""
+    writing = Writing(tmp_path / "a.mcap")
+    writing.add(text_topic(7, "/chatter"), 0, cdr("a"))
+    writing.file.close()
+    reading, go_on = threading.Event(), threading.Event()
+
+    def slow(*args: object, **options: object) -> Iterator[Message]:
+        reading.set()
+        go_on.wait()
+        return iter(())
+
+    monkeypatch.setattr(Bag, "messages", slow)
+    timeline = Timeline(writing.path, lambda channel: True)
+    player = Player(timeline, lambda message: None, lambda error: None)
+    player.start()
+    reading.wait(PATIENCE_S)
+    stopping = threading.Thread(target=player.stop, daemon=True)
+    stopping.start()
+    wait_for(lambda: timeline._closed)
+    go_on.set()
+    stopping.join(PATIENCE_S)
+    assert not stopping.is_alive()
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    """The same as `until`, in a test without a loop."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 def test_messages_are_played_at_their_time(tmp_path: Path) -> None:
     """A thousand a second: each at its time or a little later, none before, and none is left out."""
     writing = Writing(tmp_path / "a.mcap")
@@ -314,6 +444,10 @@ def test_rate_and_loop(tmp_path: Path, rate: float, loop: bool) -> None:
         (["--to", "gateway"], "--to gateway HOST:PORT"),
         (["--topics", "/none"], "no topics"),
         (["--own-names", "7"], "with --to ros"),
+        (["--commands-to", "7", "--confirm", "7", "--robot", "7"], "--as-robot"),
+        (["--commands-to", "7", "--confirm", "7", "--topics", "/none"], "no commands to robot 7"),
+        (["--commands-to", "7", "--confirm", "7", "--sender", "unity/9"], "others sent some: unity/256"),
+        (["--sender", "unity/9"], "with --commands-to"),
         (["--to", "ros", "--own-names", "9", "--confirm", "9"], "no topics of robot 9"),
         (["--commands-to", "9", "--confirm", "9"], "no commands to robot 9"),
     ],
