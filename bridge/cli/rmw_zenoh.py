@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 
 from bridge import memory
-from bridge.cli import options, running
+from bridge.cli import options, output, running
 from bridge.settings import RmwZenohRobot, Settings
 from macs_zenoh.errors import UsageError
 from macs_zenoh.sections import changed
@@ -73,7 +73,7 @@ async def _serve(settings: Settings, *, look: bool, dry_run: bool) -> int:
     robots = settings.rmw_zenoh.robots
     if dry_run or not robots:
         for line in program.shown(robots) or ["no robots: there are no ROS nodes on the router"]:
-            print(line, flush=True)  # noqa: T201
+            output.say(line)
         return 0 if robots else 1
     await program.run(
         settings,

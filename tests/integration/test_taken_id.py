@@ -39,7 +39,7 @@ async def test_a_gateway_goes_on_under_another_id(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(bridge.gateway, "Gateway", Noted)
     async with Router() as router, counted(router.endpoint) as link:
         settings = Settings(mesh=MeshSettings(connect=[link.endpoint]), gateway=GatewaySettings(port=0))
-        running = asyncio.create_task(verb._serve(settings))
+        running = asyncio.create_task(verb._serve(settings, None))
         await until(lambda: made and made[0].port)
         port, before = made[0].port, zenoh_id(made[0].mesh)
         headset = await Headset.connect("127.0.0.1", port, reconnect=True)

@@ -274,9 +274,11 @@ async def test_the_robot_shows_its_state(robot: RobotAgent, headset: Agent) -> N
     await headset.call("ros", ROBOT, "add_node", encode(adding("/chatter")))
     state = json.loads(await headset.call("ros", ROBOT, "status"))
     assert state["stopped"] is False
-    assert {"role": "subscriber", "name": "/chatter", "type": "std_msgs/msg/String", "registrants": ["unity/5"]} in (
-        state["nodes"]
-    )
+    (chatter,) = (node for node in state["nodes"] if node["role"] == "subscriber")
+    assert chatter["name"] == "/chatter"
+    assert chatter["type"] == "std_msgs/msg/String"
+    assert chatter["registrants"] == ["unity/5"]
+    assert chatter["carried"] == {"messages": 0, "bytes": 0, "age_s": None}
     headset.send(b"", to="ros", ids=[ROBOT], metadata=Metadata(request_id=0, message_manager=STATUS))
     answer = await asyncio.wait_for(headset.receive(), PATIENCE_S)
     assert json.loads(answer.data)["ros_node"] == state["ros_node"]

@@ -21,6 +21,7 @@ FOLDERS = ("macs_zenoh", "bridge", "config", "tests", "benchmarks", "examples", 
 NOT_OURS = {
     *("nd__turn", "OnApplicationPause", "AmbientCapabilities", "CapabilityBoundingSet", "CAP_NET_BIND_SERVICE"),
     *("call_failed", "call_invalid"),  # made of call_ and the kind of failure
+    *("cmd_vel_timeout", "rmw_zenohd"),  # of ROS
 }
 """Examples, and words of Unity, systemd and Linux."""
 FOR_EXAMPLE = {

@@ -82,6 +82,8 @@ def test_there_is_no_other_way_out() -> None:
     for path in [*(ROOT / "bridge").rglob("*.py"), *(ROOT / "macs_zenoh").rglob("*.py")]:
         if path in (ROOT / "bridge" / "cli" / "output.py", ROOT / "bridge" / "logs.py"):
             continue
+        if path == ROOT / "bridge" / "page" / "libraries.py":  # run while the package is built, without what it needs
+            continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call):
                 called = ast.unparse(node.func)

@@ -56,5 +56,5 @@ def test_the_settings_say_so() -> None:
     from bridge.security.files import _sections
 
     given = policy.parse(POLICY)
-    (robot,) = parse("\n".join(_sections(given, given.robots[0]))).rmw_zenoh.robots
+    (robot,) = parse("\n".join(_sections(given, given.robots[0], "there"))).rmw_zenoh.robots
     assert (robot.id, robot.session_namespace) == (7, "robot7")
