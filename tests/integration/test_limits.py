@@ -294,13 +294,13 @@ async def test_those_that_do_not_read_have_a_limit_together() -> None:
             for number in range(10):
                 sender.send(bytes(31 << 20), to="unity", ids=[number + 2], metadata=Metadata(message_manager="Big"))
                 await asyncio.sleep(0.1)
+        await until(lambda: any("outbox_full" in line for line in gateway.log))
         await answers(neighbour)
         await until(lambda: memory_bytes(gateway.pid) - before < (256 + 96) << 20)  # what was cut is given back soon
         for sock in stalled:
             sock.close()
         while len((await neighbour.online()).unity_agent_ids) > 1:
             await asyncio.sleep(0.05)
-        await until(lambda: any("outbox_full" in line for line in gateway.log))
 
 
 async def test_frames_that_do_not_end_have_a_limit_together() -> None:

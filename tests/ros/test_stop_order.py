@@ -27,7 +27,7 @@ from macs_zenoh.mesh import now_s
 from macs_zenoh.protocol.messages import ROS, UNITY, Metadata, NodeType
 from macs_zenoh.protocol.routing import unicast_key
 from macs_zenoh.protocol.wire import encode_frame, encode_message
-from tests.support.ros_peer import ROBOT, Peer, adding
+from tests.support.ros_peer import ROBOT, Peer, adding, reaches
 from tests.support.waiting import get, until
 
 TOPIC = "/emergency_stop"
@@ -133,6 +133,7 @@ async def test_a_node_that_fails_stops_no_others_stop(nodes: InterfaceNodes, sto
     for topic in ("/second", TOPIC, TOPIC + AGENTS):
         await until(lambda topic=topic: peer.session.node.count_publishers(topic) >= 1)
     await until(lambda: stop._publisher._made.get_subscription_count() >= 2)
+    await reaches(nodes, "/second")
     first = nodes.get(NodeType.PUBLISHER, "nd__first")
     assert first is not None
     first.emergency_stop = fails  # type: ignore[method-assign]
