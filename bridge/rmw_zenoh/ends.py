@@ -230,5 +230,6 @@ class Typed(MessageType):
     def __init__(self, name: str, of: MessageType) -> None:
         self.name = name
         self.least_bytes, self.unity, self.parts = of.least_bytes, of.unity, of.parts
+        self.problem = of.problem  # type: ignore[method-assign]
         self.filled = of.filled  # type: ignore[method-assign]
         self.failure = of.failure  # type: ignore[method-assign]

@@ -196,14 +196,14 @@ class ActionNode(InterfaceNode):
         goal = self._asked(message, goal_id)
         goal.group = self.robot.group_of(sender)
         body = message.data[ID_BYTES:]
+        of = self._types.goal if self._types is not None else None
         try:
-            of = self._types.goal if self._types is not None else None
             if of is not None:
                 body = readable(of.unity, of.parts, body, self.robot.rules.settings.max_message_parts)
         except TooManyParts as error:
             self._reject(goal, f"the goal of {len(body)} bytes is too much: {error}")
             return
-        problem = cdr_problem(body)
+        problem = of.problem(body) if of is not None else cdr_problem(body)
         if problem is not None:
             self._reject(goal, f"the goal is no {self.interface}: {problem}")
         elif self.held:

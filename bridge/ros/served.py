@@ -18,7 +18,6 @@ from bridge.ros.interface import InterfaceNode, Registrant, Robot
 from bridge.ros.servers import check_service_type
 from bridge.ros.services import BURST
 from bridge.ros.side import NotOfType, Server, ServiceType, first_line
-from bridge.ros.stream import cdr_problem
 from bridge.ros.unity_cdr import TooManyParts, readable, to_unity
 from macs_zenoh.errors import Refused, WireError
 from macs_zenoh.protocol.messages import AddNode, CallFailure, NodeType, decode_data
@@ -166,7 +165,7 @@ class ServiceNode(InterfaceNode):
         except TooManyParts as error:
             self._bad_answer(request_id, sender, f"{len(message.data)} bytes are too much: {error}")
             return
-        problem = cdr_problem(answer)
+        problem = expected.problem(answer)
         if problem is not None:
             self._bad_answer(request_id, sender, problem)
             return

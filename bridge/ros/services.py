@@ -16,7 +16,6 @@ from bridge.ros.failures import CallFailed, answer_metadata, tell_failure
 from bridge.ros.interface import InterfaceNode, Registrant, Robot
 from bridge.ros.servers import ABSENT_S, Search, check_service_type
 from bridge.ros.side import Client, NotOfType, ServiceType, first_line
-from bridge.ros.stream import cdr_problem
 from bridge.ros.unity_cdr import TooManyParts, readable, to_unity
 from macs_zenoh.protocol.messages import AddNode, NodeType
 from macs_zenoh.protocol.reading import Message
@@ -128,7 +127,7 @@ class ClientNode(InterfaceNode):
             request = readable(asked.unity, asked.parts, data, self.robot.rules.settings.max_message_parts)
         except TooManyParts as error:
             raise CallFailed("invalid", f"the request of {len(data)} bytes is too much: {error}") from None
-        problem = cdr_problem(request)
+        problem = asked.problem(request)
         if problem is not None:
             raise CallFailed("invalid", f"the request is no {self.interface}: {problem}")
         if not await self._search.found(min(ABSENT_S, self._deadline_s / 2)):

@@ -16,6 +16,7 @@ from bridge.ros.shapes import Structure, least_cdr_bytes
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import InterfaceName
 from bridge.ros.unity_cdr import Parts, UnityCdr
+from bridge.ros.whole import Whole
 from macs_zenoh.protocol.rmw_zenoh.qos import Qos
 from macs_zenoh.protocol.schemas import Definition
 
@@ -74,11 +75,13 @@ class MessageType:
         self.least_bytes = least_cdr_bytes(shape) if shape is not None else 4
         self.unity = UnityCdr.of(shape) if shape is not None else None
         self.parts = Parts.of(shape) if shape is not None else None
+        self._whole = Whole(shape) if shape is not None else None
 
     def problem(self, cdr: bytes) -> str | None:
-        """Why these bytes cannot be CDR of this type; None when they may be. Whoever reads them in ROS may end by them
-        otherwise. From any thread."""
-        return cdr_problem(cdr, self.least_bytes)
+        """Why these bytes cannot be CDR of this type, as ROS writes it; None when they may be. Whoever reads them in
+        ROS may end by them otherwise. From any thread."""
+        problem = cdr_problem(cdr)
+        return self._whole.problem(cdr) if problem is None and self._whole is not None else problem
 
     def filled(self, values: Mapping[str, Any], what: str) -> bytes:
         """A message with these fields, the others zero. ``what`` names the setting in errors. Raises Refused."""

@@ -26,7 +26,7 @@ from bridge.ros.safety import Control, DeadMan
 from bridge.ros.side import MessageType, Other, Publisher, Side
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import InterfaceName
-from bridge.ros.unity_cdr import TooManyParts, UnityCdr, to_ros
+from bridge.ros.unity_cdr import TooManyParts, to_ros
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import AddNode, NodeType
 from macs_zenoh.protocol.reading import Message
@@ -86,8 +86,7 @@ class PublisherNode(TopicNode):
         self._watch: Alarm | None = None
         self._retired = False
         self._publisher: Publisher | None = None
-        self._least_bytes = 4
-        self._cdr: UnityCdr | None = None
+        self._message: MessageType | None = None
         self._expected = 0
         self._matched = asyncio.Event()
         self._loop = asyncio.get_running_loop()
@@ -97,7 +96,7 @@ class PublisherNode(TopicNode):
     def open(self) -> None:
         side = self.robot.session
         message = side.message(self.interface, self.topic)
-        self._least_bytes, self._cdr = message.least_bytes, message.unity
+        self._message = message
         if self.rule.deadman_message is not None:
             self._stop_cdr = self._stop_message(message)
         check_topic_type(side, self.topic, self.interface)
@@ -149,13 +148,15 @@ class PublisherNode(TopicNode):
             publisher.close()
 
     def receive(self, message: Message) -> None:
+        of = self._message
         try:  # before the lock, for which a stop message may wait
-            cdr = to_ros(self._cdr, message.data, self.robot.rules.settings.max_message_parts)
+            cdr = to_ros(of.unity if of else None, message.data, self.robot.rules.settings.max_message_parts)
         except TooManyParts as error:
             self._refuse(message, TOO_LARGE, f"refused {len(message.data)} bytes for {self.interface}: {error}")
             return
+        problem = of.problem(cdr) if of else cdr_problem(cdr)
         with self.lock:
-            refusal = self._refusal(message)
+            refusal = self._refusal(message, problem)
             if refusal is None:
                 if self._publish(cdr, self._publisher):
                     self.carried.count(len(cdr))
@@ -173,11 +174,10 @@ class PublisherNode(TopicNode):
     def refused(self, message: Message, reason: str) -> None:
         self.robot.tell_refused(message, self.topic, "not_allowed", reason)
 
-    def _refusal(self, message: Message) -> tuple[str, str] | None:
-        """The name of the drop and why, when a message may not pass now."""
+    def _refusal(self, message: Message, problem: str | None) -> tuple[str, str] | None:
+        """The name of the drop and why, when a message may not pass now. ``problem``: of its bytes."""
         if self._retired:
             return "no_node", "it was removed in this moment"
-        problem = cdr_problem(message.data, self._least_bytes)
         if problem is not None:
             return "bad_cdr", f"refused {len(message.data)} bytes for {self.interface}: {problem}"
         if self.held:

@@ -18,6 +18,7 @@ import macs_zenoh
 from macs_zenoh import ros
 from macs_zenoh.protocol.rmw_zenoh.attachment import parse_attachment
 from macs_zenoh.protocol.rmw_zenoh.cdr import looks_like_cdr
+from macs_zenoh.typed import request_of
 from tests.support.programs import Program, ended
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
@@ -160,3 +161,45 @@ async def test_what_others_put_wrongly_ends_nothing(router: str) -> None:
             assert node.drops["bad_kind"] == 1
     finally:
         await asyncio.to_thread(session.close)
+
+
+async def test_what_is_cut_short_is_not_put() -> None:
+    """A headset's message, and its request, that say they are longer than they are: refused with the reason. Nothing
+    of them meets the robot's keys, and what is whole does."""
+    async with (
+        Router() as router,
+        watched(router.endpoint) as seen,
+        ros.node("planner", domain=DOMAIN, connect=[router.endpoint]) as node,
+        Program("rmw-zenoh", "--id", "7", "--domain", str(DOMAIN), "-e", router.endpoint),
+        macs_zenoh.join("unity", id=300, connect=[router.endpoint]) as agent,
+    ):
+        node.subscribe("/orders", "std_msgs/String")
+        node.serve("/plan", "nav_msgs/GetPlan", plan)
+        await until(lambda: agent.directory.ids(1) == [7], PATIENCE_S)
+        orders = await agent.advertise("/orders", robot=7)
+        refused: list[str] = []
+        orders.on_refused(lambda robot, reason: refused.append(reason))
+        whole = b"\0\1\0\0\2\0\0\0A\0"
+
+        def is_refused() -> bool:
+            orders.publish(b"\0\1\0\0\xff\xff\0\0A\0\0\0\0")
+            return any("cut off" in reason for reason in refused)
+
+        await until(is_refused, PATIENCE_S, every_s=0.05)
+
+        def is_put() -> bool:
+            orders.publish(whole)
+            return any("/orders/" in each.key for each in seen)
+
+        await until(is_put, PATIENCE_S, every_s=0.05)
+        asked = node.types.serialize(request_of("nav_msgs/srv/GetPlan"), {"tolerance": 0.5})
+        for size in (5, 12, len(asked) - 1):
+            with pytest.raises(macs_zenoh.Refused, match="cut off"):
+                await agent.call_service("/plan", asked[:size], robot=7)
+        await agent.call_service("/plan", asked, robot=7)
+        assert {each.payload for each in seen if "/orders/" in each.key} == {whole}
+        assert [each.payload for each in seen if "/plan/" in each.key] == [asked]
+
+
+async def plan(request: dict[str, Any]) -> dict[str, Any]:
+    return {"plan": {"header": {"frame_id": "map"}}}

@@ -27,8 +27,8 @@ from tests.support.local import patient
 from tests.support.ros_peer import Peer
 from tests.support.waiting import PATIENCE_S, get, until
 
-BAD = [b"", b'{"data": "a"}', b"\0\1\0\0", b"\0\1\0\0\2\0"]
-"""Nothing, JSON, and what ends before a String's length."""
+BAD = [b"", b'{"data": "a"}', b"\0\1\0\0", b"\0\1\0\0\2\0", b"\0\1\0\0\xff\xff\0\0A\0\0\0\0"]
+"""Nothing, JSON, what ends before a String's length, and what says that it is longer."""
 OFFERED = Offered(
     publishers={"/pose": "std_msgs/msg/String"}, subscribers={}, services={"/lamp": "std_srvs/srv/SetBool"}
 )
