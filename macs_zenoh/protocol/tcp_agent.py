@@ -24,7 +24,8 @@ from ..errors import BadField, BadJson, NotAdmitted, NotAllowed, NotPermitted, T
 from . import greetings
 from .credit import Credit
 from .decoders import FrameDecoder
-from .guard import is_press
+from .guard import COMMAND, is_press
+from .halts import HALTS_PER_S, halts
 from .judging import Judge
 from .limits import (
     CONFIGURATION_BYTES,
@@ -322,6 +323,7 @@ class TcpAgent:
         self._held: deque[Frames] = deque()
         self._held_bytes = 0
         self._stops = Credit(self.STOPS_PER_S, now)
+        self._halts = Credit(HALTS_PER_S, now)
         self._connected_at = now
         self._heard_at = now
         self._partial_since: float | None = None
@@ -508,10 +510,18 @@ class TcpAgent:
         raise error
 
     def _presses(self, frame: Frames, now: float, events: list[Event]) -> bool:
-        """Let a press of an emergency stop pass, a few in a second; whether it was one."""
+        """Let a press of an emergency stop pass, or a velocity of zero, a few of each in a second; whether it was
+        one."""
         if not isinstance(frame, Frame) or frame.has_management or not frame.metadata:
             return False  # who is held to a rate sends no runs
-        if not is_press(Metadata.decode(frame.metadata), frame.body) or not self._stops.take(1, now):
+        metadata = Metadata.decode(frame.metadata)
+        if is_press(metadata, frame.body):
+            credit = self._stops
+        elif metadata.node_type == COMMAND and halts(metadata.data_exchange_type, frame.body):
+            credit = self._halts
+        else:
+            return False
+        if not credit.take(1, now):
             return False
         self._send(frame, events)
         return True
@@ -655,7 +665,8 @@ class TcpAgent:
         self.extensions = former.extensions
         self.drops += former.drops
         self.corrected += former.corrected
-        self.credit, self._stops, self.recipient = former.credit, former._stops, former.recipient
+        self.credit, self._stops, self._halts = former.credit, former._stops, former._halts
+        self.recipient = former.recipient
         self._registered, self._refused_at = former._registered, former._refused_at
         self._judge = Judge(self.agent_type, self.agent_id)
         former.state, self.state = GONE, ONLINE

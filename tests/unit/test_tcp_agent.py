@@ -26,6 +26,7 @@ from macs_zenoh.errors import (
     WireError,
 )
 from macs_zenoh.protocol.credit import Credit
+from macs_zenoh.protocol.halts import HALTS_PER_S
 from macs_zenoh.protocol.messages import (
     MANAGERS,
     OPERATOR,
@@ -677,7 +678,8 @@ def test_frames_beyond_the_rate_are_dropped() -> None:
 
 
 def test_a_press_of_a_stop_passes_beyond_the_rate() -> None:
-    """Whoever has used up his rate may still stop a robot, a few times a second, and nothing else."""
+    """Whoever has used up his rate may still stop a robot, or say that it is to stand still, a few times a second, and
+    nothing else."""
 
     def said(node: str, data_type: str, data: bytes) -> bytes:
         metadata = Metadata(UNITY, 7, node_type=2, node_name=node, data_exchange_type=data_type)
@@ -687,7 +689,12 @@ def test_a_press_of_a_stop_passes_beyond_the_rate() -> None:
     count_sent(peer, 5, 0.0)
     press, release = (said("nd__emergency_stop", "std_msgs/Bool", b"\0\1\0\0" + end) for end in (b"\1", b"\0"))
     assert [type(event) for event in peer.receive(press, 0.0)] == [Sent]
-    assert errors(peer.receive(release + said("nd__cmd_vel", "geometry_msgs/Twist", bytes(52)), 0.0)) == [TooFast] * 2
+    twist = b"\0\1\0\0" + bytes(40)
+    moves, halts = (said("nd__cmd_vel", "geometry_msgs/Twist", twist + end) for end in (b"\1" * 8, bytes(8)))
+    assert errors(peer.receive(release + moves, 0.0)) == [TooFast] * 2
+    assert [type(event) for event in peer.receive(halts, 0.0)] == [Sent]
+    assert 0 < sum(type(event) is Sent for event in peer.receive(halts * 100, 0.0)) < HALTS_PER_S
+    assert [type(event) for event in peer.receive(press, 0.0)] == [Sent], "zeros take nothing from stops"
     assert sum(type(event) is Sent for event in peer.receive(press * 100, 0.0)) < TcpAgent.STOPS_PER_S
 
 
