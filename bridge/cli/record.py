@@ -5,8 +5,8 @@ left, stops, control, refusals and losses are JSON channels /macs/…. A robot s
 Nothing is lost silently: what did not get into the file is counted there and on stdout. It ends at Ctrl-C, at a limit,
 or when the disk is full; after a crash `macs bag repair` keeps all that was on the disk.
 
---ring keeps the last minute in memory and writes it when asked (kill -USR1, or the verb `record` of its agent), and by
-itself at a stop or when a dead-man acts (--on).
+--ring keeps the last minute in memory and writes it when asked (kill -USR1, or its agent's verb `record` for those
+whom [record] allow names), and by itself at a stop or when a dead-man acts (--on).
 
 Exit code 0: recorded; 1: no router, or the disk is full; 2: wrong usage.
 
@@ -96,6 +96,8 @@ async def _record(args: argparse.Namespace, settings: Settings) -> int:
         ring_bytes=args.ring_size or said.ring_bytes,
         on=tuple(args.on or said.on),
         after_s=said.after_s,
+        ring_files=said.ring_files,
+        allow=tuple(said.allow),
         agent=args.principal.agent if args.principal is not None else None,
     )
     with output.status_line() as line:

@@ -20,6 +20,7 @@ from bridge.recording import LIBRARY
 from bridge.recording.disk import Disk, Plan
 from bridge.recording.recorder import Recorder, Wanted
 from bridge.recording.ring import Ring
+from bridge.settings.record import is_allowed
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, Refused, UsageError
@@ -32,6 +33,8 @@ log = logging.getLogger("macs.record")
 TELL_S = 1.0
 AGAIN_S = 2.0
 """Several robots that are stopped together are one incident."""
+LONGEST = 10
+"""A file of a ring for which more happens goes on, at most for so many times ``after_s``."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,8 @@ class Order:
     ring_bytes: int = 512 << 20
     on: tuple[str, ...] = ()
     after_s: float = 10.0
+    ring_files: int = 100
+    allow: tuple[str, ...] = ()
     agent: tuple[int, int] | None = None
 
     def plan(self, path: Path, about: dict[str, str]) -> Plan:
@@ -89,7 +94,9 @@ class Recording:
         self._ring = Ring(order.ring_s, order.ring_bytes) if order.ring_s else None
         self._disk = Disk(order.plan(order.path, self._about()), self._disk_ended) if self._ring is None else None
         self._dumps: dict[Disk, asyncio.Task[None]] = {}
-        self._dumped_at = 0.0
+        self._dumped_at = -AGAIN_S
+        self._dumps_end = 0.0
+        self._dumps_made = 0
         sink = self._ring if self._ring is not None else self._disk
         assert sink is not None
         self.recorder = Recorder(agent, sink, order.wanted, self._triggered)
@@ -174,17 +181,38 @@ class Recording:
     # -- a ring --------------------------------------------------------------------------------------------------
 
     def _triggered(self, trigger: str, about: dict[str, Any]) -> None:
-        if self._ring is not None and trigger in self._order.on and time.monotonic() > self._dumped_at + AGAIN_S:
+        if self._ring is not None and trigger in self._order.on:
             try:
-                self.dump(trigger, f"robot {about.get('robot')}: {trigger}")
+                self.dump_for_others(trigger, f"robot {about.get('robot')}: {trigger}")
+            except Refused as refusal:
+                log.warning("the ring is not written for robot %s: %s", about.get("robot"), refusal.reason)
             except ConfigError as error:
                 log.error("the ring is not written: %s", error)
 
+    def dump_for_others(self, name: str, reason: str) -> Path:
+        """The same as `dump` for robots and agents: not too soon and not too often, since each file may be as large as
+        the ring. Raises Refused too."""
+        if not self._dumps:
+            if time.monotonic() < self._dumped_at + AGAIN_S:
+                raise Refused(f"it was written less than {AGAIN_S:g} s ago")
+            if self._dumps_made >= self._order.ring_files:
+                raise Refused(f"it has written {self._dumps_made} files, as many as [record] ring_files lets it")
+        return self.dump(name, reason)
+
     def dump(self, name: str, reason: str) -> Path:
-        """Write what the ring has, and what comes for a while. Raises ConfigError, UsageError where there is none."""
+        """Write what the ring has, and what comes for a while; where a file is being written, it goes on for longer.
+
+        Raises ConfigError, UsageError where there is no ring.
+        """
         if self._ring is None:
             raise UsageError("this recording has no ring; it writes all the time")
-        self._dumped_at = time.monotonic()
+        now = time.monotonic()
+        for open_disk in self._dumps:
+            self._dumps_end = min(now + self._order.after_s, self._dumped_at + LONGEST * self._order.after_s)
+            log.info("%s goes on: %s", open_disk.plan.path, reason)
+            return open_disk.plan.path
+        self._dumped_at, self._dumps_end = now, now + self._order.after_s
+        self._dumps_made += 1
         path = self._order.path
         stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
         path = path.with_name(f"{path.stem}_{name}_{stamp}{path.suffix}")
@@ -200,8 +228,10 @@ class Recording:
         return path
 
     async def _after(self, disk: Disk, reason: str) -> None:
-        await asyncio.sleep(self._order.after_s)
+        while (left_s := self._dumps_end - time.monotonic()) > 0:  # noqa: ASYNC110 - the end may move
+            await asyncio.sleep(left_s)
         del self._dumps[disk]
+        self._dumped_at = time.monotonic()
         await self._finish(disk, reason)
 
     async def _finish(self, disk: Disk, reason: str) -> None:
@@ -212,17 +242,19 @@ class Recording:
         self._on_file(self._report_of(disk, reason))
 
     async def _asked(self, call: Call) -> bytes:
-        """The verb ``record``: ``{"action": "write"}`` writes the ring, ``"status"`` tells, ``"stop"`` ends."""
+        """The verb ``record``: ``{"action": "write"}`` writes the ring, ``"status"`` tells, ``"stop"`` ends. What is
+        more than to tell is for those whom ``[record] allow`` names."""
         try:
             request = json.loads(call.data or b"{}")
             action = request.get("action", "status")
         except (ValueError, AttributeError) as error:
             raise Refused('say {"action": "status"}, "write" or "stop"') from error
+        if action in ("write", "stop") and not is_allowed(self._order.allow, call.sender_type, call.sender_id):
+            raise Refused(f"{call.sender_type}/{call.sender_id} may not: [record] allow does not name it")
         if action == "write":
             try:
-                return json.dumps(
-                    {"file": str(self.dump("asked", f"asked by {call.sender_type}/{call.sender_id}"))}
-                ).encode()
+                path = self.dump_for_others("asked", f"asked by {call.sender_type}/{call.sender_id}")
+                return json.dumps({"file": str(path)}).encode()
             except (ConfigError, UsageError) as error:
                 raise Refused(str(error)) from error
         if action == "stop":

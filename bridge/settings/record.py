@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta
 
+from macs_zenoh.protocol.keyexpr import block_of
 from macs_zenoh.sections import Seconds, Section
+
+from .agents import AgentPattern, names_agents
 
 
 class RecordSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -20,5 +24,23 @@ class RecordSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     """How long it goes on writing after that."""
     ring_bytes: Annotated[int, Meta(ge=1 << 20, le=1 << 40)] = 512 * 1024 * 1024
     """How much memory a ring may take."""
+    ring_files: Annotated[int, Meta(ge=1, le=1_000_000)] = 100
+    """So many files a ring writes by itself and for agents, then only for a signal: no robot fills the disk."""
+    allow: list[AgentPattern] = []
+    """Who may have the verb ``record`` write a ring or end the recording. Everybody may ask how it is getting on."""
     compress: Literal["zstd", "lz4", "none"] = "lz4"
     """How chunks are made smaller."""
+
+    def _check(self) -> None:
+        for number, pattern in enumerate(self.allow):
+            if pattern.startswith("group/") or not names_agents(pattern):
+                problem = f"{pattern!r} names no agents, as *, unity, unity/5, operator/5 and block/1 do"
+                raise self._wrong(f"allow[{number}]", problem)
+
+
+def is_allowed(patterns: Collection[str], agent_type: str, agent_id: int) -> bool:
+    """Whether an agent is one of those in `RecordSettings.allow`."""
+    own = {"*", agent_type, f"{agent_type}/{agent_id}"}
+    if agent_type == "unity":
+        own.add(f"block/{block_of(agent_id)}")
+    return not own.isdisjoint(patterns)

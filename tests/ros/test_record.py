@@ -309,6 +309,48 @@ async def test_a_ring_is_written_at_a_stop_and_when_asked(site: Site, peer: Peer
     assert not (site.folder / "a.mcap").exists()
 
 
+async def test_a_recording_ends_for_nobody_who_is_not_named(site: Site) -> None:
+    """Others than those of [record] allow neither end it nor have its ring written; those do, one file at a time, and
+    no more files than ring_files."""
+    settings = site.folder / "record.toml"
+    settings.write_text('[record]\nafter_s = 0.2\nring_files = 1\nallow = ["operator/5"]\n')
+    write, stop = b'{"action": "write"}', b'{"action": "stop"}'
+    async with (
+        site.record("--ring", "30s", "--settings", str(settings)) as recording,
+        macs_zenoh.join("unity", connect=[site.endpoint]) as other,
+        macs_zenoh.join("operator", id=5, connect=[site.endpoint]) as named,
+    ):
+        me = int(recording.ready.split()[2].removeprefix("unity/"))
+        await until(lambda: (2, me) in other.directory and (2, me) in named.directory)
+        for request in (write, stop):
+            with pytest.raises(macs_zenoh.Refused, match="allow does not name it"):
+                await other.call("unity", me, "record", request)
+        assert not list(site.folder.glob("a_asked_*"))
+        answers = await asyncio.gather(
+            *(named.call("unity", me, "record", write) for _ in range(20)), return_exceptions=True
+        )
+        files = {json.loads(answer)["file"] for answer in answers if isinstance(answer, bytes)}
+        assert len(files) == 1
+        await until(lambda: any("a_asked_" in line for line in recording.said))
+
+        async def refused() -> str:
+            try:
+                await named.call("unity", me, "record", write)
+            except macs_zenoh.Refused as refusal:
+                return refusal.reason
+            return ""
+
+        assert "s ago" in await refused() or "ring_files" in await refused()
+
+        async def is_full() -> bool:
+            return "ring_files" in await refused()
+
+        await until(is_full, every_s=0.2)
+        await named.call("unity", me, "record", stop)
+        assert await recording.wait() == 0
+    assert len(list(site.folder.glob("a_asked_*"))) == 1
+
+
 async def test_a_recording_rides_on_what_is_sent_anyway(site: Site, peer: Peer) -> None:
     """A robot puts each message once, for a headset and a recording alike."""
     publisher = await peer.publisher(String, "/chatter")
