@@ -31,6 +31,7 @@ from bridge.ros.types import InterfaceName
 from macs_zenoh.deadline import Deadline
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.protocol.budget import may_have_one_more
+from macs_zenoh.protocol.guard import says_halt
 from macs_zenoh.protocol.messages import (
     OTHER_TYPE,
     ROS,
@@ -391,7 +392,7 @@ class InterfaceNodes:
             return message
         age_s = message.age_s + waited_s
         most_s = self.robot.rules.settings.max_command_age_s
-        stops = self.stop is not None and key == self.stop.key
+        stops = (self.stop is not None and key == self.stop.key) or says_halt(message)
         if not stops and 0 < most_s < age_s:
             reason = f"a command waited for {age_s:.2f} s, the last of it for its registration"
             self.drops.note("too_old", f"{key.node_name[:80]} from {Registrant.of(message)}", reason)

@@ -4,8 +4,8 @@ Pure: times are passed in. Each sender has credit, one for what is urgent and on
 the message before it is even looked at. So a flood costs the robot a fixed share of its time, and what is judged here
 never waits behind it. A sender is what its keys end in, which routers hold certificates to.
 
-Commands that have waited on their way are not carried out. How long they did is worked out from the stamps that the
-first router puts on samples, without comparing clocks (`Ages`).
+Commands that have waited on their way are not carried out, unless they say to stand still (`halts`). How long they did
+is worked out from the stamps that the first router puts on samples, without comparing clocks (`Ages`).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import NamedTuple, Protocol
 from ..errors import WireError
 from .agent_id import AgentId
 from .credit import Credit
+from .halts import halts
 from .keyexpr import GROUP, UNICAST, sender_of, type_number
 from .messages import ROS, Metadata, NodeType
 from .reading import Message, Reader
@@ -395,7 +396,7 @@ class Guard:
         if self._overtaken(message, sender, age_s, now):
             self.on_dropped("too_old", sender, "a release was sent before the stop that its sender asked for")
             return False
-        if self._fresh.take(sender, age_s, now):
+        if self._fresh.take(sender, age_s, now) or says_halt(message):
             return True
         self.on_dropped("too_old", sender, f"a command has waited for {age_s:.2f} s on its way, or behind such a one")
         return False
@@ -431,6 +432,11 @@ def is_press(metadata: Metadata, data: Buffer | memoryview) -> bool:
     """Whether a message to a robot may be a press of its emergency stop."""
     command = metadata.node_type == COMMAND and metadata.data_exchange_type in STOP_TYPES
     return command and presses(bytes(data[:5]))
+
+
+def says_halt(message: Message) -> bool:
+    """Whether a command says to stand still: it does however old it is, for nobody may say it again."""
+    return halts(message.metadata.data_exchange_type, message.data)
 
 
 def _is_command(message: Message) -> bool:

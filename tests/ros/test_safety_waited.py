@@ -62,3 +62,30 @@ async def test_a_link_that_stood_still_brings_no_old_commands(domain: int, peer:
             link.release()
             await until(lambda: heard.last == STOPPED)
             assert (await told(driver, 1))["stopped"]
+
+
+async def test_who_lets_go_while_the_link_stands_still_is_heard(domain: int, peer: Peer, tmp_path: Path) -> None:
+    """The zero is as old as what was said before it and nobody says it again: it alone is carried out, or a robot
+    without a dead-man would drive on."""
+    heard = await hear(peer)
+    async with (
+        site(domain, tmp_path, settings="") as place,
+        counted(place.router.endpoint) as link,
+        place.robot(router=link.endpoint),
+        place.headset() as driver,
+    ):
+        await may_command(driver, 1)
+        async with driving(driver, 1, hz=20):
+            await until(lambda: heard.last == 0.5)
+            link.hold_down()
+            await asyncio.sleep(0.1)
+        for number in range(15):
+            send(driver, 1, 100.0 + number)
+            await asyncio.sleep(0.1)
+        send(driver, 1, 0.0)
+        await asyncio.sleep(1.2)
+        assert heard.last == 0.5
+        link.release()
+        await until(lambda: heard.last == 0.0)
+        assert not [value for _, value in heard.values if value >= 100]
+        assert (await told(driver, 1))["drops"]["too_old"] >= 10

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import struct
 from collections import Counter
 
 import pytest
@@ -370,3 +371,24 @@ def test_what_waited_while_the_robot_stood_still_is_old(stood_s: float, senders:
     now = 60.0 + stood_s
     assert sum(taken(60.0 + tick / 20, now + tick / 1e4) for tick in range(40)) == 0
     assert taken(now + 1.0, now + 1.01) == senders
+
+
+@pytest.mark.parametrize("age_s", [0.7, 90.0])
+def test_a_velocity_of_zero_passes_however_old(guard: Guard, taken: list[Message], age_s: float) -> None:
+    """Who lets go of the stick while the network stands still says so once; what he said before is not carried out,
+    nor behind it what waited with it."""
+    dropped = []
+    guard.on_dropped = lambda name, sender, why, count=1: dropped.append(name)
+
+    def moving(speed: float) -> bytes:
+        metadata = Metadata(node_type=2, node_name="nd__cmd_vel", data_exchange_type="geometry_msgs/Twist")
+        data = b"\0\1\0\0" + struct.pack("<6d", speed, 0, 0, 0, 0, 0)
+        return encode_frame(1, (7,), message=encode_message(metadata.encode(), data))
+
+    assert guard.first(KEY, moving(1.0) + moving(0.0) + moving(2.0), age_s, 10.0)
+    assert guard.first(KEY, moving(3.0), age_s, 10.0)
+    assert [struct.unpack_from("<d", message.data, 4)[0] for message in taken] == [0.0]
+    assert taken[0].age_s == age_s
+    assert dropped == ["too_old"] * 3
+    messages = Reader(MACS, lambda key, error: None).read(KEY, moving(1.0) + moving(0.0), ME, by_group=False)
+    assert [guard.judge(message, KEY, age_s, 10.0) for message in messages] == [False, True]
