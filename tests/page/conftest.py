@@ -48,6 +48,7 @@ class Site:
     demo: Process
     web_port: int
     domain: int
+    endpoint: str
     browser: Browser
     pages: list[Watched] = field(default_factory=list)
 
@@ -100,6 +101,7 @@ async def start_site(tmp_path: Path) -> AsyncIterator[StartSite]:
                 ),
                 web_port,
                 domain,
+                endpoint,
                 await stack.enter_async_context(browser()),
             )
             sites.append(site)
@@ -114,6 +116,11 @@ async def start_site(tmp_path: Path) -> AsyncIterator[StartSite]:
 async def site(start_site: StartSite) -> Site:
     """One with its usual settings."""
     return await start_site()
+
+
+async def says(page: Watched, selector: str, words: str) -> bool:
+    """Whether an element has these words."""
+    return words in await page.page.inner_text(selector)
 
 
 HELD = "document.querySelector('#pad').classList.contains('held')"

@@ -360,6 +360,7 @@ export class Headset extends EventTarget {
     } else if (message.manager === "PrunedUnityAgentsInterfaceNodesCleaner" && message.senderType === null) {
       const { agents } = object(message.data);
       if (!Array.isArray(agents)) throw new WireError("who has left is no list");
+      this.#following = ""; // who is back before the next answer is told anew
       this.#tell("gone", agents.map((each) => ({ type: each.agent_type, id: each.agent_id })));
     } else if (message.manager === "AccessRefused" && message.senderType === null) {
       this.#takeAccess(object(message.data));
@@ -380,11 +381,12 @@ export class Headset extends EventTarget {
   #takeId(message) {
     const { agentId } = object(message.data);
     if (!Number.isInteger(agentId) || agentId < 0 || agentId > 0xffff) throw new WireError(`${agentId} is no id`);
+    const before = this.id;
     this.#welcome = message.requestId;
     this.id = agentId;
     if (this.#connected) {
       this.#configure();
-      this.#tell("id", { id: agentId });
+      if (agentId !== before) this.#tell("id", { id: agentId }); // a question to a headset is the same message
       return;
     }
     this.#clear("handshake");
@@ -465,7 +467,7 @@ export class Headset extends EventTarget {
     const whom = robot ? [robot] : [...(node?.robots ?? [])];
     const kind = said.kind ?? "refused";
     for (const each of whom) node?.refused(each, said.reason, kind);
-    this.#tell("refused", { robot, node: node ?? null, name: said.tosName, kind, reason: said.reason });
+    this.#tell("refused", { robot, node: node ?? null, name: node?.name ?? said.tosName, kind, reason: said.reason });
   }
 
   /** The connection is gone, however it went: tell, and make another one. */

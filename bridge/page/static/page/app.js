@@ -24,7 +24,7 @@ class Page {
     this.topics = new Topics(this.headset);
     this.types = new Types("", (url) => this.get(url).then((answer) => answer ?? { error: "the gateway does not answer" }));
     this.tell = (kind, text) => this.#tell(kind, text);
-    this.stop = new Stop(this.headset, this.tell, this.may.has("stop"));
+    this.stop = new Stop(this.headset, this.tell, this.may.has("stop"), (path) => this.get(path));
     this.stop.onChange = () => this.robotView?.mark();
     this.online = { robots: [], headsets: [] };
     this.robotView = new RobotView(this);
@@ -90,6 +90,8 @@ class Page {
   #route() {
     const [, wanted] = /^#(\w+)/.exec(location.hash) ?? [];
     const chosen = this.tabs.find(({ name }) => name === wanted) ?? this.tabs[0];
+    // who does not see what he drives has let go
+    if (this.view !== chosen.view) this.robotView.release("another view was chosen");
     this.view = chosen.view;
     for (const { tab, view } of this.tabs) {
       show(view.element, view === chosen.view);
@@ -118,9 +120,14 @@ class Page {
     });
     headset.addEventListener("access", ({ detail: { kind, reason } }) => {
       this.tell("refused", reason);
-      if (kind === "changed" || kind === "no_token" || kind === "ended") location.reload();
+      if (kind !== "changed" && kind !== "no_token" && kind !== "ended") return;
+      this.reloads = true;
+      location.reload();
     });
     window.addEventListener("hashchange", () => this.#route());
+    window.addEventListener("beforeunload", (event) => {
+      if (this.stop.open && !this.reloads) event.preventDefault(); // who closes it forgets a stop that is not confirmed
+    });
     window.addEventListener("pagehide", () => {
       this.robotView.release("the page was closed"); // the zero command first
       headset.close();

@@ -1,7 +1,8 @@
 /**
  * The emergency stop: pressed on all robots at once, again until each says that it holds; shown as each robot tells it.
  *
- * A press is never forgotten: without a connection it is sent as soon as there is one, until it is confirmed or taken
+ * A press is never forgotten: who is away, or not known yet, is stopped as soon as he is there; without a connection it is
+ * sent as soon as there is one, and a page that is loaded again goes on with it. It ends when it is confirmed or taken
  * back. That is the one thing here that may be old.
  */
 
@@ -10,21 +11,32 @@ import { h, say, show } from "./dom.js";
 const TOPIC = "/emergency_stop";
 const TYPE = "std_msgs/Bool";
 const AGAIN_MS = 200;
+/** A robot is asked whether it is stopped when for so long nothing was said of it; so many at a time. */
+const CHECK_MS = 1500;
+const CHECKED_AT_ONCE = 16;
 const TRUE = new Uint8Array([0, 1, 0, 0, 1]);
 const FALSE = new Uint8Array([0, 1, 0, 0, 0]);
+/** Where it is written down for the page that comes after this one in the same tab. */
+const KEPT = "macs.stop";
 
 export class Stop {
-  /** `say` tells an event; `mayStop` whether this page may. */
-  constructor(headset, tell, mayStop) {
+  /** `tell` tells an event; `mayStop` whether this page may; `get` asks the gateway for JSON. */
+  constructor(headset, tell, mayStop, get) {
     this.headset = headset;
+    this.get = get;
     this.tell = tell;
     this.mayStop = mayStop;
     /** robot → {stopped, tookMs}: what it said last, and how long that took after the press. */
     this.states = new Map();
     this.pressedAt = null;
+    this.askedAt = 0;
+    this.turn = 0;
+    /** All that were ever seen here: who is away when it is pressed is meant too. */
+    this.known = new Set();
+    /** Those that have not confirmed yet, online or not. */
     this.wanted = new Set();
-    /** Pressed while nobody knew which robots there are. */
-    this.pending = false;
+    /** Pressed for all: so also for robots that are seen for the first time, until it is released. */
+    this.all = false;
     this.onChange = () => {};
     this.state = headset.subscribe(TOPIC, TYPE, {}, (message) => this.#take(message));
     this.command = mayStop ? headset.advertise(TOPIC, TYPE) : null;
@@ -34,7 +46,11 @@ export class Stop {
       this.onChange();
     });
     headset.addEventListener("refused", ({ detail }) => this.#refused(detail));
+    // timers of a hidden page are slow
+    document.addEventListener("visibilitychange", () => this.#send());
     this.element = this.#build();
+    this.#restore();
+    setInterval(() => this.#check(), CHECK_MS);
   }
 
   /** These robots are online. */
@@ -48,50 +64,75 @@ export class Stop {
     }
     this.state.register({ robots });
     this.command?.register({ robots });
-    if (this.pending && robots.length) this.press(robots);
-    else this.#show();
+    for (const robot of robots) {
+      if (this.all && !this.known.has(robot)) this.wanted.add(robot);
+      this.known.add(robot);
+    }
+    this.#send();
   }
 
-  /** Stop these robots, all by default. */
-  press(robots = [...this.state.robots]) {
+  /** Stop all robots. */
+  press() {
     if (!this.mayStop) return;
-    if (!this.pending) this.pressedAt = performance.now();
-    this.pending = !this.headset.connected;
-    this.wanted = new Set(robots);
-    robots.forEach((robot) => this.states.has(robot) && (this.states.get(robot).tookMs = null));
-    const whom = robots.length === 1 ? `robot ${robots[0]}` : robots.length ? `${robots.length} robots` : "all robots";
+    if (!this.open) this.pressedAt = performance.now();
+    this.askedAt = performance.now();
+    this.all = true;
+    this.known.forEach((robot) => this.wanted.add(robot));
+    this.states.forEach((state) => (state.tookMs = null));
+    const { size } = this.known;
+    const whom = size === 1 ? `robot ${[...this.known][0]}` : size ? `${size} robots` : "all robots, of which none is known yet";
     this.tell("stop", `stop pressed for ${whom}`);
     // also those that somebody else has stopped: a release of his is not ours
-    if (robots.length) this.command.publish(TRUE, { robots });
+    const online = [...this.state.robots];
+    if (online.length) this.command.publish(TRUE, { robots: online });
     this.#send({ again: false });
+    this.onChange();
   }
 
-  /** Let these robots go on, as far as they let this page. */
+  /** Let these robots go on, as far as they let this page; a press that is not confirmed is taken back. */
   release(robots = this.stopped()) {
     this.wanted.clear();
-    this.pending = false;
+    this.all = false;
     this.pressedAt = null;
-    this.command?.publish(FALSE, { robots });
-    this.tell("stop", `release asked for ${robots.map((robot) => `robot ${robot}`).join(", ")}`);
-    this.#show();
+    this.askedAt = performance.now();
+    const whom = robots.map((robot) => `robot ${robot}`).join(", ");
+    const sent = robots.length > 0 && this.command?.publish(FALSE, { robots });
+    if (sent) this.tell("stop", `release asked for ${whom}`);
+    else this.tell("stop", robots.length ? `no connection: the release of ${whom} was not sent` : "the stop is taken back");
+    this.#send();
+    this.onChange();
+  }
+
+  /** Whether a press is not confirmed yet, by somebody who is known or because nobody is. */
+  get open() {
+    return this.wanted.size > 0 || (this.all && this.known.size === 0);
   }
 
   /** Robots that say that they are stopped. */
   stopped() {
-    return [...this.states].filter(([, state]) => state.stopped).map(([robot]) => robot);
+    return [...this.states].filter(([, state]) => state.stopped).map(([robot]) => robot).sort((a, b) => a - b);
   }
 
   isStopped(robot) {
     return this.states.get(robot)?.stopped ?? false;
   }
 
+  /** Whether it was asked to stop and has not said so yet. */
+  isWanted(robot) {
+    return this.wanted.has(robot);
+  }
+
   #take(message) {
-    const robot = message.senderId;
-    const stopped = message.data.length > 4 && message.data[4] !== 0;
+    this.#said(message.senderId, message.data.length > 4 && message.data[4] !== 0);
+  }
+
+  #said(robot, stopped) {
     const before = this.states.get(robot);
-    const state = { stopped, tookMs: before?.tookMs ?? null, why: "" };
-    if (stopped && this.wanted.delete(robot)) state.tookMs = performance.now() - this.pressedAt;
+    const state = { stopped, tookMs: before?.tookMs ?? null, why: "", at: performance.now() };
+    if (stopped && this.wanted.delete(robot) && this.pressedAt !== null) state.tookMs = performance.now() - this.pressedAt;
     this.states.set(robot, state);
+    // somebody has let all of them go on: then newcomers may, too
+    if (before?.stopped && !stopped && !this.wanted.size && !this.stopped().length) this.all = false;
     if (before?.stopped !== stopped && (before || stopped)) {
       this.tell("stop", stopped ? `robot ${robot} is stopped` : `robot ${robot} may go on`);
     }
@@ -100,9 +141,10 @@ export class Stop {
   }
 
   #refused({ robot, name, reason }) {
-    if (name !== TOPIC || !robot) return;
-    const before = this.states.get(robot) ?? { stopped: false, tookMs: null };
-    this.states.set(robot, { ...before, why: reason });
+    if (name !== TOPIC) return;
+    for (const one of robot ? [robot] : this.wanted) {
+      this.states.set(one, { ...(this.states.get(one) ?? { stopped: false, tookMs: null }), why: reason });
+    }
     this.#show();
   }
 
@@ -110,11 +152,57 @@ export class Stop {
   #send({ again = true } = {}) {
     clearTimeout(this.timer);
     this.wanted.forEach((robot) => this.isStopped(robot) && this.wanted.delete(robot));
-    if (!this.wanted.size) return this.#show();
-    const online = [...this.wanted].filter((robot) => this.state.robots.has(robot));
-    if (again && online.length) this.command.publish(TRUE, { robots: online });
-    this.timer = setTimeout(() => this.#send(), AGAIN_MS);
+    if (this.wanted.size && this.mayStop) {
+      const online = [...this.wanted].filter((robot) => this.state.robots.has(robot));
+      if (again && online.length) this.command.publish(TRUE, { robots: online });
+      this.timer = setTimeout(() => this.#send(), AGAIN_MS);
+    }
     this.#show();
+  }
+
+  /** What it says was lost if nothing came for a while, or the robot was away meanwhile: then it is asked. */
+  async #check() {
+    const due = [...new Set([...this.wanted, ...this.stopped()])].filter((robot) => {
+      const at = Math.max(this.askedAt, this.states.get(robot)?.at ?? 0);
+      return this.state.robots.has(robot) && performance.now() - at > CHECK_MS;
+    });
+    this.turn = due.length > CHECKED_AT_ONCE ? (this.turn + CHECKED_AT_ONCE) % due.length : 0;
+    const asked = [...due.slice(this.turn), ...due.slice(0, this.turn)].slice(0, CHECKED_AT_ONCE);
+    for (const robot of asked) {
+      const [before, { askedAt }] = [this.states.get(robot), this];
+      const status = await this.get(`/view/robots/${robot}/status`);
+      const same = this.states.get(robot) === before && this.askedAt === askedAt && this.state.robots.has(robot);
+      if (same && typeof status?.stopped === "boolean") this.#said(robot, status.stopped);
+    }
+  }
+
+  // -- over the end of a page ----------------------------------------------------------------------------------------
+
+  /** A page that is loaded again goes on with what was pressed in the one before. */
+  #restore() {
+    let kept = null;
+    try {
+      kept = JSON.parse(sessionStorage.getItem(KEPT));
+    } catch {
+      // a browser that keeps nothing
+    }
+    if (kept === null || !Array.isArray(kept.wanted)) return this.#show();
+    this.all = kept.all === true;
+    for (const robot of kept.wanted) this.wanted.add(robot) && this.known.add(robot);
+    this.pressedAt = performance.now();
+    this.#send();
+  }
+
+  #keep() {
+    const kept = this.open ? JSON.stringify({ all: this.all, wanted: [...this.wanted] }) : null;
+    if (kept === this.kept) return;
+    this.kept = kept;
+    try {
+      if (kept === null) sessionStorage.removeItem(KEPT);
+      else sessionStorage.setItem(KEPT, kept);
+    } catch {
+      // likewise
+    }
   }
 
   // -- what is shown -------------------------------------------------------------------------------------------------
@@ -158,23 +246,29 @@ export class Stop {
   }
 
   #show() {
+    this.#keep();
     const stopped = this.stopped();
-    const waiting = [...this.wanted];
-    const open = waiting.length > 0 || this.pending;
-    this.element.dataset.state = open ? "waiting" : stopped.length ? "stopped" : "free";
-    show(this.releaseButton, this.mayStop && (stopped.length > 0 || this.pending));
-    if (!this.headset.connected && open) {
-      say(this.status, "no connection: the stop is sent as soon as there is one");
-    } else if (waiting.length) {
-      const why = "no confirmation yet of";
-      const reasons = waiting.map((robot) => this.states.get(robot)?.why).filter(Boolean);
-      say(this.status, `${why} robot ${waiting.join(", ")}${reasons.length ? ` (${reasons[0]})` : ""}`);
+    this.element.dataset.state = this.open ? "waiting" : stopped.length ? "stopped" : "free";
+    show(this.releaseButton, this.mayStop && (stopped.length > 0 || this.open || this.all));
+    say(this.status, this.#words(stopped).join(" · "));
+  }
+
+  #words(stopped) {
+    const list = (robots) => `robot ${robots.join(", ")}`;
+    const away = [...this.wanted].filter((robot) => !this.state.robots.has(robot));
+    const waiting = [...this.wanted].filter((robot) => this.state.robots.has(robot));
+    if (this.open && !this.mayStop) return [`a stop is not confirmed by ${list([...this.wanted])}, and this token may not stop`];
+    if (this.open && !this.headset.connected) return ["no connection: the stop is sent as soon as there is one"];
+    const words = [];
+    if (waiting.length) {
+      const reason = waiting.map((robot) => this.states.get(robot)?.why).find(Boolean);
+      words.push(`no confirmation yet of ${list(waiting)}${reason ? ` (${reason})` : ""}`);
     } else if (stopped.length) {
       const took = stopped.map((robot) => this.states.get(robot).tookMs).filter((ms) => ms !== null);
-      const within = took.length ? ` after ${Math.round(Math.max(...took))} ms` : "";
-      say(this.status, `robot ${stopped.join(", ")} stopped${within}`);
-    } else {
-      say(this.status, "");
+      words.push(`${list(stopped)} stopped${took.length ? ` after ${Math.round(Math.max(...took))} ms` : ""}`);
     }
+    if (away.length) words.push(`${list(away)} not online: stopped on return`);
+    if (this.all && !words.length) words.push("no robot is online: each that comes is stopped");
+    return words;
   }
 }

@@ -1,0 +1,86 @@
+"""The page's stop with robots that are away: what was pressed is never forgotten, and what is said of it is so."""
+
+from __future__ import annotations
+
+import signal
+from contextlib import AsyncExitStack
+from functools import partial
+
+import pytest
+
+from tests.page.conftest import DOMAINS, Site, says
+from tests.support.browser import OFFLINE, Watched, needs_browser
+from tests.support.programs import Program
+from tests.support.waiting import until
+
+pytest.importorskip("rclpy")
+pytestmark = [needs_browser, pytest.mark.timeout(240)]
+
+
+def second_agent(site: Site) -> Program:
+    """Of robot 2, on a graph of its own."""
+    return Program("agent", "--id", "2", "-e", site.endpoint, env={"ROS_DOMAIN_ID": str(site.domain + DOMAINS)})
+
+
+async def online(page: Watched, *robots: int) -> None:
+    """Wait until the page knows these, and no others."""
+    await until(partial(page.value, f"String(macsPage.online.robots) === '{','.join(map(str, robots))}'"))
+
+
+async def test_a_press_holds_for_a_robot_that_drops_out(site: Site) -> None:
+    """Robot 2 stands still before it confirms, and is not online when somebody presses again: it is stopped as
+    soon as it is back, and until then nobody says that all of them are."""
+    async with AsyncExitStack() as stack:
+        other = await stack.enter_async_context(second_agent(site))
+        page = await site.open()
+        await online(page, 1, 2)
+        other.send_signal(signal.SIGSTOP)
+        try:
+            await page.page.click("#stop")
+            await until(lambda: says(page, "#stop-status", "no confirmation yet of robot 2"))
+            await online(page, 1)
+            await page.page.click("#stop")
+            await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
+            assert "robot 2 not online: stopped on return" in await page.page.inner_text("#stop-status")
+            assert await page.page.get_attribute(".stop-bar", "data-state") == "waiting"
+        finally:
+            other.send_signal(signal.SIGCONT)
+        await until(lambda: says(page, "#stop-status", "robot 1, 2 stopped"))
+
+
+async def test_a_press_holds_where_no_robot_is_known(site: Site) -> None:
+    """Connected, and none is online: it is said so; who comes is stopped, one and all. A page that is loaded
+    anew meanwhile goes on with it."""
+    await site.agent.stop(signal.SIGKILL)
+    page = await site.open()
+    page.allowed.append(OFFLINE)
+    await until(partial(page.value, "macsPage.headset.connected"))
+    await online(page)
+    await page.page.click("#stop")
+    await until(lambda: says(page, "#stop-status", "no robot is online: each that comes is stopped"))
+    page.page.on("dialog", lambda dialog: dialog.accept())
+    await page.page.reload()
+    await until(lambda: says(page, "#stop-status", "no robot is online: each that comes is stopped"))
+    await site.agent.start()
+    await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
+    async with second_agent(site):
+        await until(lambda: says(page, "#stop-status", "robot 1, 2 stopped"))
+        await page.page.click("#release")
+        await page.page.click("#release")
+        await until(partial(page.value, "document.querySelector('#stop-status').textContent === ''"))
+    assert await page.value("sessionStorage.getItem('macs.stop')") is None
+
+
+async def test_a_press_that_was_taken_back_is_not_sent(site: Site) -> None:
+    """Pressed while there is no robot, and released: who comes then may go on."""
+    await site.agent.stop(signal.SIGKILL)
+    page = await site.open()
+    await until(partial(page.value, "macsPage.headset.connected"))
+    await online(page)
+    await page.page.click("#stop")
+    await page.page.click("#release")
+    await page.page.click("#release")
+    await until(partial(page.value, "document.querySelector('#stop-status').textContent === ''"))
+    await site.agent.start()
+    await page.page.wait_for_selector('#pad[aria-disabled="false"]', timeout=60_000)
+    assert await page.value("macsPage.stop.stopped().length") == 0
