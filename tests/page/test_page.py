@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import signal
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 pytest.importorskip("rclpy")
 
-from geometry_msgs.msg import Twist
-
 from bridge.tokens import store
 from macs_zenoh.protocol.rights import Rights
 from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
-from tests.page.conftest import Act, Site, StartSite, driven, still
+from tests.page.conftest import Site, StartSite, driven, says, still
+from tests.page.driving import GAMEPAD, heard_at, hold, key, pointer
 from tests.support.browser import AXE, OFFLINE, SCREENSHOTS, Watched, needs_browser
-from tests.support.ros_peer import Peer
 from tests.support.waiting import until
 
 pytestmark = [needs_browser, pytest.mark.timeout(240)]
@@ -39,58 +35,6 @@ async def text(page: Watched, selector: str) -> str:
 async def picture(page: Watched, selector: str = CAMERA) -> str:
     """The pixels of a canvas."""
     return str(await page.value(LOOK.replace("{}", selector)))
-
-
-async def hold(page: Watched, across: float = 0.0, up: float = 0.8) -> None:
-    """Press on the pad and drag there: from -1 to 1."""
-    box = await page.page.locator("#pad").bounding_box()
-    assert box is not None
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    await page.page.mouse.move(x, y)
-    await page.page.mouse.down()
-    await page.page.mouse.move(x + across * 0.38 * box["width"], y - up * 0.38 * box["height"], steps=3)
-
-
-def pointer(page: Watched, across: float = 0.0, up: float = 0.8) -> tuple[Act, Act]:
-    """How it is taken hold of by the pointer, and let go."""
-    return partial(hold, page, across, up), page.page.mouse.up
-
-
-def key(page: Watched, name: str) -> tuple[Act, Act]:
-    """The same by a key."""
-    return partial(page.page.keyboard.down, name), partial(page.page.keyboard.up, name)
-
-
-class Heard:
-    """Commands that the robot gets, as a ROS node beside it hears them."""
-
-    def __init__(self) -> None:
-        self.speeds: list[float] = []
-        self.stopped_at = 0.0
-        """When the first zero after another command came."""
-
-    async def listen(self, peer: Peer) -> None:
-        def take(twist: Any) -> None:
-            if twist.linear.x == 0 and self.last:
-                self.stopped_at = time.monotonic()
-            self.speeds.append(twist.linear.x)
-
-        await peer.session.run(lambda: peer.session.node.create_subscription(Twist, "/cmd_vel", take, 1000))
-
-    @property
-    def last(self) -> float | None:
-        return self.speeds[-1] if self.speeds else None
-
-
-@contextlib.asynccontextmanager
-async def heard_at(site: Site):  # type: ignore[no-untyped-def]
-    """What the robot of a site is told."""
-    peer, heard = Peer(site.domain), Heard()
-    try:
-        await heard.listen(peer)
-        yield heard
-    finally:
-        peer.session.close()
 
 
 async def test_it_shows_the_robot(site: Site) -> None:
@@ -123,10 +67,6 @@ async def more_points(page: Watched, before: int) -> bool:
     return int(await page.value("document.querySelector('.plotted').dataset.points")) > before
 
 
-async def says(page: Watched, selector: str, words: str) -> bool:
-    return words in await text(page, selector)
-
-
 async def test_it_drives_by_pointer_and_by_keys(site: Site) -> None:
     """Forward, to a side and back, and by a gamepad, while it is held and no longer: the last command is a zero."""
     async with heard_at(site) as heard:
@@ -152,8 +92,6 @@ async def test_it_drives_by_pointer_and_by_keys(site: Site) -> None:
         await until(lambda: heard.last == 0.0)
 
 
-GAMEPAD = "{connected: true, axes: [0, -1], buttons: [{}, {}, {}, {}, {}, {pressed: true}]}"
-"""Its shoulder button held, its stick pushed forward."""
 LETTING_GO = {
     "released": "",
     "window_blurred": "window.dispatchEvent(new Event('blur'))",

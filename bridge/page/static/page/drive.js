@@ -2,8 +2,9 @@
  * Driving: commands only while somebody holds on, and a zero command at once when he lets go, for whatever reason.
  *
  * Held is the pointer on the pad, a key while the pad has the focus, or a shoulder button of a gamepad. Lost is the hold
- * also when the window loses the focus, the tab is hidden, the page closes or stood still, the connection is not fresh,
- * the robot refuses, or is stopped. After that it has to be taken anew: nothing drives on by itself.
+ * also when the window loses the focus, the tab is hidden, another view or robot is chosen, a modifier key is pressed, the
+ * page closes or stood still, the connection is not fresh, the robot leaves, refuses, or is stopped. After that it has to
+ * be taken anew: nothing drives on by itself.
  */
 
 import { digits, h, panel, say, show } from "./dom.js";
@@ -34,6 +35,12 @@ const KEYS = {
 };
 const CLUTCH_BUTTONS = [4, 5, 6, 7];
 const DEAD_ZONE = 0.08;
+/** So long an answer is waited for, and then so long until it is asked again, as long as a zero command is owed. */
+const ANSWER_MS = 5000;
+const AGAIN_MS = 500;
+const LATE_ZERO_MS = 1000;
+/** headset → panels, closed ones too, whose last zero command may not have come. */
+const debts = new WeakMap();
 
 export class Drive {
   #source = null;
@@ -44,7 +51,10 @@ export class Drive {
   #keys = new Set();
   #unlisten = [];
   #barred = "the robot is asked";
-  #gamepadHeld = false;
+  /** Whether its button is down since before it would count: it has to be pressed anew to take hold. */
+  #gamepadHeld = true;
+  #gamepad = undefined;
+  #online = true;
 
   constructor(robot, topic, type, { headset, types, stop, tell }) {
     this.robot = robot;
@@ -54,8 +64,10 @@ export class Drive {
     this.tell = tell;
     this.shape = COMMANDS[type];
     this.node = headset.advertise(topic, type, { robots: [robot] });
+    this.debt = 0;
     this.element = this.#build();
     this.#listen();
+    this.#inherit();
     types.get(type, robot).then(
       (found) => {
         this.type = found;
@@ -94,22 +106,35 @@ export class Drive {
     return this.#source !== null;
   }
 
-  /** A gamepad is looked at with each frame that the screen shows. */
+  /** The robot is there, or not: who is away is not driven, and not driven on when he is back. */
+  setOnline(online) {
+    this.#online = online;
+    this.#judge();
+  }
+
+  /** A gamepad is looked at with each frame that the screen shows, and before each command. */
   draw() {
     const pad = [...(navigator.getGamepads?.() ?? [])].find((each) => each?.connected);
     const clutch = pad && CLUTCH_BUTTONS.some((button) => pad.buttons[button]?.pressed);
-    if (clutch && document.hasFocus()) {
-      const [turn, forward] = pad.axes.map((axis) => (Math.abs(axis) < DEAD_ZONE ? 0 : -axis));
-      if (this.#source === "gamepad" || (!this.#gamepadHeld && this.#take("gamepad"))) this.#point(forward, turn);
-      this.#gamepadHeld = true; // it has to be pressed anew to take hold again
+    const another = pad && this.#source === "gamepad" && pad?.index !== this.#gamepad;
+    if (another) {
+      this.release("it is another gamepad");
+    } else if (clutch && document.hasFocus()) {
+      const [turn = 0, forward = 0] = pad.axes.map((axis) => (Math.abs(axis) < DEAD_ZONE ? 0 : -axis));
+      if (this.#source === "gamepad" || (!this.#gamepadHeld && this.#take("gamepad"))) {
+        this.#gamepad = pad.index;
+        this.#point(forward, turn);
+      }
+      this.#gamepadHeld = true;
     } else {
-      this.#gamepadHeld = false;
       if (this.#source === "gamepad") this.release("the button was released");
+      this.#gamepadHeld = Boolean(clutch);
     }
   }
 
-  /** Let go: a zero command, at once and twice more. */
+  /** Let go: a zero command, at once and twice more, and once again when the way to the robot is known to be open. */
   release(why) {
+    this.#gamepadHeld = true;
     if (this.#source === null) return;
     this.#source = null;
     this.#keys.clear();
@@ -117,6 +142,7 @@ export class Drive {
     this.#point(0, 0);
     this.#sendZero();
     for (const ms of ZEROS) setTimeout(() => this.#source === null && this.#sendZero(), ms);
+    this.#owe();
     this.pad.classList.remove("held");
     this.why = why;
     this.#judge();
@@ -125,8 +151,57 @@ export class Drive {
   close() {
     this.release("the panel was closed");
     this.#unlisten.forEach((end) => end());
-    this.node.deregister({ robots: [this.robot] });
+    this.closed = true;
+    if (!this.owing) this.node.deregister({ robots: [this.robot] }); // else when the last zero has gone
     this.element.remove();
+  }
+
+  // -- the last zero command -----------------------------------------------------------------------------------------
+
+  /**
+   * What is sent while a connection stands still or is lost comes too late or never, and a robot may keep its last speed.
+   * So the zero is sent once more when the gateway has answered, with the robot online, and the panel's end changes
+   * nothing about that. Whoever takes hold meanwhile says himself what is to be.
+   */
+  async #owe() {
+    this.debt += 1;
+    if (this.owing) return;
+    this.owing = true;
+    if (!debts.has(this.headset)) debts.set(this.headset, new Set());
+    debts.get(this.headset).add(this);
+    for (let away = false; this.owing && !this.held; ) {
+      const { debt } = this;
+      const there = await this.headset.online({ timeoutMs: ANSWER_MS }).catch(() => null);
+      if (!this.owing || this.held) break;
+      if (debt !== this.debt) continue; // what was asked before the release tells nothing of it
+      if (there?.robots.includes(this.robot)) {
+        this.#sendZero();
+        if (!away) break;
+        away = false; // it may not have this topic yet: once more
+        await pause(LATE_ZERO_MS);
+      } else {
+        away = true;
+        await pause(AGAIN_MS);
+      }
+    }
+    if (!this.owing) return;
+    this.#paid();
+    if (this.closed) this.node.deregister({ robots: [this.robot] });
+  }
+
+  #paid() {
+    this.owing = false;
+    debts.get(this.headset).delete(this);
+  }
+
+  /** What a panel of before owes this robot's topic is for this one to send now: their node is the same. */
+  #inherit() {
+    for (const each of [...(debts.get(this.headset) ?? [])]) {
+      if (each.robot !== this.robot || each.topic !== this.topic) continue;
+      each.#paid();
+      this.lastZero = each.zero ?? each.lastZero;
+      this.#owe();
+    }
   }
 
   // -- the hold ------------------------------------------------------------------------------------------------------
@@ -152,6 +227,8 @@ export class Drive {
   }
 
   #tick() {
+    if (this.#source === "gamepad") this.draw(); // nobody else looks while the robot's view is not shown
+    if (!this.held) return;
     const now = performance.now();
     const still = now - this.#tickedAt;
     this.#tickedAt = now;
@@ -168,7 +245,9 @@ export class Drive {
   }
 
   #sendZero() {
-    this.node.publish(this.zero, { robots: [this.robot] });
+    const zero = this.zero ?? this.lastZero;
+    if (zero === undefined) return;
+    this.node.publish(zero, { robots: [this.robot] });
     this.#shown(0, 0);
   }
 
@@ -180,8 +259,10 @@ export class Drive {
   #judge() {
     const own = `unity/${this.headset.id}`;
     if (!this.headset.connected) this.#bar("no connection");
+    else if (!this.#online) this.#bar("the robot is not online");
     else if (this.zero === undefined) this.#bar("the type of its commands is asked for");
     else if (this.stop.isStopped(this.robot) || this.status?.stopped) this.#bar("the robot is stopped");
+    else if (this.stop.isWanted(this.robot)) this.#bar("a stop is pressed");
     else if (this.holder && this.holder !== own) this.#bar(`${this.holder} has control`);
     else this.#bar("");
   }
@@ -207,7 +288,12 @@ export class Drive {
       this.pad.focus({ preventScroll: true });
       this.#follow(event);
     });
-    on(this.pad, "pointermove", (event) => this.#isPointer(event) && this.#follow(event));
+    on(this.pad, "pointermove", (event) => {
+      if (!this.#isPointer(event)) return;
+      // while another button is down, the end of the first is told as a move
+      if (event.buttons & 1) this.#follow(event);
+      else this.release("let go");
+    });
     for (const type of ["pointerup", "pointercancel", "lostpointercapture"]) {
       on(this.pad, type, (event) => this.#isPointer(event) && this.release("let go"));
     }
@@ -238,7 +324,12 @@ export class Drive {
   }
 
   #key(event, down) {
-    if (!(event.code in KEYS) || event.ctrlKey || event.metaKey || event.altKey) return;
+    // with a modifier a key is another one, and its end may never be told
+    if (down && (event.ctrlKey || event.metaKey || event.altKey)) {
+      if (this.#source === "keys") this.release("a modifier key was pressed");
+      return;
+    }
+    if (!(event.code in KEYS)) return;
     event.preventDefault();
     if (down && !event.repeat && (this.#source === "keys" || this.#take("keys"))) this.#keys.add(event.code);
     if (!down) this.#keys.delete(event.code);
@@ -285,6 +376,8 @@ export class Drive {
     }
   }
 }
+
+const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
 
 function stamp() {
   const now = Date.now();

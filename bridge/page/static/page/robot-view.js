@@ -141,6 +141,7 @@ class Shown {
   setOnline(online) {
     if (online && !this.online) this.page.types.forget(this.robot);
     this.online = online;
+    this.drive?.setOnline(online);
     this.place.classList.toggle("lost", !online);
     this.#tellFacts();
   }
@@ -222,6 +223,7 @@ class Shown {
       const found = Object.entries(offers.subscribers ?? {}).find(([, type]) => type in COMMANDS);
       if (found) {
         this.drive = new Drive(this.robot, ...found, this.parts);
+        this.drive.setOnline(this.online);
         this.drive.setStatus(this.status);
         this.areas.control.prepend(this.drive.element);
       }

@@ -1,0 +1,71 @@
+"""How a page's pad is taken hold of, and what its robot is told then."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import AsyncIterator
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import Twist
+
+from tests.page.conftest import Act, Site
+from tests.support.browser import Watched
+from tests.support.ros_peer import Peer
+
+
+async def hold(page: Watched, across: float = 0.0, up: float = 0.8) -> None:
+    """Press on the pad and drag there: from -1 to 1."""
+    box = await page.page.locator("#pad").bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    await page.page.mouse.move(x, y)
+    await page.page.mouse.down()
+    await page.page.mouse.move(x + across * 0.38 * box["width"], y - up * 0.38 * box["height"], steps=3)
+
+
+def pointer(page: Watched, across: float = 0.0, up: float = 0.8) -> tuple[Act, Act]:
+    """How it is taken hold of by the pointer, and let go."""
+    return partial(hold, page, across, up), page.page.mouse.up
+
+
+def key(page: Watched, name: str) -> tuple[Act, Act]:
+    """The same by a key."""
+    return partial(page.page.keyboard.down, name), partial(page.page.keyboard.up, name)
+
+
+class Heard:
+    """Commands that the robot gets, as a ROS node beside it hears them."""
+
+    def __init__(self) -> None:
+        self.speeds: list[float] = []
+        self.stopped_at = 0.0
+        """When the first zero after another command came."""
+
+    async def listen(self, peer: Peer) -> None:
+        def take(twist: Any) -> None:
+            if twist.linear.x == 0 and self.last:
+                self.stopped_at = time.monotonic()
+            self.speeds.append(twist.linear.x)
+
+        await peer.session.run(lambda: peer.session.node.create_subscription(Twist, "/cmd_vel", take, 1000))
+
+    @property
+    def last(self) -> float | None:
+        return self.speeds[-1] if self.speeds else None
+
+
+@contextlib.asynccontextmanager
+async def heard_at(site: Site) -> AsyncIterator[Heard]:
+    """What the robot of a site is told."""
+    peer, heard = Peer(site.domain), Heard()
+    try:
+        await heard.listen(peer)
+        yield heard
+    finally:
+        peer.session.close()
+
+
+GAMEPAD = "{connected: true, axes: [0, -1], buttons: [{}, {}, {}, {}, {}, {pressed: true}]}"
+"""Its shoulder button held, its stick pushed forward."""
