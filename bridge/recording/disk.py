@@ -18,13 +18,17 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from bridge.recording.mcap_file import McapFile
-from bridge.recording.streams import LOST, ROS2MSG, Channel
+from bridge.recording.streams import LOST, PREFIX, ROS2MSG, Channel
 from macs_zenoh.errors import ConfigError
 
 log = logging.getLogger("macs.record")
 
 QUEUE_BYTES = 256 << 20
 """What may wait for the disk."""
+CHANNELS = 0xFFFF - 100
+"""A file has no more of robots and headsets, whose names are their own: the mesh's have room beside them."""
+KEPT = 1 << 16
+"""Newest values that a later file begins with; as many agents may be online, and robots' names have no end."""
 TURN_S = 0.02
 """Pause between two looks at what has come: a look per message would wake two threads for each."""
 FLUSH_S = 0.4
@@ -229,12 +233,15 @@ class Disk:
         assert file is not None
         number = self._ids.get(channel)
         if number is None:
+            if len(file.index.channels) >= CHANNELS and not channel.topic.startswith(PREFIX):
+                self.lost["too_many_channels"] += 1
+                return
             number = self._ids[channel] = self._channel(file, channel)
         if not self._began_ns:
             self._began_ns = entry.log_ns
         self.messages += 1
         file.add(number, entry.sequence, entry.log_ns, entry.publish_ns or entry.log_ns, entry.data)
-        if entry.keep:
+        if entry.keep and (entry.keep in self._kept or len(self._kept) < KEPT):
             self._kept[entry.keep] = entry
 
     def _channel(self, file: McapFile, channel: Channel) -> int:

@@ -7,6 +7,7 @@ takes, and takes 20 µs for a message; records other than messages are its recor
 
 from __future__ import annotations
 
+import errno
 import os
 import struct
 import zlib
@@ -196,7 +197,7 @@ class McapFile:
     def channel(self, topic: str, encoding: str, schema_id: int, metadata: dict[str, str]) -> int:
         """A new channel's id; 0 as ``schema_id`` for none."""
         if len(self.index.channels) >= 0xFFFF:
-            raise OSError(75, "a recording has at most 65535 channels")
+            raise OSError(errno.EOVERFLOW, "a recording has at most 65535 channels")
         found = len(self.index.channels) + 1
         record = Channel(found, topic, encoding, metadata, schema_id)
         self._write(_bytes(record))

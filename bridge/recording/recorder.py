@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +15,8 @@ from bridge.recording.conditions import Condition, Event, stop_topic
 from bridge.recording.disk import Entry, Sink, now_ns
 from bridge.recording.follower import RobotFollower
 from bridge.recording.schema_source import Schemas
-from bridge.recording.streams import CDR, JSON, MESSAGES, NOTES, OFFERS, PRESENCE, Channel, command_topic
+from bridge.recording.sent import SentCommands
+from bridge.recording.streams import MESSAGES, NOTES, OFFERS, PRESENCE, Channel
 from bridge.recording.traffic import Said, Sent, Traffic
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError, Unreachable, WireError
@@ -26,7 +27,6 @@ from macs_zenoh.protocol.limits import ANSWER_BYTES
 from macs_zenoh.protocol.messages import ROS, decode_data
 from macs_zenoh.protocol.name_patterns import matches
 from macs_zenoh.protocol.robot_state import Offered, RobotStatus
-from macs_zenoh.protocol.schemas import full_type
 from macs_zenoh.protocol.wire import Layout
 
 log = logging.getLogger("macs.record")
@@ -35,10 +35,6 @@ STATUS_S = 1.0
 """How often a robot is asked how it is; its stop is heard at once."""
 WITHOUT_STATUS_S = 30.0
 """The same of one that has not answered: an existing program."""
-EARLY = 4096
-"""So many commands wait for the schema of their type."""
-EARLY_BYTES = 16 << 20
-"""And no more of them than this."""
 
 
 @dataclass(frozen=True)
@@ -84,11 +80,9 @@ class Recorder:
         self._on_trigger = on_trigger
         self.schemas = Schemas(agent)
         self._json: dict[str, Channel] = {}
-        self._commands: dict[tuple[str, str, str, str], Channel | None] = {}
-        self._early: deque[tuple[Sent, int]] = deque()
+        self._commands = SentCommands(sink, self.schemas, self.robots)
         self._watching: dict[int, asyncio.Task[None]] = {}
         self._asked: dict[int, asyncio.Event] = {}
-        self._tasks: set[asyncio.Task[None]] = set()
         self._subscribed: list[Any] = []
         layout = Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots)
         self._traffic = Traffic(layout, self._bad)
@@ -108,8 +102,9 @@ class Recorder:
 
     def close(self) -> None:
         """Hear no more; robots are told."""
-        for task in [*self._watching.values(), *self._tasks]:
+        for task in self._watching.values():
             task.cancel()
+        self._commands.close()
         for subscription in self._subscribed:
             subscription.close()
         for follower in self.robots.values():
@@ -227,7 +222,7 @@ class Recorder:
         for key, payload in batch:
             for what in self._traffic.read(key, payload):
                 if isinstance(what, Sent):
-                    self._command(what, now_ns())
+                    self._commands.put(what, now_ns())
                 elif self._wanted.headsets or what.channel != MESSAGES:
                     self._say(what)
 
@@ -237,52 +232,6 @@ class Recorder:
     def _bad(self, key: str, error: WireError) -> None:
         self._bad_frames += 1
         log.debug("a frame on %s cannot be read: %s", key, error)
-
-    def _command(self, sent: Sent, log_ns: int) -> None:
-        known = (sent.sender, sent.to, sent.node, sent.type)
-        channel = self._commands.get(known)
-        if channel is not None:
-            self._put_command(channel, sent, log_ns)
-            return
-        while len(self._early) >= EARLY or sum(len(each.data) for each, _ in self._early) > EARLY_BYTES:
-            self._early.popleft()
-            self._bad_frames += 1
-        self._early.append((sent, log_ns))
-        if known not in self._commands:
-            self._commands[known] = None
-            task = asyncio.get_running_loop().create_task(self._open_command(known, sent))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
-
-    def _put_command(self, channel: Channel, sent: Sent, log_ns: int) -> None:
-        data = sent.data
-        if channel.encoding == JSON:
-            data = msgspec.json.encode({"type": sent.type, "bytes": len(data), "data": data})
-        self._sink.put(Entry(channel, channel.next(len(data)), log_ns, data))
-
-    async def _open_command(self, known: tuple[str, str, str, str], sent: Sent) -> None:
-        """Make the channel of commands like this one, and record those that waited for it."""
-        robots = [self.robots[int(sent.to)]] if sent.to.isdigit() and int(sent.to) in self.robots else []
-        robots += [follower for follower in self.robots.values() if follower not in robots]
-        topic = robots[0].topic_of(sent.node) if robots else "/" + sent.node.removeprefix("nd_").removeprefix("_")
-        metadata = {"robot": sent.to, "sender": sent.sender, "as": "sent", "topic": topic, "node": sent.node}
-        name, of_type = command_topic(sent.sender, sent.to, topic), full_type(sent.type)
-        channel = Channel(name, JSON, metadata=metadata)
-        for follower in robots:
-            try:
-                schema = await self.schemas.of(follower.robot, of_type)
-            except MacsError:
-                continue
-            metadata |= {"topic_type_hash": schema.hash, "offered_qos_profiles": ""}
-            channel = Channel(name, CDR, of_type, schema.text, metadata)
-            break
-        self._commands[known] = channel
-        waiting, self._early = self._early, deque()
-        for early, log_ns in waiting:
-            if (early.sender, early.to, early.node, early.type) == known:
-                self._put_command(channel, early, log_ns)
-            else:
-                self._early.append((early, log_ns))
 
     def _put(self, event: Event) -> None:
         channel = self._json.get(event.channel)

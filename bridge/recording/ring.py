@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
-from bridge.recording.disk import Disk, Entry
+from bridge.recording.disk import KEPT, Disk, Entry
 
 
 class Ring:
@@ -40,7 +40,7 @@ class Ring:
             self._bytes -= len(gone.data)
             if gone.log_ns >= oldest:
                 self.lost["ring_full"] += 1
-            if gone.keep:
+            if gone.keep and (gone.keep in self._kept or len(self._kept) < KEPT):
                 self._kept[gone.keep] = gone
         for disk in self._fed:
             disk.put(entry)

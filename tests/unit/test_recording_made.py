@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -14,16 +15,18 @@ from rosbags.highlevel import AnyReader
 from bridge.recording import repair as repairing
 from bridge.recording.bag import Bag
 from bridge.recording.copying import cut, merge
-from bridge.recording.disk import Disk, Entry, Plan
+from bridge.recording.disk import CHANNELS, Disk, Entry, Plan
 from bridge.recording.mcap_file import McapFile
 from bridge.recording.ring import Ring
 from bridge.recording.rosbag2 import to_rosbag2
-from bridge.recording.streams import (
-    CDR,
-    JSON,
-)
+from bridge.recording.schema_source import Schemas
+from bridge.recording.sent import KNOWN_OF_ONE, OTHERS, SentCommands
+from bridge.recording.streams import CDR, CONTROL, JSON, LOST, STOPS, Channel
+from bridge.recording.traffic import Sent
+from macs_zenoh.agent import Agent
 from macs_zenoh.errors import ConfigError
 from tests.support.bags import BEGIN, S, cdr, entries, fill, string_channel, texts
+from tests.support.waiting import until
 
 # -- the thread that writes ------------------------------------------------------------------------------------------
 
@@ -119,6 +122,69 @@ def test_a_ring_has_a_size(tmp_path: Path) -> None:
     ring.write(disk)
     disk.stop()
     assert disk.lost["ring_full"] == ring.lost["ring_full"]
+
+
+def test_names_that_somebody_makes_up_end_no_recording(tmp_path: Path) -> None:
+    """A channel that the file cannot have is counted; others, and what is said of the mesh, go on."""
+    disk = Disk(Plan(tmp_path / "a.mcap", compression="none"))
+    first = Channel("/7/chatter", JSON)
+    disk.start()
+    disk.put(Entry(first, 0, BEGIN, b"{}"))
+    for number in range(CHANNELS + 9):
+        disk.put(Entry(Channel(f"/sent/{number}", JSON), 0, BEGIN, b"{}"))
+    disk.put(Entry(first, 1, BEGIN, b"{}"))
+    disk.put(Entry(Channel(STOPS), 0, BEGIN, b"{}"))
+    disk.stop()
+    assert disk.problem is None
+    assert disk.lost == {"too_many_channels": 10}
+    with Bag(tmp_path / "a.mcap") as bag:
+        found = {channel.topic for channel in bag.channels.values()}
+        assert {"/7/chatter", STOPS, LOST} <= found
+        assert bag.messages_in_all == CHANNELS - 1 + 3 + 1  # the last tells the loss
+
+
+def test_a_ring_keeps_so_many_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The newest of each, and no name more than it may have."""
+    monkeypatch.setattr("bridge.recording.ring.KEPT", 10)
+    ring = Ring(1.0, 1 << 20)
+    for second in range(3):
+        for number in range(20):
+            channel = Channel(CONTROL)
+            ring.put(Entry(channel, 0, BEGIN + 10 * second * S + number, b"%d" % second, keep=f"control {number}"))
+    assert set(ring._kept) == {f"control {number}" for number in range(10)}
+    assert {entry.data for entry in ring._kept.values()} == {b"1"}
+
+
+class Taken:
+    """A sink that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.entries: list[Entry] = []
+
+    def put(self, entry: Entry) -> None:
+        self.entries.append(entry)
+
+
+async def test_a_headset_that_makes_up_names_blinds_no_recording() -> None:
+    """All its commands are recorded, few in channels of their own; others' are in theirs as before."""
+    sink = Taken()
+    sent = SentCommands(sink, Schemas(cast(Agent, None)), {})  # nobody is followed: nobody is asked
+    for number in range(2000):
+        sent.put(Sent("unity/300", "7", f"nd__{number}", f"a_msgs/T{number}", b"bad"), BEGIN)
+        sent.put(Sent("unity/256", "7", "nd__cmd_vel", "geometry_msgs/Twist", b"good"), BEGIN)
+    await until(lambda: len(sink.entries) == 4000)
+    channels = {entry.channel.topic: entry.channel for entry in sink.entries}
+    assert len(channels) == KNOWN_OF_ONE + 2
+    mine = [
+        json.loads(entry.data)["data"] for entry in sink.entries if entry.channel.topic.startswith("/sent/unity/256/")
+    ]
+    assert len(mine) == 2000
+    others = [json.loads(entry.data) for entry in sink.entries if entry.channel.topic == OTHERS]
+    assert len(others) == 2000 - KNOWN_OF_ONE
+    assert (others[-1]["from"], others[-1]["node"], others[-1]["bytes"]) == ("unity/300", "nd__1999", 3)
+    sent.put(Sent("unity/257", "7", "nd__cmd_vel", "geometry_msgs/Twist", b"waits"), BEGIN)
+    sent.close()  # before its channel is there
+    assert json.loads(sink.entries[-1].data)["from"] == "unity/257"
 
 
 # -- out of others ---------------------------------------------------------------------------------------------------
