@@ -10,6 +10,8 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection
 from concurrent.futures import Future, wait
+from contextlib import ExitStack
+from functools import partial
 from typing import Any, TypeVar
 
 from bridge.rmw_zenoh.ends import Held, Typed, ZenohClient, ZenohPublisher, ZenohServer, ZenohSubscription
@@ -51,7 +53,11 @@ log = logging.getLogger("macs.ros")
 T = TypeVar("T")
 
 DESCRIBE_S = 1.0
-"""How long a node may take to describe a type."""
+"""How long nodes may take to describe a type."""
+DESCRIBERS = 4
+"""So many nodes are asked at once."""
+SILENT_S = 30.0
+"""A node that did not answer is not asked again for so long."""
 
 
 class ZenohSession:
@@ -76,10 +82,14 @@ class ZenohSession:
         self.node = network.node(domain, name, namespace)
         self.graph = self.node.graph
         self._work = Alarms()
+        self._urgent = Alarms()
         self._open = True
         self._lock = threading.Lock()
         self._jobs: set[Future[Any]] = set()
+        self._hurried: set[Future[Any]] = set()
         self._held: list[Held] = []
+        self._silent: dict[Endpoint, float] = {}
+        """Nodes that did not describe a type, and until when they are not asked again."""
         self._watching = network.on_change(self._changed)
 
     @property
@@ -99,16 +109,28 @@ class ZenohSession:
 
     def submit(self, job: Callable[[], T]) -> Future[T]:
         """`Side.submit`."""
+        return self._submitted(job, self._work)
+
+    def hurry(self, job: Callable[[], T]) -> Future[T]:
+        """`Side.hurry`: in a thread of its own, as the ROS thread may wait for a robot's node."""
+        return self._submitted(job, self._urgent)
+
+    def _submitted(self, job: Callable[[], T], thread: Alarms) -> Future[T]:
         future: Future[T] = Future()
         with self._lock:
             if not self._open:
                 future.set_exception(Unreachable("the ROS graph", "the session is closed"))
                 return future
+            before = [*self._hurried]
             self._jobs.add(future)
-        self._work.at(time.monotonic(), lambda: self._do(job, future))
+            if thread is self._urgent:
+                self._hurried.add(future)
+        future.add_done_callback(self._done)
+        thread.at(time.monotonic(), lambda: self._do(job, future, before))
         return future
 
-    def _do(self, job: Callable[[], T], future: Future[T]) -> None:
+    def _do(self, job: Callable[[], T], future: Future[T], before: list[Future[Any]]) -> None:
+        wait(before, timeout=DESCRIBE_S)  # what ends something comes after what uses it
         with self._lock:
             self._jobs.discard(future)
         if not future.set_running_or_notify_cancel():
@@ -119,6 +141,10 @@ class ZenohSession:
             future.set_exception(error)
         else:
             future.set_result(result)
+
+    def _done(self, future: Future[Any]) -> None:
+        with self._lock:
+            self._hurried.discard(future)
 
     def later(self, delay_s: float, job: Callable[[], object]) -> None:
         """`Side.later`."""
@@ -136,12 +162,13 @@ class ZenohSession:
         """Leave the graph: what was submitted before is done first."""
         self._watching.close()
         with self._lock:
-            waiting = [*self._jobs]
+            waiting = [*self._jobs, *self._hurried]
         wait(waiting, timeout=DESCRIBE_S)
         with self._lock:
             self._open = False
             unfinished = [*self._jobs]
         self._work.close()
+        self._urgent.close()
         for future in unfinished:
             if future.set_running_or_notify_cancel():
                 future.set_exception(Unreachable("the ROS graph", "the session is closed"))
@@ -255,24 +282,33 @@ class ZenohSession:
         return hashes.most_common(1)[0][0] if hashes else None
 
     def _describe(self, topic: str, name: str, type_hash: str, request: bytes) -> bytes | None:
-        """Ask the nodes that have a topic what its type consists of. In the ROS thread, which waits for it."""
-        for node in dict.fromkeys(one.node for one in self.graph.on(topic, others=True)):
-            for server in self.graph.on(f"{node.full_name}/get_type_description", Kind.SERVICE, others=True):
-                response = self._asked(server, request)
+        """Ask the nodes that have a topic what its type consists of. In the ROS thread, which waits for them: for all
+        together, and for who did not answer not again for a while."""
+        now, nodes = time.monotonic(), dict.fromkeys(one.node for one in self.graph.on(topic, others=True))
+        self._silent = {server: until for server, until in self._silent.items() if until > now}
+        names = [f"{node.full_name}/get_type_description" for node in nodes]
+        servers = [one for each in names for one in self.graph.on(each, Kind.SERVICE, others=True)]
+        return self._asked([server for server in servers if server not in self._silent][:DESCRIBERS], request)
+
+    def _asked(self, servers: list[Endpoint], request: bytes) -> bytes | None:
+        """The first answer of these."""
+        answers: queue.SimpleQueue[tuple[Endpoint, bytes | None]] = queue.SimpleQueue()
+        until, waiting = time.monotonic() + DESCRIBE_S, set(servers)
+        with ExitStack() as stack:
+            for server in servers:
+                client = self.node.client(server.topic, DESCRIPTION, server.hash, timeout_s=2 * DESCRIBE_S)
+                stack.callback(client.close)
+                stack.callback(client.call(request, partial(_put, answers, server)))
+            while waiting:
+                try:
+                    server, response = answers.get(timeout=max(0.0, until - time.monotonic()))
+                except queue.Empty:
+                    self._silent.update(dict.fromkeys(waiting, until + SILENT_S))
+                    break
                 if response is not None:
                     return response
+                waiting.discard(server)
         return None
-
-    def _asked(self, server: Endpoint, request: bytes) -> bytes | None:
-        answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        client = self.node.client(server.topic, DESCRIPTION, server.hash, timeout_s=DESCRIBE_S)
-        try:
-            client.call(request, lambda response, _problem: answers.put(response))
-            return answers.get(timeout=DESCRIBE_S)
-        except queue.Empty:
-            return None
-        finally:
-            client.close()
 
     # -- our ends ------------------------------------------------------------------------------------------------
 
@@ -319,6 +355,12 @@ class ZenohSession:
             for held in [*self._held]:
                 if held.topic == found.topic:
                     held.changed(found, alive)
+
+
+def _put(
+    answers: queue.SimpleQueue[tuple[Endpoint, bytes | None]], server: Endpoint, response: bytes | None, _why: str
+) -> None:
+    answers.put((server, response))
 
 
 def _other(endpoint: Endpoint) -> Other:

@@ -279,7 +279,7 @@ class ActionNode(InterfaceNode):
     def _accepted(self, goal: Goal, accepted: bool) -> None:
         if goal.id not in self._goals:
             if accepted:  # it came too late
-                self.robot.session.submit(lambda: self._send_cancel(goal))
+                self.robot.session.hurry(lambda: self._send_cancel(goal))
             return
         if not accepted:
             self._drop(goal, f"{self.topic} rejected the goal")
@@ -310,7 +310,7 @@ class ActionNode(InterfaceNode):
         elif not goal.accepted:
             goal.cancel_wanted = True
         else:
-            self.robot.session.submit(lambda: self._send_cancel(goal))
+            self.robot.session.hurry(lambda: self._send_cancel(goal))
 
     def _reject(self, goal: Goal, reason: str) -> None:
         self._tell(goal, ActionVerb.ACCEPTED, 0, reason.encode())
@@ -353,7 +353,7 @@ class ActionNode(InterfaceNode):
         if not self.in_use:
             self.unused()
 
-    # -- in the ROS thread ---------------------------------------------------------------------------------------
+    # -- in the ROS thread, or `_send_cancel` wherever it is soonest ----------------------------------------------
 
     def _send_goal(self, goal: Goal, body: bytes) -> None:
         if self._client is None:

@@ -201,6 +201,10 @@ class Side(Protocol):
         The future raises Unreachable when the session ends first.
         """
 
+    def hurry(self, job: Callable[[], T]) -> Future[T]:
+        """The same of what must not wait for the others where that can be avoided, as it ends what moves the robot;
+        perhaps in another thread. What is submitted later is done after it."""
+
     def later(self, delay_s: float, job: Callable[[], object]) -> None:
         """Run ``job`` in the ROS thread after a time, unless the session ends before."""
 

@@ -32,6 +32,8 @@ class Site(NamedTuple):
 
     ours: ZenohSession
     node: RosNode
+    kept: list[Any]
+    """What the robot's nodes have, until the end."""
 
     async def publisher(self, qos: Qos = QOS) -> ZenohPublisher:
         of = await self.ours.run(lambda: self.ours.message(STRING, "/orders"))
@@ -42,7 +44,8 @@ class Site(NamedTuple):
     def heard(self, qos: Qos = QOS) -> list[bytes]:
         """What a subscription of the robot's, with another hash, hears from now on."""
         heard: list[bytes] = []
-        self.node.subscription("/orders", str(STRING), OTHER_HASH, qos, lambda cdr, attached: heard.append(cdr))
+        made = self.node.subscription("/orders", str(STRING), OTHER_HASH, qos, lambda cdr, attached: heard.append(cdr))
+        self.kept.append(made)
         return heard
 
 
@@ -54,7 +57,7 @@ async def site(router: str) -> AsyncIterator[Site]:
         ]
         ours = ZenohSession(networks[0], await asyncio.to_thread(KnownTypes))
         stack.push_async_callback(asyncio.to_thread, ours.close)
-        yield Site(ours, networks[1].node(0, "base"))
+        yield Site(ours, networks[1].node(0, "base"), [])
 
 
 async def test_a_message_of_that_moment_is_published(site: Site) -> None:
