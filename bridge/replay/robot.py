@@ -162,7 +162,7 @@ class ReplayedRobot:
         return b""
 
     async def _offers(self, _call: Call) -> bytes:
-        return encode_data(self.recorded.offers())
+        return encode_data(msgspec.structs.replace(self.recorded.offers(), replay=True))
 
     async def _definitions(self, call: Call) -> bytes:
         request = decode_data(DefinitionsRequest, call.data) if call.data else DefinitionsRequest()

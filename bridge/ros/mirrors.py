@@ -17,6 +17,7 @@ from bridge.ros.side import MessageType, NotOfType, Publisher, Server, ServiceTy
 from bridge.ros.types import InterfaceName
 from bridge.settings.mirror import MirrorRule
 from macs_zenoh.agent import Agent
+from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.limits import ANSWER_BYTES
@@ -97,7 +98,11 @@ class _Mirrored:
             await asyncio.sleep(AGAIN_S)
 
     async def _offers(self) -> Offered:
-        return decode_data(Offered, await self._agent.call(ROS, self._other, "offers"), ANSWER_BYTES)
+        """What the other robot has. Raises Refused where it is a recording and the rule does not take those."""
+        offered = decode_data(Offered, await self._agent.call(ROS, self._other, "offers"), ANSWER_BYTES)
+        if offered.replay is True and not self._rule.replays:
+            raise Refused("it is a recording that is played; replays = true mirrors those, too")
+        return offered
 
     async def _mirror(self, offered: Offered) -> None:
         raise NotImplementedError

@@ -41,6 +41,8 @@ class MirrorRule(Section, frozen=True, kw_only=True, forbid_unknown_fields=True)
     tf_prefix: Annotated[str, Meta(max_length=64)] = ""
     """Before each frame of topics of transforms (tf2_msgs/TFMessage), as ``robot{robot}/``. They have a name of their
     own here as all others; tf2 listens to ``/tf`` alone unless it is remapped."""
+    replays: bool = False
+    """Mirror a recording that is played under that id as well (`macs replay`): its poses and transforms are old."""
 
     def _check(self) -> None:
         if NAME not in self.name:

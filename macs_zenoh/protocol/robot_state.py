@@ -100,6 +100,8 @@ class Offered(Functionality, frozen=True, rename="camel"):
 
     actions: dict[str, str] = field(default_factory=dict)
     qos: dict[str, TopicQos] = field(default_factory=dict)
+    replay: bool | UnsetType = UNSET
+    """It is a recording that is played: what it publishes was so once. Only agents on the mesh are told."""
 
 
 class FollowRequest(Struct, frozen=True):

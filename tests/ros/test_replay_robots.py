@@ -224,6 +224,26 @@ async def test_nothing_that_may_move_a_robot_is_played_into_ros_unasked(
         assert all(heard[topic].empty() for topic in DRIVING if topic != "/tf")
 
 
+@pytest.mark.parametrize("replays", [False, True])
+async def test_a_recording_gets_into_no_live_robot_unasked(
+    recording: Path, router: Router, peer: Peer, domain: int, tmp_path: Path, replays: bool
+) -> None:
+    """A robot that mirrors robot 7 mirrors no recording of it, and says so, unless its rule takes those."""
+    settings = tmp_path / "mirror.toml"
+    taken = "replays = true" if replays else ""
+    settings.write_text(f'[[robot.mirror]]\nfrom = "ros/7"\ntopics = ["/chatter"]\nas = "/seven{{topic}}"\n{taken}\n')
+    received = await peer.subscription(String, "/seven/chatter", 1000)
+    env = {"ROS_DOMAIN_ID": str(domain)}
+    command = ("agent", "--id", "2", "--settings", str(settings), "-e", router.endpoint)
+    async with Program(*command, env=env) as live, replay(recording, router.endpoint, "--loop"):
+        if replays:
+            assert (await get(received)).data.startswith("message")
+        else:
+            await until(lambda: any("recording that is played; replays = true" in line for line in live.log))
+            assert received.empty()
+            assert peer.session.node.count_publishers("/seven/chatter") == 0
+
+
 async def test_a_recording_is_played_to_a_gateway(recording: Path, router: Router) -> None:
     """As an existing robot program it is there under an id that the gateway has set aside for robots."""
     async with (
