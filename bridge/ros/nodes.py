@@ -204,6 +204,7 @@ class InterfaceNodes:
 
     async def open_stop(self, topic: str) -> None:
         """Have an emergency stop on this topic. Raises Refused when the topic cannot be used for it."""
+        self.robot.rules.stop_names.add(full_name(self.robot, StopNode, topic))  # remapped, or in a namespace
         stop = StopNode(self.robot, topic, self._stopped)
         for node in self._places.all_of(stop.key):  # of headsets that registered what has its name meanwhile
             self._remove(node)

@@ -23,6 +23,8 @@ class Rules:
     def __init__(self, settings: RobotSettings | None = None) -> None:
         self.settings = settings or RobotSettings()
         self._merged: dict[str, TopicRule] = {}
+        self.stop_names = {self.settings.stop_topic} - {""}
+        """Of the emergency stop: as the settings have it, and in full as on this robot's graph. Always open."""
         self.mirrored: set[str] = set()
         """Names under which this robot's graph has what is another robot's: not offered again."""
 
@@ -30,7 +32,7 @@ class Rules:
         """Whether agents may use, and see, what has this name."""
         if name in self.mirrored:
             return False
-        if name == self.settings.stop_topic:
+        if name in self.stop_names:
             return True
         allowed = any(matches(pattern, name) for pattern in self.settings.expose)
         return allowed and not any(matches(pattern, name) for pattern in self.settings.hide)

@@ -12,6 +12,9 @@ import pytest
 from bridge.cli import main
 from bridge.ros import parameters
 from bridge.ros.agent import open_robot
+from bridge.ros.interface import Robot
+from bridge.ros.nodes import InterfaceNodes
+from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh.config import MeshSettings
@@ -58,6 +61,22 @@ async def test_namespace_and_remapping_hold(domain: int) -> None:
         assert session.full_name == "/robot7/eyes"
         assert session.node.resolve_topic_name("camera") == "/robot7/camera"
         assert session.node.resolve_topic_name("cmd_vel") == "/drive"
+
+
+async def test_the_emergency_stop_is_open_wherever_it_is_remapped(domain: int) -> None:
+    """Also with one topic exposed, for its own name and for the one it has in ROS; the rest stays closed."""
+    ros_args = ["--ros-args", "-r", "/emergency_stop:=/robot7/emergency_stop"]
+    with RosSession(domain_id=domain, ros_args=ros_args) as session:
+        rules = Rules(RobotSettings(expose=["/cmd_vel"]))
+        nodes = InterfaceNodes(Robot(session, 7, lambda node, frame: None, rules=rules))
+        try:
+            await nodes.open_stop("/emergency_stop")
+            assert nodes.stop is not None
+            assert nodes.stop.topic == "/robot7/emergency_stop"
+            names = ["/emergency_stop", "/robot7/emergency_stop", "/cmd_vel", "/scan"]
+            assert [rules.exposes(name) for name in names] == [True, True, True, False]
+        finally:
+            nodes.close()
 
 
 def test_the_launch_file_starts_what_exists() -> None:
