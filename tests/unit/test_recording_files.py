@@ -30,6 +30,7 @@ from bridge.recording.streams import (
     robot_topic,
     split_topic,
 )
+from bridge.replay.timeline import Timeline
 from macs_zenoh.errors import ConfigError
 from macs_zenoh.protocol.robot_state import TopicQos
 from tests.support.bags import BEGIN, STRING, S, cdr, texts, write
@@ -342,3 +343,26 @@ def test_a_full_disk_ends_a_recording_that_stays_readable(tmp_path: Path) -> Non
 
 def _id(bag: Bag, topic: str) -> int:
     return next((channel.id for channel in bag.channels.values() if channel.topic == topic), -1)
+
+
+def test_a_message_that_is_too_short_is_told(tmp_path: Path) -> None:
+    """Its record has a time and no more: reading and playing end with an error, not as if that were all."""
+    path = write(tmp_path / "a.mcap", 10, compression="none")
+    whole = path.read_bytes()
+    text = cdr("message 4")
+    at = whole.index(text) - 22  # channel, number and two times are before it
+    (length,) = struct.unpack_from("<Q", whole, at - 8)
+    left = length - 14 - 9
+    short = struct.pack("<Q", 14) + whole[at : at + 14] + struct.pack("<BQ", 0x80, left) + bytes(left)
+    damaged = bytearray(whole[: at - 8] + short + whole[at + length :])
+    with Bag(path) as bag:
+        checksum = bag.chunks[0].offset + 9 + 3 * 8
+    damaged[checksum : checksum + 4] = bytes(4)  # none
+    path.write_bytes(damaged)
+    with Bag(path) as bag, pytest.raises(BadBag, match="cut off"):
+        list(bag.messages())
+    timeline = Timeline(path, lambda channel: True)
+    timeline.start()
+    with pytest.raises(BadBag, match="cut off"):
+        list(timeline)
+    timeline.close()
