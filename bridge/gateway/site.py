@@ -71,8 +71,7 @@ class Site:
             await self._its_turn()
             visitor = self.visitor(request)
             if visitor is None:
-                if _shown(request) is not None:
-                    self._door.failed(self._entrance, self._host_of(request))
+                self.refuse(request)
                 return web.json_response(WRONG, status=401, headers={"WWW-Authenticate": "Bearer"})
             return await answer(request, visitor)
 
@@ -91,6 +90,11 @@ class Site:
         """Between two requests the loop does everything else that is due, frames above all."""
         async with self._turn:
             await asyncio.sleep(0)
+
+    def refuse(self, request: web.Request) -> None:
+        """Who asks is not let in: count it, and log it, if he has shown a token."""
+        if _shown(request) is not None:
+            self._door.failed(self._entrance, self._host_of(request))
 
     def visitor(self, request: web.Request) -> Grant | None:
         """What who asks may do; None: a valid token is wanted, and none is shown."""

@@ -92,6 +92,7 @@ class Page:
         """Who asks, and what he may do: no error where a token is wanted, which browsers would log as one."""
         visitor = self._site.visitor(request)
         if visitor is None:
+            self._site.refuse(request)
             return _json({"wanted": True})
         rights = visitor.rights
         return _json(
@@ -100,6 +101,7 @@ class Page:
                 "name": visitor.name,
                 "may": sorted(RIGHTS) if rights is None else rights.may,
                 "robots": "any" if rights is None else rights.robots,
+                "groups": "any" if rights is None else rights.groups,
                 "topics": ["/**"] if rights is None else rights.topics,
                 "version": installed("macs-zenoh"),
             }

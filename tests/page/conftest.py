@@ -80,18 +80,18 @@ StartSite = Callable[..., Awaitable[Site]]
 
 @pytest.fixture
 async def start_site(tmp_path: Path) -> AsyncIterator[StartSite]:
-    """Starts a site; ``gateway`` are words for its gateway."""
+    """Starts a site; ``gateway`` and ``agent`` are words for these."""
     async with AsyncExitStack() as stack:
         sites: list[Site] = []
 
-        async def start(gateway: tuple[str, ...] = (), rules: str = ROBOT) -> Site:
+        async def start(gateway: tuple[str, ...] = (), rules: str = ROBOT, agent: tuple[str, ...] = ()) -> Site:
             domain = next(_domains)
             environment = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
             endpoint, web_port = f"tcp/127.0.0.1:{free_port()}", free_port()
             settings = tmp_path / f"robot-{domain}.toml"
             settings.write_text(rules)
             words = ["--port", str(free_port()), "--web-port", str(web_port), "-e", endpoint, *gateway]
-            robot = ["--id", "1", "--settings", str(settings), "-e", endpoint]
+            robot = ["--id", "1", "--settings", str(settings), "-e", endpoint, *agent]
             site = Site(
                 await stack.enter_async_context(Program("router", "-l", endpoint)),
                 await stack.enter_async_context(Program("gateway", *words)),

@@ -60,6 +60,12 @@ def test_its_frames_are_those_of_the_vectors() -> None:
     assert made["keys"] == {"agentId": 1, "agentId2": 2, "agentID": 3, "x": {"a_b": 1}}
 
 
+@needs_node
+def test_a_goal_that_its_robot_does_not_know_is_not_asked_for_again() -> None:
+    """Its result is why, and that was the last word."""
+    assert ran("goals.mjs", None) == {"asked": 1, "askedAfter": 0, "why": "no such goal"}
+
+
 def failed(verdicts: list[Verdict]) -> dict[str, str]:
     return {verdict.check.name: verdict.why for verdict in verdicts if verdict.outcome is Outcome.FAILED}
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from contextlib import AsyncExitStack
 from functools import partial
+from pathlib import Path
 
 import pytest
 
-from tests.page.conftest import DOMAINS, Site, says
+from bridge.tokens import store
+from macs_zenoh.protocol.rights import Rights
+from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
+from tests.page.conftest import DOMAINS, Site, StartSite, says
 from tests.support.browser import OFFLINE, Watched, needs_browser
 from tests.support.programs import Program
 from tests.support.waiting import until
@@ -84,3 +89,34 @@ async def test_a_press_that_was_taken_back_is_not_sent(site: Site) -> None:
     await site.agent.start()
     await page.page.wait_for_selector('#pad[aria-disabled="false"]', timeout=60_000)
     assert await page.value("macsPage.stop.stopped().length") == 0
+
+
+@pytest.mark.parametrize("groups", [[3], "any"])
+async def test_a_token_for_groups_stops_their_robots(start_site: StartSite, tmp_path: Path, groups: object) -> None:
+    """A robot that it may name by its group only is stopped and released, also when it was away; nothing else of the
+    page pretends to be for it."""
+    path, secret = tmp_path / "tokens.json", new_secret(os.urandom(32))
+    rights = Rights(may=["see", "stop", "command"], robots=[], groups=groups)  # type: ignore[arg-type]
+    store.change(
+        path, lambda tokens: (tokens.with_token(Token(name="hall", rights=rights, hashes=[hash_of(secret)])), None)
+    )
+    words = ("--tokens", str(path), "--without-token", "nobody")
+    site = await start_site(words, agent=("--group", "3"))
+    page = await site.open()
+    page.allowed.append(OFFLINE)
+    await page.page.fill("#token", secret)
+    await page.page.click("button[type=submit]")
+    await page.page.wait_for_selector("#stop")
+    await online(page, 1)
+    assert "by their group" in await page.page.inner_text(".robot-view")
+    await page.page.click("#stop")
+    await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
+    await page.page.click("#release")
+    await page.page.click("#release")
+    await until(partial(page.value, "document.querySelector('#stop-status').textContent === ''"))
+    await site.agent.stop(signal.SIGKILL)
+    await online(page)
+    await page.page.click("#stop")
+    await until(lambda: says(page, "#stop-status", "robot 1 not online: stopped on return"))
+    await site.agent.start()
+    await until(lambda: says(page, "#stop-status", "robot 1 stopped"))

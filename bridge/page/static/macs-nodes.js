@@ -278,6 +278,7 @@ export class Goal {
     }
   }
 
+  /** What its robot says of it; whether that is the last word. */
   receive(verb, code, rest) {
     const reason = () => new CallError("refused", new TextDecoder().decode(rest) || "no reason given");
     if (verb === "ActionFeedback") this.onFeedback?.(rest);
@@ -289,9 +290,8 @@ export class Goal {
     else if (verb === "ActionResult") {
       this.#settle.accepted.resolve();
       this.#settle.result.resolve({ status: code, data: rest.slice() });
-      return true;
     }
-    return verb === "ActionAccepted" && !code;
+    return verb === "ActionResult" || (verb === "ActionAccepted" && !code);
   }
 
   end(error) {

@@ -24,7 +24,7 @@ class Page {
     this.topics = new Topics(this.headset);
     this.types = new Types("", (url) => this.get(url).then((answer) => answer ?? { error: "the gateway does not answer" }));
     this.tell = (kind, text) => this.#tell(kind, text);
-    this.stop = new Stop(this.headset, this.tell, this.may.has("stop"), (path) => this.get(path));
+    this.stop = new Stop(this.headset, this.tell, (path) => this.get(path), me);
     this.stop.onChange = () => this.robotView?.mark();
     this.online = { robots: [], headsets: [] };
     this.robotView = new RobotView(this);
@@ -150,9 +150,10 @@ class Page {
         if (left.length) this.tell("left", `${name} ${listed(left)} left`);
       }
     }
+    // the gateway tells only of robots that this token may name, by id or by group: a stop needs no more
+    this.stop.setRobots(now.robots);
     const mine = this.me.robots === "any" ? now.robots : now.robots.filter((id) => this.me.robots.includes(id));
-    this.stop.setRobots(mine);
-    this.robotView.setRobots(mine);
+    this.robotView.setRobots(mine, now.robots.length - mine.length);
     this.latencyView.setRobots(mine);
   }
 

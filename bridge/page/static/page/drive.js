@@ -65,6 +65,7 @@ export class Drive {
     this.shape = COMMANDS[type];
     this.node = headset.advertise(topic, type, { robots: [robot] });
     this.debt = 0;
+    this.away = false;
     this.element = this.#build();
     this.#listen();
     this.#inherit();
@@ -109,6 +110,7 @@ export class Drive {
   /** The robot is there, or not: who is away is not driven, and not driven on when he is back. */
   setOnline(online) {
     this.#online = online;
+    if (!online) this.away = true;
     this.#judge();
   }
 
@@ -169,18 +171,18 @@ export class Drive {
     this.owing = true;
     if (!debts.has(this.headset)) debts.set(this.headset, new Set());
     debts.get(this.headset).add(this);
-    for (let away = false; this.owing && !this.held; ) {
+    while (this.owing && !this.held) {
       const { debt } = this;
       const there = await this.headset.online({ timeoutMs: ANSWER_MS }).catch(() => null);
       if (!this.owing || this.held) break;
       if (debt !== this.debt) continue; // what was asked before the release tells nothing of it
       if (there?.robots.includes(this.robot)) {
         this.#sendZero();
-        if (!away) break;
-        away = false; // it may not have this topic yet: once more
+        if (!this.away) break;
+        this.away = false; // it may not have this topic yet: once more
         await pause(LATE_ZERO_MS);
       } else {
-        away = true;
+        this.away = true;
         await pause(AGAIN_MS);
       }
     }
@@ -209,6 +211,7 @@ export class Drive {
   #take(source) {
     if (this.#source !== null || this.#barred || this.zero === undefined) return false;
     this.#source = source;
+    this.away = false;
     this.#tickedAt = performance.now();
     this.pad.classList.add("held");
     this.#timer = setInterval(() => this.#tick(), EVERY_MS);

@@ -19,6 +19,9 @@ const PLOTTED = {
   "nav_msgs/msg/Odometry": [["twist.twist.linear.x", "twist.twist.angular.z"], "Speed"],
 };
 
+const NOBODY = "No robot is online. As soon as one is, it appears here.";
+const ONLY_GROUPS = "This token names robots by their group: the mesh and the stop are for it, not what is one robot's.";
+
 export class RobotView {
   #shown = null;
 
@@ -28,19 +31,21 @@ export class RobotView {
     this.chips = h("div", { class: "chips", role: "group", "aria-label": "Robots" });
     this.keyed = new Keyed(this.chips, (robot) => this.#chip(robot));
     this.facts = h("p", { class: "facts", id: "facts", role: "status" });
-    this.empty = h("p", { class: "empty" }, "No robot is online. As soon as one is, it appears here.");
+    this.empty = h("p", { class: "empty" }, NOBODY);
     this.place = h("div", { class: "panels" });
     const heading = h("h1", { class: "visually-hidden" }, "Robot");
     this.element = h("div", { class: "view robot-view" }, heading, this.chips, this.facts, this.empty, this.place);
   }
 
-  /** Who is online now; the chosen robot stays chosen while it is away. */
-  setRobots(robots) {
+  /** Who is online now, and how many more only as members of a group; the chosen robot stays chosen while it is away. */
+  setRobots(robots, others = this.others ?? 0) {
     this.robots = robots;
+    this.others = others;
     const chosen = this.#shown?.robot;
     const all = chosen === undefined || robots.includes(chosen) ? robots : [...robots, chosen].sort((a, b) => a - b);
     this.keyed.set(all);
     show(this.empty, all.length === 0);
+    say(this.empty, others ? ONLY_GROUPS : NOBODY);
     if (chosen === undefined && robots.length) this.choose(this.page.wanted() ?? robots[0]);
     else if (chosen !== undefined) this.#setOnline(robots.includes(chosen));
     this.#mark();

@@ -16,16 +16,21 @@ const CHECK_MS = 1500;
 const CHECKED_AT_ONCE = 16;
 const TRUE = new Uint8Array([0, 1, 0, 0, 1]);
 const FALSE = new Uint8Array([0, 1, 0, 0, 0]);
+const ANY_GROUP = Array.from({ length: 255 }, (_, at) => at + 1);
 /** Where it is written down for the page that comes after this one in the same tab. */
 const KEPT = "macs.stop";
 
 export class Stop {
-  /** `tell` tells an event; `mayStop` whether this page may; `get` asks the gateway for JSON. */
-  constructor(headset, tell, mayStop, get) {
+  /** `tell` tells an event; `get` asks the gateway for JSON; `me` is what this page may (/view/me). */
+  constructor(headset, tell, get, me) {
     this.headset = headset;
     this.get = get;
     this.tell = tell;
-    this.mayStop = mayStop;
+    this.mayStop = me.may.includes("stop");
+    /** Robots that may be named by id, or "any"; all others are reached by these groups. */
+    this.named = me.robots;
+    this.groups = me.groups === "any" ? ANY_GROUP : me.groups;
+    this.online = new Set();
     /** robot → {stopped, tookMs}: what it said last, and how long that took after the press. */
     this.states = new Map();
     this.pressedAt = null;
@@ -39,7 +44,7 @@ export class Stop {
     this.all = false;
     this.onChange = () => {};
     this.state = headset.subscribe(TOPIC, TYPE, {}, (message) => this.#take(message));
-    this.command = mayStop ? headset.advertise(TOPIC, TYPE) : null;
+    this.command = this.mayStop ? headset.advertise(TOPIC, TYPE) : null;
     headset.addEventListener("link", ({ detail }) => {
       if (detail.up) this.#send();
       else this.states.clear();
@@ -55,20 +60,25 @@ export class Stop {
 
   /** These robots are online. */
   setRobots(robots) {
-    const now = new Set(robots);
-    const gone = [...this.state.robots].filter((robot) => !now.has(robot));
-    if (gone.length) {
-      this.state.deregister({ robots: gone });
-      this.command?.deregister({ robots: gone });
-      gone.forEach((robot) => this.states.delete(robot));
+    const gone = [...this.online].filter((robot) => !robots.includes(robot));
+    this.online = new Set(robots);
+    gone.forEach((robot) => this.states.delete(robot));
+    const left = gone.filter((robot) => this.state.robots.has(robot));
+    for (const node of [this.state, this.command]) {
+      if (left.length) node?.deregister({ robots: left });
+      node?.register(this.#named(robots));
     }
-    this.state.register({ robots });
-    this.command?.register({ robots });
     for (const robot of robots) {
       if (this.all && !this.known.has(robot)) this.wanted.add(robot);
       this.known.add(robot);
     }
     this.#send();
+  }
+
+  /** How these are named: by id where this page may, all others by the groups in which they have to be. */
+  #named(robots) {
+    const named = robots.filter((robot) => this.named === "any" || this.named.includes(robot));
+    return { robots: named, groups: named.length < robots.length ? this.groups : [] };
   }
 
   /** Stop all robots. */
@@ -83,8 +93,7 @@ export class Stop {
     const whom = size === 1 ? `robot ${[...this.known][0]}` : size ? `${size} robots` : "all robots, of which none is known yet";
     this.tell("stop", `stop pressed for ${whom}`);
     // also those that somebody else has stopped: a release of his is not ours
-    const online = [...this.state.robots];
-    if (online.length) this.command.publish(TRUE, { robots: online });
+    if (this.online.size) this.command.publish(TRUE, this.#named([...this.online]));
     this.#send({ again: false });
     this.onChange();
   }
@@ -96,7 +105,7 @@ export class Stop {
     this.pressedAt = null;
     this.askedAt = performance.now();
     const whom = robots.map((robot) => `robot ${robot}`).join(", ");
-    const sent = robots.length > 0 && this.command?.publish(FALSE, { robots });
+    const sent = robots.length > 0 && this.command?.publish(FALSE, this.#named(robots));
     if (sent) this.tell("stop", `release asked for ${whom}`);
     else this.tell("stop", robots.length ? `no connection: the release of ${whom} was not sent` : "the stop is taken back");
     this.#send();
@@ -153,8 +162,8 @@ export class Stop {
     clearTimeout(this.timer);
     this.wanted.forEach((robot) => this.isStopped(robot) && this.wanted.delete(robot));
     if (this.wanted.size && this.mayStop) {
-      const online = [...this.wanted].filter((robot) => this.state.robots.has(robot));
-      if (again && online.length) this.command.publish(TRUE, { robots: online });
+      const online = [...this.wanted].filter((robot) => this.online.has(robot));
+      if (again && online.length) this.command.publish(TRUE, this.#named(online));
       this.timer = setTimeout(() => this.#send(), AGAIN_MS);
     }
     this.#show();
@@ -164,14 +173,14 @@ export class Stop {
   async #check() {
     const due = [...new Set([...this.wanted, ...this.stopped()])].filter((robot) => {
       const at = Math.max(this.askedAt, this.states.get(robot)?.at ?? 0);
-      return this.state.robots.has(robot) && performance.now() - at > CHECK_MS;
+      return this.online.has(robot) && performance.now() - at > CHECK_MS;
     });
     this.turn = due.length > CHECKED_AT_ONCE ? (this.turn + CHECKED_AT_ONCE) % due.length : 0;
     const asked = [...due.slice(this.turn), ...due.slice(0, this.turn)].slice(0, CHECKED_AT_ONCE);
     for (const robot of asked) {
       const [before, { askedAt }] = [this.states.get(robot), this];
       const status = await this.get(`/view/robots/${robot}/status`);
-      const same = this.states.get(robot) === before && this.askedAt === askedAt && this.state.robots.has(robot);
+      const same = this.states.get(robot) === before && this.askedAt === askedAt && this.online.has(robot);
       if (same && typeof status?.stopped === "boolean") this.#said(robot, status.stopped);
     }
   }
@@ -255,8 +264,8 @@ export class Stop {
 
   #words(stopped) {
     const list = (robots) => `robot ${robots.join(", ")}`;
-    const away = [...this.wanted].filter((robot) => !this.state.robots.has(robot));
-    const waiting = [...this.wanted].filter((robot) => this.state.robots.has(robot));
+    const away = [...this.wanted].filter((robot) => !this.online.has(robot));
+    const waiting = [...this.wanted].filter((robot) => this.online.has(robot));
     if (this.open && !this.mayStop) return [`a stop is not confirmed by ${list([...this.wanted])}, and this token may not stop`];
     if (this.open && !this.headset.connected) return ["no connection: the stop is sent as soon as there is one"];
     const words = [];
