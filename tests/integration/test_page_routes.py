@@ -197,7 +197,11 @@ async def test_types_are_those_of_the_robot(
 
 
 async def test_who_has_a_token_is_told_what_it_permits(
-    start_gateway: StartGateway, session: aiohttp.ClientSession, asked: Asked, tmp_path: Path
+    start_gateway: StartGateway,
+    session: aiohttp.ClientSession,
+    asked: Asked,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The page learns what to offer; robots that are not the token's tell it nothing; without one it asks for one."""
     path, secret = tmp_path / "tokens.json", new_secret(os.urandom(32))
@@ -208,8 +212,10 @@ async def test_who_has_a_token_is_told_what_it_permits(
     await until(lambda: gateway.directory.ids(ROS) == [5, 6])
     assert await one.told("/view/me") == {"wanted": True}
     assert (await one.get("/view/mesh")).status == (await one.get("/view/robots/5/status")).status == 401
+    assert await one.told("/view/me", Cookie="macs_token=macs_wrong") == {"wanted": True}
+    assert "shows no valid token at the web port" in caplog.text  # whatever he asks for who tries them
     me = await one.told("/view/me", **cookie)
-    assert (me["name"], me["may"], me["robots"], me["wanted"]) == ("anna", ["see"], [5], False)
+    assert (me["name"], me["may"], me["robots"], me["groups"], me["wanted"]) == ("anna", ["see"], [5], [], False)
     assert await one.told("/view/robots/5/status", **cookie) == STATUS
     assert "error" in await one.told("/view/robots/6/status", **cookie)
     assert "error" in await one.told("/types/6/own_msgs/msg/Level", **cookie)
