@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from bridge.tokens import store
+from macs_zenoh.protocol.rights import Rights
+from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
 from tests.support.browser import Watched, browser, opened
 from tests.support.isolation import worker_number
 from tests.support.processes import Process
@@ -116,6 +119,23 @@ async def start_site(tmp_path: Path) -> AsyncIterator[StartSite]:
 async def site(start_site: StartSite) -> Site:
     """One with its usual settings."""
     return await start_site()
+
+
+async def signed_in(site: Site, secret: str) -> Watched:
+    """A page that has shown a token."""
+    page = await site.open()
+    await page.page.fill("#token", secret)
+    await page.page.click("button[type=submit]")
+    await page.page.wait_for_selector("header.top", timeout=60_000)
+    return page
+
+
+def with_token(path: Path, rights: Rights) -> tuple[str, tuple[str, ...]]:
+    """A token with these rights in a file: its secret, and the words for a gateway that wants one."""
+    secret = new_secret(os.urandom(32))
+    token = Token(name="hall", rights=rights, hashes=[hash_of(secret)])
+    store.change(path, lambda tokens: (tokens.with_token(token), None))
+    return secret, ("--tokens", str(path), "--without-token", "nobody")
 
 
 async def says(page: Watched, selector: str, words: str) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from contextlib import AsyncExitStack
 from functools import partial
@@ -10,10 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from bridge.tokens import store
 from macs_zenoh.protocol.rights import Rights
-from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
-from tests.page.conftest import DOMAINS, Site, StartSite, says
+from tests.page.conftest import DOMAINS, Site, StartSite, says, signed_in, with_token
 from tests.support.browser import OFFLINE, Watched, needs_browser
 from tests.support.programs import Program
 from tests.support.waiting import until
@@ -95,18 +92,10 @@ async def test_a_press_that_was_taken_back_is_not_sent(site: Site) -> None:
 async def test_a_token_for_groups_stops_their_robots(start_site: StartSite, tmp_path: Path, groups: object) -> None:
     """A robot that it may name by its group only is stopped and released, also when it was away; nothing else of the
     page pretends to be for it."""
-    path, secret = tmp_path / "tokens.json", new_secret(os.urandom(32))
     rights = Rights(may=["see", "stop", "command"], robots=[], groups=groups)  # type: ignore[arg-type]
-    store.change(
-        path, lambda tokens: (tokens.with_token(Token(name="hall", rights=rights, hashes=[hash_of(secret)])), None)
-    )
-    words = ("--tokens", str(path), "--without-token", "nobody")
+    secret, words = with_token(tmp_path / "tokens.json", rights)
     site = await start_site(words, agent=("--group", "3"))
-    page = await site.open()
-    page.allowed.append(OFFLINE)
-    await page.page.fill("#token", secret)
-    await page.page.click("button[type=submit]")
-    await page.page.wait_for_selector("#stop")
+    page = await signed_in(site, secret)
     await online(page, 1)
     assert "by their group" in await page.page.inner_text(".robot-view")
     await page.page.click("#stop")
