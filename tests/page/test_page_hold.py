@@ -7,12 +7,14 @@ import asyncio
 import signal
 from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partial
+from pathlib import Path
 
 import pytest
 
 pytest.importorskip("rclpy")
 
-from tests.page.conftest import HELD, Site, StartSite, says
+from macs_zenoh.protocol.rights import Rights
+from tests.page.conftest import HELD, Site, StartSite, says, signed_in, with_token
 from tests.page.driving import GAMEPAD, Heard, heard_at, hold
 from tests.support.browser import Watched, needs_browser
 from tests.support.waiting import until
@@ -162,3 +164,30 @@ async def test_a_zero_comes_for_a_panel_that_is_gone(site: Site, heard: Heard) -
     node = "macsPage.headset.nodes.find((node) => node.name === '/cmd_vel')"
     assert await page.value(f"{node}.unsent") > before
     await until(partial(page.value, f"{node}.robots.size === 0"))
+
+
+async def test_a_robot_that_drops_out_is_not_driven_on(site: Site, heard: Heard) -> None:
+    """It leaves while it is driven: the hold ends, and when it is back, with the button still held, it stands."""
+    page = await site.with_robot()
+    await drives(page, heard, partial(hold, page))
+    site.agent.send_signal(signal.SIGSTOP)
+    try:
+        await until(lambda: says(page, "#drive-hint", "not online"))
+        assert not await page.value(HELD)
+    finally:
+        site.agent.send_signal(signal.SIGCONT)
+    await page.page.wait_for_selector('#pad[aria-disabled="false"]', timeout=60_000)
+    await stands(page, heard)
+    await page.page.mouse.up()
+
+
+async def test_a_refused_command_ends_a_hold(start_site: StartSite, tmp_path: Path) -> None:
+    """A token that is not for the topic of the commands: the pad says so, and does not seem to drive."""
+    rights = Rights(may=["see", "command"], robots="any", topics=["/pose"])
+    secret, words = with_token(tmp_path / "tokens.json", rights)
+    page = await signed_in(await start_site(words), secret)
+    await page.page.wait_for_selector('#pad[aria-disabled="false"]', timeout=60_000)
+    await hold(page)
+    await until(lambda: says(page, "#drive-hint", "its registration was refused"))
+    assert not await page.value(HELD)
+    await page.page.mouse.up()
