@@ -17,12 +17,12 @@ from bridge.recording.bag import Bag
 from bridge.recording.conditions import stop_topic
 from bridge.recording.mcap_records import ChannelRecord
 from bridge.recording.streams import CDR
+from bridge.replay.recorded import is_stop
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Closed, MacsError, Unreachable, UsageError
 from macs_zenoh.protocol.directory import AgentInfo
-from macs_zenoh.protocol.guard import STOP_TOPIC
 from macs_zenoh.protocol.limits import ANSWER_BYTES
-from macs_zenoh.protocol.messages import ROS, decode_data, node_name
+from macs_zenoh.protocol.messages import ROS, decode_data
 from macs_zenoh.protocol.offers import short_type
 from macs_zenoh.protocol.robot_state import RobotStatus
 from macs_zenoh.topics import TopicPublisher
@@ -41,10 +41,6 @@ def is_command(channel: ChannelRecord, robot: int) -> bool:
         and channel.metadata.get("robot") == str(robot)
         and bool(channel.metadata.get("topic"))
     )
-
-
-def _is_stop(channel: ChannelRecord) -> bool:
-    return node_name(channel.metadata["topic"]) == node_name(STOP_TOPIC)
 
 
 class Commands:
@@ -71,7 +67,11 @@ class Commands:
         """Why the robot did not take some, and how often it said so."""
         with Bag(path) as bag:
             found = [channel for channel in bag.channels.values() if is_command(channel, recorded)]
-            found = [channel for channel in found if wants(channel.metadata["topic"]) and not _is_stop(channel)]
+            found = [
+                channel
+                for channel in found
+                if wants(channel.metadata["topic"]) and not is_stop(channel.metadata["topic"])
+            ]
             senders = sorted({channel.metadata.get("sender", "") for channel in found})
             self._channels = {
                 channel.id: (channel.metadata["topic"], schema.name)

@@ -13,8 +13,14 @@ from bridge.recording.bag import Bag
 from bridge.recording.mcap_records import ChannelRecord
 from bridge.recording.streams import CDR, OFFERS, PRESENCE, qos_of, split_topic
 from macs_zenoh.protocol.guard import STOP_TOPIC
+from macs_zenoh.protocol.messages import node_name
 from macs_zenoh.protocol.robot_state import Offered, TopicQos
 from macs_zenoh.protocol.schemas import Definition, definitions_in
+
+
+def is_stop(topic: str) -> bool:
+    """Whether a topic is an emergency stop, of a robot in a namespace as well."""
+    return node_name(topic).endswith(node_name(STOP_TOPIC).removeprefix("nd_"))
 
 
 @dataclass
@@ -61,7 +67,7 @@ class RecordedRobot:
 
         The emergency stop always may; of the others not those in ``named``, the names that somebody has given.
         """
-        if topic == STOP_TOPIC:
+        if is_stop(topic):
             return "it is the emergency stop"
         if topic in named:
             return ""

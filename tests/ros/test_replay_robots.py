@@ -179,7 +179,7 @@ async def test_a_recording_is_played_into_ros(recording: Path, router: Router, p
     assert own.empty()
 
 
-DRIVING = ["/cmd_vel", "/emergency_stop", "/speed", "/tf"]
+DRIVING = ["/cmd_vel", "/emergency_stop", "/robot7/emergency_stop", "/speed", "/tf"]
 """What nodes of the robot listened to, its stop, and what only a recording of commands has."""
 
 
@@ -212,13 +212,14 @@ async def test_nothing_that_may_move_a_robot_is_played_into_ros_unasked(
         code, out, errors = await ended("replay", str(driven), "--to", "ros", *options)
         assert (code, out) == (2, "")
         assert "named twice" in errors or "--confirm 7" in errors
+    named = ("--topics", "/tf", "--topics", "/emer*", "--topics", "/robot7/emergency_stop")
     own = ("--to", "ros", "--own-names", "7", "--confirm", "7")
     async with replay(driven, router.endpoint, *own, "--loop", env=env) as playing:
         for _ in range(100):
             await get(heard["/chatter"])
         assert all(heard[topic].empty() for topic in DRIVING)
         assert all(any(f"{topic} is not played" in line for line in playing.log) for topic in DRIVING)
-    async with replay(driven, router.endpoint, *own, "--loop", "--topics", "/tf", "--topics", "/emer*", env=env):
+    async with replay(driven, router.endpoint, *own, "--loop", *named, env=env):
         for _ in range(100):
             await get(heard["/tf"])
         assert all(heard[topic].empty() for topic in DRIVING if topic != "/tf")
@@ -291,6 +292,7 @@ def mixed(tmp_path: Path) -> Path:
             ("unity/257", "/cmd_vel", "geometry_msgs/msg/Twist", TWIST, twist(-1)),
             ("unity/256", "/arm", "geometry_msgs/msg/Twist", TWIST, twist(5)),
             ("unity/256", "/emergency_stop", "std_msgs/msg/Bool", "bool data\n", b"\0\1\0\0\0"),
+            ("unity/256", "/robot7/emergency_stop", "std_msgs/msg/Bool", "bool data\n", b"\0\1\0\0\0"),
         ):
             metadata = {"as": "sent", "robot": "7", "topic": topic, "sender": sender}
             sent = Channel(command_topic(sender, "7", topic), CDR, of_type, text, metadata)
@@ -313,7 +315,7 @@ async def test_no_more_commands_are_sent_than_were_asked_for(
     code, out, errors = await ended(*command)
     assert (code, out) == (2, "")
     assert "unity/256, unity/257; say whose: --sender" in errors
-    code, out, errors = await ended(*command, "--topics", "/emergency_stop")
+    code, out, errors = await ended(*command, "--topics", "/emergency_stop", "--topics", "/robot7/emergency_stop")
     assert (code, out) == (2, "")
     assert "no commands to robot 7" in errors
     async with Program("agent", "--id", "7", "-e", router.endpoint, env={"ROS_DOMAIN_ID": str(domain)}):
