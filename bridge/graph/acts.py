@@ -214,6 +214,10 @@ class MeshAction(ActionClient):
         )
         self._agent.send(data, to=ROS, ids=[robot], metadata=metadata)
 
+    async def is_there(self, robot: int) -> bool:
+        """Whether a robot is online now."""
+        return (ROS, robot) in self._agent.directory
+
     def take(self, message: Message) -> None:
         """A message to the agent."""
         said = message.metadata
@@ -285,7 +289,11 @@ async def send_goal(
                     else:
                         say(f"\nFeedback:\n{_indented(as_yaml(value))}")
 
-        status, result = await _result(goal, steps, wish.cancel_after_s)
+        following = asyncio.create_task(goal.follow(client.is_there))
+        try:
+            status, result = await _result(goal, steps, wish.cancel_after_s)
+        finally:
+            following.cancel()
     value = types.deserialize(part_of_action(of_type, "Result"), result, max_bytes=SUMMARY_BYTES)
     ended = GOAL_STATUS.get(status, str(status))
     if as_json:

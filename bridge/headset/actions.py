@@ -17,9 +17,10 @@ import asyncio
 import contextlib
 import json
 import os
+from collections.abc import Awaitable, Callable
 from typing import Any, NamedTuple
 
-from macs_zenoh.errors import CallTimeout, Refused, Unreachable, WireError
+from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, WireError
 from macs_zenoh.protocol.messages import ActionVerb
 from macs_zenoh.timeouts import within
 
@@ -31,6 +32,11 @@ from .nodes import REQUEST_IDS, Incoming, Node, Owner
 ID_BYTES = 16
 UNKNOWN, ACCEPTED, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = range(7)
 """action_msgs/GoalStatus."""
+ASK_S = 5.0
+"""After so long without it a goal's result is asked for."""
+LOST_S = 5.0
+"""A robot that is away for so long has left; a router that starts again takes less."""
+LOOK_S = 1.0
 FINISHED = "the goal has finished"
 
 
@@ -70,6 +76,23 @@ class Goal:
             raise Refused(FINISHED)
         await self._client.tell(self.robot, ActionVerb.CANCEL, self.id)
         await _within(self.cancelling, f"cancellation of {self._client.spec.tos_name}", timeout_s)
+
+    async def follow(self, is_there: Callable[[int], Awaitable[bool]]) -> None:
+        """Until it has ended: ask for the result now and then, as it may have been lost; end it when the robot, of
+        which ``is_there`` knows, stays away: who waits gets Unreachable."""
+        loop = asyncio.get_running_loop()
+        asked = seen = loop.time()
+        while not self.finished.done():
+            await asyncio.sleep(LOOK_S)
+            with contextlib.suppress(MacsError):  # our own link is lost, and may be made again
+                there, now = await is_there(self.robot), loop.time()
+                if there and now - asked > ASK_S:
+                    await self._client.tell(self.robot, ActionVerb.RESULT, self.id)
+                    asked = now
+                if not there and now - seen > LOST_S:
+                    reason = "it has left, and what becomes of the goal is not known"
+                    self._end(Unreachable(f"robot {self.robot}", reason))
+                seen = now if there else seen
 
     def receive(self, verb: str, code: int, rest: bytes) -> None:
         """Something about this goal came from the robot."""

@@ -308,11 +308,15 @@ class Session:
             async for cdr in goal:
                 self._emit({**line, "feedback": self.types.deserialize(feedback, cdr, max_bytes=MAX_BYTES)})
 
+        async def is_there(robot: int) -> bool:
+            return robot in (await self.headset.online()).ros_agent_ids
+
         async def work() -> int:
-            if agent not in (await self.headset.online()).ros_agent_ids:
+            if not await is_there(agent):
                 raise Unreachable(f"robot {agent}", "it is not online")
             began = time.monotonic()
             goal = await client.send_goal(agent, goal_cdr)
+            following = asyncio.create_task(goal.follow(is_there))
             try:
                 await within(steps(goal), args.timeout)
             except asyncio.TimeoutError:
@@ -321,6 +325,8 @@ class Session:
                 with contextlib.suppress(MacsError):  # nobody looks after it any more
                     await asyncio.shield(goal.cancel(timeout_s=1.0))
                 raise
+            finally:
+                following.cancel()
             status, cdr = await goal.result(timeout_s=5.0)
             took_ms = round((time.monotonic() - began) * 1000, 2)
             result = self.types.deserialize(part_of_action(args.type, "Result"), cdr, max_bytes=MAX_BYTES)

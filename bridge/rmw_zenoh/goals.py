@@ -6,6 +6,7 @@ result, which begins behind a byte and is aligned anew.
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from bridge.rmw_zenoh.ends import Typed, ZenohClient
@@ -13,7 +14,7 @@ from bridge.rmw_zenoh.types import UnknownMessage
 from bridge.ros.shapes import Structure
 from bridge.ros.side import GoalTold, NotOfType, OnCancel
 from bridge.ros.unity_cdr import Misfit, behind_a_byte
-from macs_zenoh.mesh.ros_network import RESULT_S
+from macs_zenoh.mesh.ros_network import CALL_S, RESULT_S
 from macs_zenoh.protocol.rmw_zenoh.cdr import HEADER
 from macs_zenoh.protocol.rmw_zenoh.qos import Qos
 
@@ -35,11 +36,21 @@ class ZenohGoals:
         self._result = result
         self._told: dict[bytes, GoalTold] = {}
         part = f"{action}/_action"
-        self._send = ZenohClient(session, f"{of_type}_SendGoal", f"{part}/send_goal")
-        self._cancel = ZenohClient(session, "action_msgs/srv/CancelGoal", f"{part}/cancel_goal")
-        self._get = ZenohClient(session, f"{of_type}_GetResult", f"{part}/get_result", RESULT_S)
         message, topic = f"{of_type}_FeedbackMessage", f"{part}/feedback"
-        self._feedback = session.subscribe(Typed(message, UnknownMessage(message)), topic, self._fed_back, FEEDBACK)
+        with ExitStack() as made:  # when one cannot be had, none stays
+
+            def client(of: str, name: str, timeout_s: float = CALL_S) -> ZenohClient:
+                one = ZenohClient(session, of, f"{part}/{name}", timeout_s)
+                made.callback(one.close)
+                return one
+
+            self._send = client(f"{of_type}_SendGoal", "send_goal")
+            self._cancel = client("action_msgs/srv/CancelGoal", "cancel_goal")
+            self._get = client(f"{of_type}_GetResult", "get_result", RESULT_S)
+            self._feedback = session.subscribe(
+                Typed(message, UnknownMessage(message)), topic, self._fed_back, FEEDBACK
+            )
+            made.pop_all()
 
     def is_ready(self) -> bool:
         """`Goals.is_ready`."""

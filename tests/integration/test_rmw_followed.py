@@ -12,7 +12,9 @@ import pytest
 from bridge.rmw_zenoh import ends
 from bridge.rmw_zenoh.ends import ZenohPublisher
 from bridge.rmw_zenoh.session import ZenohSession
-from bridge.rmw_zenoh.types import KnownTypes
+from bridge.rmw_zenoh.types import KnownTypes, UnknownMessage
+from bridge.ros.shapes import Structure
+from bridge.ros.side import ActionType
 from bridge.ros.types import InterfaceName
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh.ros_network import RosNetwork, RosNode
@@ -139,3 +141,19 @@ async def test_what_is_latched_is_there_for_them(site: Site) -> None:
     heard = site.heard(LATCHED)
     await until(lambda: heard, PATIENCE_S)
     assert set(heard) == {STOP}
+
+
+async def test_an_action_of_which_a_part_cannot_be_had_leaves_nothing(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Clients that were made before the part that fails are closed again."""
+
+    def fail(*_args: Any) -> None:
+        raise OSError("no more of that")
+
+    monkeypatch.setattr(site.ours, "hash_of", lambda topic, of_type: OTHER_HASH)
+    monkeypatch.setattr(site.ours, "subscribe", fail)
+    of = ActionType(UnknownMessage(""), ("demo_msgs/action/Turn", Structure(())))
+    with pytest.raises(OSError, match="no more"):
+        await site.ours.run(lambda: site.ours.goals(of, "/turn"))
+    assert site.ours._held == []

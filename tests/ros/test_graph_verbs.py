@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
@@ -26,7 +27,7 @@ from std_srvs.srv import SetBool
 from tests.support.processes import ROOT
 from tests.support.programs import Program, ended, free_port, macs
 from tests.support.ros_peer import Peer, set_bool
-from tests.support.waiting import get, until
+from tests.support.waiting import PATIENCE_S, get, until
 
 SETTINGS = """
 [robot]
@@ -42,6 +43,7 @@ class Site:
     endpoint: str
     peer: Peer
     driven: asyncio.Queue[Any]
+    robot: Program
 
     async def macs(self, *argv: str) -> tuple[int, str, str]:
         return await ended(*argv, "-e", self.endpoint)
@@ -79,7 +81,7 @@ async def site(domain: int, peer: Peer, tmp_path: Path) -> AsyncIterator[Site]:
         await stack.enter_async_context(Program("router", "-l", endpoint))
         robot = Program("agent", "--settings", str(settings), "-e", endpoint, env={"ROS_DOMAIN_ID": str(domain)})
         await stack.enter_async_context(robot)
-        site = Site(endpoint, peer, driven)
+        site = Site(endpoint, peer, driven, robot)
         await site.offered("/chatter", "/cmd_vel", "/set", "/picture")
         yield site
     for task in talking:
@@ -280,6 +282,35 @@ async def test_goals_are_given(site: Site, count_action: Any) -> None:
     code, _, log = await site.macs("action", "send", "/count", "to: 2")
     assert code == 1
     assert "stop" in log.splitlines()[-1]
+    await site.peer.session.run(server.destroy)
+
+
+async def test_a_goal_whose_robot_is_killed_has_an_end(site: Site, count_action: Any) -> None:
+    """Who waits for its result without a time limit hears that the robot has left: exit code 1."""
+    go = threading.Event()
+
+    def execute(handle: Any) -> Any:
+        go.wait(PATIENCE_S)
+        handle.succeed()
+        return count_action.Result()
+
+    node = site.peer.session.node
+    server = await site.peer.session.run(lambda: ActionServer(node, count_action, "/count", execute))
+    await site.offered("/count")
+    sending = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "bridge", "action", "send", "/count", "to: 2", "-e", site.endpoint),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    assert sending.stdout is not None
+    while b"Goal accepted" not in await asyncio.wait_for(sending.stdout.readline(), PATIENCE_S):
+        assert sending.returncode is None
+    await site.robot.stop(signal.SIGKILL)
+    _, log = await asyncio.wait_for(sending.communicate(), PATIENCE_S)
+    go.set()
+    assert sending.returncode == 1
+    last = log.decode().splitlines()[-1]
+    assert "robot 7 cannot be reached: it has left" in last
     await site.peer.session.run(server.destroy)
 
 
