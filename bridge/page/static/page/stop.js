@@ -107,7 +107,8 @@ export class Stop {
     const whom = robots.map((robot) => `robot ${robot}`).join(", ");
     const sent = robots.length > 0 && this.command?.publish(FALSE, this.#named(robots));
     if (sent) this.tell("stop", `release asked for ${whom}`);
-    else this.tell("stop", robots.length ? `no connection: the release of ${whom} was not sent` : "the stop is taken back");
+    else if (robots.length || !this.headset.connected) this.tell("stop", "no connection: who is stopped was not released");
+    else this.tell("stop", "the stop is taken back where it is not confirmed");
     this.#send();
     this.onChange();
   }
@@ -140,13 +141,17 @@ export class Stop {
     const state = { stopped, tookMs: before?.tookMs ?? null, why: "", at: performance.now() };
     if (stopped && this.wanted.delete(robot) && this.pressedAt !== null) state.tookMs = performance.now() - this.pressedAt;
     this.states.set(robot, state);
+    // a release from just before the press may be told after it: then the press counts
+    const again = before?.stopped && !stopped && this.all && performance.now() - this.askedAt < CHECK_MS;
+    if (again) this.wanted.add(robot);
     // somebody has let all of them go on: then newcomers may, too
     if (before?.stopped && !stopped && !this.wanted.size && !this.stopped().length) this.all = false;
     if (before?.stopped !== stopped && (before || stopped)) {
       this.tell("stop", stopped ? `robot ${robot} is stopped` : `robot ${robot} may go on`);
     }
     this.onChange(robot);
-    this.#show();
+    if (again) this.#send();
+    else this.#show();
   }
 
   #refused({ robot, name, reason }) {
@@ -195,15 +200,17 @@ export class Stop {
     } catch {
       // a browser that keeps nothing
     }
-    if (kept === null || !Array.isArray(kept.wanted)) return this.#show();
+    if (!Array.isArray(kept?.wanted) || !Array.isArray(kept.known)) return this.#show();
     this.all = kept.all === true;
-    for (const robot of kept.wanted) this.wanted.add(robot) && this.known.add(robot);
+    kept.wanted.forEach((robot) => this.wanted.add(robot));
+    kept.known.forEach((robot) => this.known.add(robot));
     this.pressedAt = performance.now();
     this.#send();
   }
 
   #keep() {
-    const kept = this.open ? JSON.stringify({ all: this.all, wanted: [...this.wanted] }) : null;
+    const now = { all: this.all, wanted: [...this.wanted], known: [...this.known] };
+    const kept = this.open || this.all ? JSON.stringify(now) : null;
     if (kept === this.kept) return;
     this.kept = kept;
     try {
@@ -268,6 +275,7 @@ export class Stop {
     const waiting = [...this.wanted].filter((robot) => this.online.has(robot));
     if (this.open && !this.mayStop) return [`a stop is not confirmed by ${list([...this.wanted])}, and this token may not stop`];
     if (this.open && !this.headset.connected) return ["no connection: the stop is sent as soon as there is one"];
+    if (this.all && !this.headset.connected) return ["no connection: how robots are is not known"];
     const words = [];
     if (waiting.length) {
       const reason = waiting.map((robot) => this.states.get(robot)?.why).find(Boolean);
