@@ -26,7 +26,7 @@ def second_agent(site: Site) -> Program:
 
 async def online(page: Watched, *robots: int) -> None:
     """Wait until the page knows these, and no others."""
-    await until(partial(page.value, f"String(macsPage.online.robots) === '{','.join(map(str, robots))}'"))
+    await until(partial(page.value, f"String(window.macsPage?.online.robots) === '{','.join(map(str, robots))}'"))
 
 
 async def test_a_press_holds_for_a_robot_that_drops_out(site: Site) -> None:
@@ -56,7 +56,7 @@ async def test_a_press_holds_where_no_robot_is_known(site: Site) -> None:
     await site.agent.stop(signal.SIGKILL)
     page = await site.open()
     page.allowed.append(OFFLINE)
-    await until(partial(page.value, "macsPage.headset.connected"))
+    await until(partial(page.value, "window.macsPage?.headset.connected"))
     await online(page)
     await page.page.click("#stop")
     await until(lambda: says(page, "#stop-status", "no robot is online: each that comes is stopped"))
@@ -77,7 +77,7 @@ async def test_a_press_that_was_taken_back_is_not_sent(site: Site) -> None:
     """Pressed while there is no robot, and released: who comes then may go on."""
     await site.agent.stop(signal.SIGKILL)
     page = await site.open()
-    await until(partial(page.value, "macsPage.headset.connected"))
+    await until(partial(page.value, "window.macsPage?.headset.connected"))
     await online(page)
     await page.page.click("#stop")
     await page.page.click("#release")
