@@ -139,7 +139,7 @@ def test_the_program_says_its_version(macs: Path, tmp_path: Path) -> None:
 def test_a_whole_round(macs: Path, tmp_path: Path) -> None:
     """Router, gateway, robot and headset out of the wheel alone: data comes, commands move the robot."""
     pytest.importorskip("rclpy")
-    ros = os.environ.get("AMENT_PREFIX_PATH") or sys.prefix
+    ros = os.pathsep.join(filter(None, [os.environ.get("AMENT_PREFIX_PATH"), sys.prefix]))  # of other tests as well
     done = run(
         macs, *["up", "--demo", "--once", "--port", "0", "--router-port", "0"], cwd=tmp_path, AMENT_PREFIX_PATH=ros
     )
@@ -175,7 +175,7 @@ def test_init_writes_what_programs_take(macs: Path, tmp_path: Path, kind: str) -
 def test_a_shipped_interface_package_builds(macs: Path, tmp_path: Path) -> None:
     """What `macs awareness` needs can be had from the wheel alone."""
     pytest.importorskip("rclpy")
-    ros = os.environ.get("AMENT_PREFIX_PATH") or sys.prefix
+    ros = os.pathsep.join(filter(None, [os.environ.get("AMENT_PREFIX_PATH"), sys.prefix]))  # of other tests as well
     done = run(macs, "interfaces", "build", "as2_ca_msgs", "--into", "dist", cwd=tmp_path, AMENT_PREFIX_PATH=ros)
     assert done.returncode == 0, done.stderr
     assert [path.name.split("-")[0] for path in (tmp_path / "dist").glob("*.whl")] == ["as2_ca_msgs"]
