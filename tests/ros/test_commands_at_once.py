@@ -111,8 +111,8 @@ def hesitating(monkeypatch: pytest.MonkeyPatch) -> None:
         time.sleep(0.01)
         take(node, message)
 
-    def hesitant_judge(node: PublisherNode, message: Message) -> tuple[str, str] | None:
-        judged = judge(node, message)
+    def hesitant_judge(node: PublisherNode, *message: Any) -> tuple[str, str] | None:
+        judged = judge(node, *message)
         time.sleep(0.01)
         return judged
 
