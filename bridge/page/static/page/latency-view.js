@@ -131,6 +131,7 @@ export class LatencyView {
     for (;;) {
       const seen = !this.element.hidden && !document.hidden && this.page.headset.connected;
       const [robot, topic] = [this.robotChoice.value, this.topicChoice.value];
+      if (seen && robot && !topic) await this.#robotChosen(); // what it offers could not be told the last time
       this.#receive(seen && robot && topic ? [Number(robot), topic, this.types[topic]] : null);
       if (seen && robot && topic) {
         const told = await this.page.get(`/view/trace/${robot}?topic=${encodeURIComponent(topic)}`);
