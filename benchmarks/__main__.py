@@ -20,16 +20,24 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from . import awareness, cases, crowd, differing, door, peers, ports, robot_speed, scale
+from . import awareness, cases, crowd, differing, door, peers, ports, recording, robot_speed, scale
 from .figures import Figure, markdown, table
 from .peer_ends import KINDS
 from .plan import Plan
 from .processes import ProgramFailed, Stage
 
 WITH_ROS = {**robot_speed.CASES, **awareness.CASES, **peers.CASES}
-WITHOUT_ROS = {**cases.CASES, **differing.CASES, **scale.CASES, **crowd.CASES, **ports.CASES, **door.CASES}
+WITHOUT_ROS = {
+    **cases.CASES,
+    **differing.CASES,
+    **scale.CASES,
+    **crowd.CASES,
+    **ports.CASES,
+    **door.CASES,
+    **recording.CASES,
+}
 CASES = {**WITHOUT_ROS, **WITH_ROS}
-ONLY_ASKED_FOR = ("mixed", "peers")
+ONLY_ASKED_FOR = ("mixed", "peers", "recording")
 """What takes ten minutes, or programs that the user starts."""
 ROUNDS = 5
 BEGIN, END = "<!-- figures: {} -->", "<!-- end of figures -->"

@@ -65,6 +65,19 @@ class RawZenoh:
         publisher.undeclare()  # type: ignore[no-untyped-call]
         return {"began": began}
 
+    def save(self, key: str, path: str) -> dict[str, Any]:
+        """Write the bytes of what comes on a key to a file, until `saved`."""
+        file = open(path, "wb")  # noqa: PTH123, SIM115 - closed in saved
+        self._saving = self.declare(key, lambda sample: file.write(sample.payload.to_bytes()))
+        self._file = file
+        return {}
+
+    def saved(self) -> dict[str, Any]:
+        """No more of it."""
+        self._saving.undeclare()
+        self._file.close()
+        return {}
+
     def expect(self, count: int) -> dict[str, Any]:
         """Begin to count: ``receive`` waits for so many."""
         self._all_here.clear()
@@ -172,7 +185,7 @@ def main() -> None:
         serve({"port": tcp.port}, {"ping": tcp.ping, "echo": tcp.echo})
         return
     raw = RawZenoh(int(port[0]))
-    names = ("subscribe", "publish", "expect", "receive", "ping", "echo")
+    names = ("subscribe", "save", "saved", "publish", "expect", "receive", "ping", "echo")
     serve({}, {name: getattr(raw, name) for name in names})
     raw.session.close()  # type: ignore[no-untyped-call]
 

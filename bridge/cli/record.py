@@ -23,6 +23,7 @@ what it prints:
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -75,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
     if args.principal is not None and not args.principal.joins:
         raise UsageError("a recording is online: --as unity/5, or another agent with an id")
     settings = options.settings(args)
+    os.nice(settings.record.nice)  # before there are threads: each has its own
     return running.until_stopped(lambda: _record(args, settings))
 
 

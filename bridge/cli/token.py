@@ -4,12 +4,13 @@ A token is printed once, when it is made. The file keeps its hash, name, rights 
 follow the file without a restart: a token that is revoked ends within a second. Copy the file to
 other gateways, or keep it where all of them read it.
 
-Rights: see, command, call, serve, act, stop, ask, send, broadcast, robot (docs/security.md).
+Rights: see, command, call, serve, act, stop, ask, send, broadcast, record, robot (docs/security.md).
 What is not named is not permitted.
 
 examples:
   macs token create anna --robots 1,2 --groups 3 --may see,command,stop --expires 30d
   macs token create wall --robots any --may see --topics '/camera/**'
+  macs token create desk --robots any --may see,record
   macs token list
   macs token show anna --qr --url http://192.168.1.10:7080      pair a headset without a keyboard
   macs token rotate anna                                        a new secret; the old one ends

@@ -39,6 +39,11 @@ CHUNK_BYTES = 2 << 20
 REMEMBERED = 256
 """So many chunks can be given up, where the disk has no room for the index."""
 COMPRESSIONS = ("zstd", "lz4", "none")
+SAMPLES, SAMPLE_BYTES = 3, 16 << 10
+"""So much of a chunk is tried first: what gets no smaller, as pictures that are compressed or full of noise, is written
+as it is, for a tenth of the time."""
+WORTH = 0.9
+"""Of its size a sample has to have at most so much."""
 
 Closing = Callable[[], Mapping[str, Mapping[str, str]]]
 """Says at the end what stands in metadata records, by their names."""
@@ -231,8 +236,9 @@ class McapFile:
         raw = b"".join(self._pieces)
         entries, start_ns, end_ns = self._entries, self._start_ns, self._end_ns
         self._pieces, self._entries, self._pending = [], {}, 0
+        compression = self._compression if self._gets_smaller(raw) else ""
         try:
-            self.add_chunk(raw, self._compress(raw), self._compression, entries, start_ns, end_ns)
+            self.add_chunk(raw, self._compress(raw) if compression else raw, compression, entries, start_ns, end_ns)
         except OSError:
             self.lost += sum(len(times) // 2 for times in entries.values())
             raise
@@ -244,16 +250,16 @@ class McapFile:
         time, offset, …"""
         name = compression.encode()
         length = 8 + 8 + 8 + 4 + 4 + len(name) + 8 + len(data)
-        chunk = b"".join(
+        head = b"".join(
             (
                 _CHUNK.pack(Opcode.CHUNK, length, start_ns, end_ns, len(raw), zlib.crc32(raw)),
                 _U32.pack(len(name)),
                 name,
                 _U64.pack(len(data)),
-                data,
             )
         )
-        at, offsets, indexes = self._at + len(chunk), {}, []
+        chunk_bytes = len(head) + len(data)
+        at, offsets, indexes = self._at + chunk_bytes, {}, []
         for channel, times in entries.items():
             record = _INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(times), channel, 8 * len(times))
             record += struct.pack(f"<{len(times)}Q", *times)
@@ -261,17 +267,17 @@ class McapFile:
             at += len(record)
             indexes.append(record)
         index = ChunkIndex(
-            chunk_length=len(chunk),
+            chunk_length=chunk_bytes,
             chunk_start_offset=self._at,
             compression=compression,
             compressed_size=len(data),
             message_end_time=end_ns,
-            message_index_length=at - self._at - len(chunk),
+            message_index_length=at - self._at - chunk_bytes,
             message_index_offsets=offsets,
             message_start_time=start_ns,
             uncompressed_size=len(raw),
         )
-        self._write(b"".join((chunk, *indexes)))
+        self._write(head, data, b"".join(indexes))
         self.index.add_chunk(index, {channel: len(times) // 2 for channel, times in entries.items()})
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
@@ -329,11 +335,26 @@ class McapFile:
         os.ftruncate(self._file, self._at)
         os.lseek(self._file, self._at, os.SEEK_SET)
 
-    def _write(self, data: bytes) -> None:
-        view, written = memoryview(data), 0
+    def _gets_smaller(self, raw: bytes) -> bool:
+        """Whether it is worth the time to make a chunk smaller, as pieces of it tell."""
+        if not self._compression or len(raw) <= SAMPLES * SAMPLE_BYTES:
+            return bool(self._compression)
+        step = (len(raw) - SAMPLE_BYTES) // (SAMPLES - 1)
+        sample = b"".join(raw[at : at + SAMPLE_BYTES] for at in range(0, len(raw), step))
+        return len(self._compress(sample)) <= WORTH * len(sample)
+
+    def _write(self, *pieces: bytes) -> None:
+        """All of it or nothing."""
+        left = [memoryview(piece) for piece in pieces if piece]
+        written = 0
         try:
-            while written < len(view):
-                written += os.write(self._file, view[written:])
+            while left:
+                count = os.writev(self._file, left)
+                written += count
+                while left and count >= len(left[0]):
+                    count -= len(left.pop(0))
+                if count:
+                    left[0] = left[0][count:]
         except OSError:
             os.ftruncate(self._file, self._at)
             os.lseek(self._file, self._at, os.SEEK_SET)

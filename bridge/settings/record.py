@@ -28,6 +28,9 @@ class RecordSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     """So many files a ring writes by itself and for agents, then only for a signal: no robot fills the disk."""
     allow: list[AgentPattern] = []
     """Who may have the verb ``record`` write a ring or end the recording. Everybody may ask how it is getting on."""
+    nice: Annotated[int, Meta(ge=0, le=19)] = 10
+    """How far it steps back for others where processors are few, as `nice` has it: what is recorded waits in memory,
+    what a headset sees and commands does not. 0: not at all."""
     compress: Literal["zstd", "lz4", "none"] = "lz4"
     """How chunks are made smaller."""
 

@@ -30,7 +30,7 @@ from .messages import (
 from .name_patterns import NamePattern, matches
 from .wire import Header
 
-Right = Literal["see", "command", "call", "serve", "act", "stop", "ask", "send", "broadcast", "robot"]
+Right = Literal["see", "command", "call", "serve", "act", "stop", "ask", "send", "broadcast", "record", "robot"]
 
 RIGHTS: dict[Right, str] = {
     "see": "register for topics that robots send, ask what they offer and how they are",
@@ -42,6 +42,7 @@ RIGHTS: dict[Right, str] = {
     "ask": "ask own managers of robots and gateways, send robots what belongs to no topic",
     "send": "send to other headsets by id and by group",
     "broadcast": "send to everybody, what needs no other right; only with --robots any, for robots hear it as well",
+    "record": "record the mesh at the web port, and have what was recorded; only with --robots any and all topics",
     "robot": "join as a robot program, and not as a headset",
 }
 """Each right by its name, with what it permits."""
@@ -89,6 +90,8 @@ class Rights(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if "broadcast" in self.may and self.robots != ANY:
             raise ValueError("everybody hears a broadcast, all robots too: it needs --robots any")
+        if "record" in self.may and (self.robots != ANY or EVERY_NAME not in self.topics):
+            raise ValueError("recordings have every robot and topic: to record needs --robots any and all topics")
 
     def has(self, right: Right) -> bool:
         """Whether it is among them."""

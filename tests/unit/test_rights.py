@@ -47,7 +47,7 @@ def data(node_type: int, name: str = "/camera/image") -> Metadata:
 @pytest.mark.parametrize(("node_type", "right"), OF_NODES.items())
 def test_each_kind_of_node_needs_its_right(node_type: int, right: Right) -> None:
     """With the right a node can be registered and data sent to it; with all other rights neither can."""
-    others = [each for each in RIGHTS if each not in (right, "broadcast", "robot")]
+    others = [each for each in RIGHTS if each not in (right, "broadcast", "record", "robot")]
     granted, withheld = rights(right), rights(*others)
     assert granted.of_registration(node(node_type), [1], [3]) is None
     assert f"right to {right}" in (withheld.of_registration(node(node_type), [1], [3]) or "")
@@ -136,14 +136,14 @@ def test_a_stop_needs_its_right_and_no_other(name: str) -> None:
 def test_requests_to_robots_need_what_they_do(manager: str, right: Right) -> None:
     """To ask how a robot is, is to see; to take control, to command; for all else there is a right to ask."""
     asked = Metadata(message_manager=manager)
-    others = [each for each in RIGHTS if each not in (right, "broadcast", "robot")]
+    others = [each for each in RIGHTS if each not in (right, "broadcast", "record", "robot")]
     assert rights(right).of_frame(header(ids=(1,)), asked, None) is None
     assert rights(*others).of_frame(header(ids=(1,)), asked, None) is not None
 
 
 def test_what_routers_say_nobody_may_send() -> None:
     """Messages of the protocol go to no robot as plain messages."""
-    everything = rights(*(each for each in RIGHTS if each != "broadcast"))
+    everything = rights(*(each for each in RIGHTS if each not in ("broadcast", "record")))
     for manager in set(MANAGERS) - {"FunctionalityGetter"}:
         assert everything.of_frame(header(ids=(1,)), Metadata(message_manager=manager), None) is not None
 
@@ -184,3 +184,12 @@ def test_nothing_is_permitted_by_default() -> None:
         msgspec.convert({"may": ["seee"]}, Rights)
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert({"mya": []}, Rights)
+
+
+def test_to_record_is_for_who_may_see_everything() -> None:
+    """A recording has every robot and topic: no token for a part of them gives the right."""
+    assert rights("record", robots="any").has("record")
+    with pytest.raises(ValueError, match="every robot"):
+        rights("record")
+    with pytest.raises(ValueError, match="every robot"):
+        rights("record", robots="any", topics=["/camera/**"])
