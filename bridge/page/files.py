@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 FOLDER = Path(__file__).parent / "static"
 LIBRARIES = ("vendor/libraries.js", "vendor/uplot.css")
 """Made of what npm brings; without them there is no page."""
+XR_LIBRARIES = ("vendor/libraries.js", "vendor/three.js")
+"""Without these there is no scene for headsets."""
 
 TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -48,9 +51,9 @@ def read_all() -> dict[str, File]:
     }
 
 
-def missing(found: dict[str, File]) -> bool:
-    """Whether the libraries are not there."""
-    return any(name not in found for name in LIBRARIES)
+def missing(found: dict[str, File], libraries: Sequence[str] = LIBRARIES) -> bool:
+    """Whether some of these libraries are not there."""
+    return any(name not in found for name in libraries)
 
 
 def without_libraries() -> File:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import importlib.util
+import json
 import os
 import shutil
 import subprocess
@@ -21,7 +22,9 @@ HERE = Path(__file__).parent
 NPM = HERE / "npm"
 VENDOR = HERE / "static" / "vendor"
 STAMP = VENDOR / "made-of.txt"
-SOURCES = ("package.json", "package-lock.json", "libraries.js")
+BUNDLES = ("libraries.js", "three.js")
+SOURCES = ("package.json", "package-lock.json", *BUNDLES)
+ONLY_TESTS = ("axe-core", "iwer")
 NPM_S = 300.0
 PATIENCE = ("--fetch-retries=1", "--fetch-retry-mintimeout=1000", "--fetch-timeout=60000")
 """Who has no network is told soon."""
@@ -54,7 +57,8 @@ def make(work: Path, *, for_tests: bool = False) -> None:
         raise NoLibraries("npm brought no esbuild for this machine")
     VENDOR.mkdir(parents=True, exist_ok=True)
     bundle = ["--bundle", "--minify", "--format=esm", "--target=es2022", "--legal-comments=none"]
-    _run([str(bundler), "libraries.js", *bundle, f"--outfile={VENDOR / 'libraries.js'}"], work)
+    for name in BUNDLES:
+        _run([str(bundler), name, *bundle, f"--outfile={VENDOR / name}"], work)
     shutil.copy(modules / "uplot" / "dist" / "uPlot.min.css", VENDOR / "uplot.css")
     (VENDOR / "licenses.txt").write_text(_licenses(modules), encoding="utf-8")
     STAMP.write_text(_wanted(), encoding="utf-8")
@@ -99,11 +103,14 @@ def _run(command: list[str], work: Path) -> None:
 def _licenses(modules: Path) -> str:
     """The licenses of what is in the bundle, as they ask for."""
     texts = []
-    for package in sorted({path.parent for path in modules.glob("**/package.json")}):
-        name = package.relative_to(modules).as_posix()
-        if "node_modules" in name or name.startswith(("esbuild", "@esbuild", "axe-core")):
-            continue
-        texts += [f"{name}\n\n{path.read_text(encoding='utf-8')}" for path in sorted(package.glob("LICEN[SC]E*"))]
+    lock = json.loads((NPM / "package-lock.json").read_text(encoding="utf-8"))
+    for place, package in sorted(lock["packages"].items()):
+        name = place.removeprefix("node_modules/")
+        if not place or package.get("dev") or name.startswith(("esbuild", "@esbuild")):
+            continue  # the packages that only tests need, and the bundler, are not in it
+        texts += [
+            f"{name}\n\n{path.read_text(encoding='utf-8')}" for path in sorted((modules / name).glob("LICEN[SC]E*"))
+        ]
     return "\n\n".join(texts)
 
 
@@ -113,7 +120,10 @@ def main() -> int:
     parser.add_argument("--work", type=Path, help="folder that keeps what npm brings (default: one that is removed)")
     parser.add_argument("--for-tests", action="store_true", help="also what only tests use, in that folder")
     args = parser.parse_args()
-    fetched = args.work is None or not args.for_tests or (args.work / "node_modules" / "axe-core").is_dir()
+    tools = (
+        [] if args.work is None or not args.for_tests else [args.work / "node_modules" / name for name in ONLY_TESTS]
+    )
+    fetched = all(tool.is_dir() for tool in tools)
     if in_place() and fetched:
         STAMP.touch()  # for make, which compares times
         return 0

@@ -49,7 +49,7 @@ def test_nothing_is_from_elsewhere(path: Path) -> None:
 
 def test_what_is_named_is_there() -> None:
     """Each script, style and module that a file of the page names is one of its files."""
-    names = {path.relative_to(files.FOLDER).as_posix() for path in OWN} | set(files.LIBRARIES)
+    names = {path.relative_to(files.FOLDER).as_posix() for path in OWN} | {*files.LIBRARIES, *files.XR_LIBRARIES}
     for path in OWN:
         text = path.read_text(encoding="utf-8")
         if path.suffix == ".js":
