@@ -4,6 +4,7 @@ import { Headset } from "../macs.js";
 import { Types } from "../ros.js";
 import { digits, h, say, show } from "./dom.js";
 import { LatencyView } from "./latency-view.js";
+import { asked, login } from "./login.js";
 import { MeshView } from "./mesh-view.js";
 import { RobotView } from "./robot-view.js";
 import { Stop } from "./stop.js";
@@ -185,52 +186,12 @@ function listed(ids) {
   return ids.length > 8 ? `${ids.slice(0, 8).join(", ")} and ${ids.length - 8} more` : ids.join(", ");
 }
 
-/** Ask for a token, or for the code that `macs token show --qr` shows. Loads the page again when it is let in. */
-function login() {
-  const input = h("input", { id: "token", type: "password", autocomplete: "current-password", required: true });
-  const problem = h("p", { class: "bad", role: "alert" });
-  const form = h(
-    "form",
-    { class: "login" },
-    h("h1", {}, "macs"),
-    h("label", { for: "token" }, "Token, or pairing code of six digits"),
-    input,
-    h("button", { type: "submit" }, "Sign in"),
-    problem,
-  );
-  form.addEventListener("submit", async (event) => {
-    event.preventDefault();
-    const shown = input.value.trim();
-    const token = /^\d{6}$/.test(shown) ? (await post("/pair", { code: shown }))?.token : shown;
-    if (token && (await post("/login", { token }))?.ok) location.reload();
-    else say(problem, "It is not valid here.");
-  });
-  document.body.replaceChildren(h("main", { class: "middle" }, form));
-  input.focus();
-}
-
-async function post(path, body) {
-  const response = await fetch(path, { method: "POST", body: JSON.stringify(body) });
-  return response.ok ? response.json() : null;
-}
-
 async function begin() {
   const me = await asked();
   if (me.wanted) return login();
   const page = new Page(me);
   window.macsPage = page; // for tests, and for who looks at it from a console
   page.start();
-}
-
-/** Who asks, and what he may do: as soon as the gateway is there. */
-async function asked() {
-  for (;;) {
-    try {
-      return await (await fetch("/view/me", { cache: "no-store" })).json();
-    } catch {
-      await new Promise((resolve) => setTimeout(resolve, 1000));
-    }
-  }
 }
 
 begin();
