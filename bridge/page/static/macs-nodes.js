@@ -143,32 +143,43 @@ export class Publisher extends Node {
     super(headset, NodeType.PUBLISHER, name, type, options);
     /** How many messages were not sent, as there was no connection or it was not fresh. */
     this.unsent = 0;
+    /** The number of the last command that told its time. */
+    this.lastTicks = 0;
   }
 
   /**
    * Send CDR to these robots and groups, by default to all where it is registered. Whether it was sent: nothing is kept
    * for later. With `freshMs` it is not sent when the gateway has not answered for so long, or when bytes still wait
-   * here: a command that cannot go at once does not go at all.
+   * here: a command that cannot go at once does not go at all. `madeAt` is when it was made, by the clock of the headset's
+   * `CommandClock`, for robots that want to know; now unless it is said.
    */
-  publish(cdr, { robots, groups = [], freshMs = 0 } = {}) {
+  publish(cdr, { robots, groups = [], freshMs = 0, madeAt } = {}) {
     const to = robots ?? [...this.robots];
     const toGroups = robots ? groups : [...this.groups];
-    const sent = freshMs
-      ? this.headset.sendFresh(() => this.#frames(cdr, to, toGroups), freshMs)
-      : this.headset.sendNow(() => this.#frames(cdr, to, toGroups));
+    const frames = () => this.#frames(cdr, to, toGroups, madeAt);
+    const sent = freshMs ? this.headset.sendFresh(frames, freshMs) : this.headset.sendNow(frames);
     if (!sent) this.unsent += 1;
     return sent;
   }
 
-  /** As many frames as it takes: ten robots and ten groups fit into one. */
-  #frames(data, robots, groups) {
-    const frames = [];
-    for (let at = 0; at < Math.max(robots.length, groups.length); at += 10) {
-      const ids = robots.slice(at, at + 10);
-      frames.push({ to: ROS, ids, groups: groups.slice(at, at + 10), meta: this.metadata(), data });
-    }
-    return frames;
+  #frames(data, robots, groups, madeAt) {
+    const { clock } = this.headset;
+    const timed = clock ? robots.filter((robot) => clock.tells(robot)) : [];
+    if (!timed.length) return packed(robots, groups, this.metadata(), data);
+    this.lastTicks = clock.ticks.next(this.lastTicks, madeAt ?? clock.now());
+    const told = { ...this.metadata({ requestId: this.lastTicks }), clock: clock.ticks.name };
+    const others = robots.filter((robot) => !timed.includes(robot));
+    return [...packed(timed, [], told, data), ...packed(others, groups, this.metadata(), data)];
   }
+}
+
+/** As many frames as it takes: ten robots and ten groups fit into one. */
+function packed(robots, groups, meta, data) {
+  const frames = [];
+  for (let at = 0; at < Math.max(robots.length, groups.length); at += 10) {
+    frames.push({ to: ROS, ids: robots.slice(at, at + 10), groups: groups.slice(at, at + 10), meta, data });
+  }
+  return frames;
 }
 
 /** A service of robots that this headset calls. */

@@ -114,6 +114,8 @@ export class Headset extends EventTarget {
     this.roundTripMs = null;
     /** Messages that came and could not be read. */
     this.badMessages = 0;
+    /** A `CommandClock`, where commands tell their time. */
+    this.clock = null;
   }
 
   /** Whether there is a connection now that the gateway has greeted. */
