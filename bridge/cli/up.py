@@ -18,7 +18,8 @@ what it prints:
     who is online      macs ls
     receive a topic    macs headset 127.0.0.1:7000 sub /TOPIC pkg/Type
   A Unity headset connects to 127.0.0.1:7000, from this machine only.
-  Watch and drive in a browser at http://127.0.0.1:7080 (programs: ws://127.0.0.1:7080/macs)."""
+  Watch and drive in a browser at http://127.0.0.1:7080 (programs: ws://127.0.0.1:7080/macs).
+  In a headset's browser: http://127.0.0.1:7080/xr"""
 
 from __future__ import annotations
 
@@ -321,7 +322,7 @@ def what_next(plan: Plan) -> str:
         f"  receive a topic    macs headset {target} sub {topic}",
         f"  drive              macs headset {target} pub /cmd_vel geometry_msgs/Twist {DRIVE}",
         f"A Unity headset connects to {where}.",
-        *([_web_line(plan)] if plan.gateway.web_port is not None else []),
+        *(_web_lines(plan) if plan.gateway.web_port is not None else []),
     ]
     if not seen_from_outside:
         lines.append("To let headsets and robots in from the network, start with --host 0.0.0.0.")
@@ -330,11 +331,14 @@ def what_next(plan: Plan) -> str:
     return "\n".join(lines)
 
 
-def _web_line(plan: Plan) -> str:
+def _web_lines(plan: Plan) -> list[str]:
     host = plan.gateway.web_host or plan.gateway.host
     where = joined(reachable(host), plan.gateway.web_port or 0)
     secure = "s" if plan.gateway.certificate is not None and not is_local(host) else ""
-    return f"Watch and drive in a browser at http{secure}://{where} (programs: ws{secure}://{where}{WEBSOCKET_PATH})."
+    return [
+        f"Watch and drive in a browser at http{secure}://{where} (programs: ws{secure}://{where}{WEBSOCKET_PATH}).",
+        f"In a headset's browser: http{secure}://{where}/xr",
+    ]
 
 
 def _say(text: str) -> None:

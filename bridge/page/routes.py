@@ -66,6 +66,8 @@ class Page:
             site.get_for_all("/", partial(self._file, files.without_libraries()))
         else:
             site.get_for_all("/", partial(self._file, found["index.html"]))
+        scene = files.without_libraries() if files.missing(found, files.XR_LIBRARIES) else found["xr/index.html"]
+        site.get_for_all("/xr", partial(self._file, scene))
         for name, file in found.items():
             site.get_for_all(f"/{name}", partial(self._file, file))
         site.get_for_all("/view/me", self._me)

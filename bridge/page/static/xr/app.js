@@ -1,0 +1,366 @@
+/**
+ * The scene for headsets: `/xr`. It reads hands and shows the world; what goes out and comes in is in two workers.
+ */
+
+import { asked, login } from "../page/login.js";
+import { h } from "../page/dom.js";
+import { Hands } from "./hands.js";
+import { Immersion } from "./immersion.js";
+import { Input } from "./input.js";
+import { Links } from "./links.js";
+import { Looking } from "./looking.js";
+import { Overlay } from "./overlay.js";
+import { Pointing } from "./pointing.js";
+import { Room } from "./room.js";
+import { Settings } from "./settings.js";
+import { Stage } from "./stage.js";
+import { Telling } from "./telling.js";
+import { driveTopic, targets, wishes } from "./targets.js";
+import { POSE_TYPES, SHOWN, TWIST } from "./wire-types.js";
+
+const OFFERS_MS = 2000;
+const IDLE_MS = 100;
+const SURE_MS = 3000;
+const CHOSEN = "macs.xr.robot";
+
+class Scene {
+  #idleAt = 0;
+  #stopping = true;
+  #before = 0;
+
+  constructor(me) {
+    this.me = me;
+    this.settings = new Settings();
+    this.canvas = h("canvas", { class: "xr-scene", id: "scene", tabindex: "0", "aria-label": "The robot and its pictures in a room" });
+    document.body.replaceChildren(this.canvas);
+    this.stage = new Stage(this.canvas);
+    this.links = new Links(me);
+    this.room = new Room(this.stage, this.settings);
+    this.immersion = new Immersion(this.stage.renderer);
+    this.overlay = new Overlay({ canvas: this.canvas, settings: this.settings, me, on: this.#actions() });
+    document.body.append(this.overlay.root);
+    this.hands = new Hands(this.stage.scene);
+    this.input = new Input({ settings: this.settings, pad: this.overlay.pad });
+    this.looking = new Looking(this.stage, this.canvas);
+    this.pointing = new Pointing({
+      head: () => this.stage.head(),
+      mayGrab: ({ kind, name }) => kind !== "hand" || name !== this.settings.get("hand"),
+    });
+    this.telling = new Telling(this);
+    this.online = [];
+    this.members = {};
+    this.target = null;
+    this.offers = { publishers: {}, subscribers: {} };
+    this.wishes = [];
+    /** How long the work of each of the last frames took, in ms. */
+    this.frameMs = [];
+  }
+
+  start() {
+    this.#listen();
+    this.links.settings(this.settings.values);
+    for (const name of ["curve", "scale", "layers"]) this.room.follow(name, this.settings.get(name));
+    this.immersion.look();
+    this.stage.renderer.setAnimationLoop((time, frame) => this.#frame(time, frame ?? null));
+    setInterval(() => this.#askOffers(), OFFERS_MS);
+    setInterval(() => this.telling.tell(), 250);
+  }
+
+  choose(id) {
+    const target = this.targets.find((each) => each.id === id);
+    if (!target || JSON.stringify(target) === JSON.stringify(this.target)) return;
+    const other = target.seen !== this.target?.seen;
+    this.target = target;
+    keep(CHOSEN, id);
+    if (other) {
+      this.offers = { publishers: {}, subscribers: {} };
+      this.room.model.clear();
+      this.telling.clear();
+      this.#wish();
+    }
+    this.#aim();
+    this.#showTargets();
+    this.#askOffers();
+  }
+
+  /** The one after the chosen one, or before it. */
+  step(by) {
+    const at = this.targets.findIndex(({ id }) => id === this.target?.id);
+    const { length } = this.targets;
+    if (length) this.choose(this.targets[(at + by + length) % length].id);
+  }
+
+  get targets() {
+    return targets(this.online, this.members, this.me);
+  }
+
+  // -- each frame ----------------------------------------------------------------------------------------------------
+
+  #frame(time, frame) {
+    const began = performance.now();
+    const dt = Math.min(0.1, (time - this.#before) / 1000);
+    this.#before = time;
+    const space = this.stage.renderer.xr.getReferenceSpace();
+    const immersive = Boolean(frame && space && this.immersion.session);
+    const sources = immersive ? this.input.read(frame, space, this.immersion.session.inputSources) : this.looking.sources();
+    this.pointing.targets = this.room.targets;
+    this.pointing.update(sources, dt);
+    this.looking.free(sources, this.pointing.panelUnder("mouse"));
+    this.#stopIfPressed(sources);
+    const sample = this.immersion.attended ? this.input.drive(sources, this.stage.head().facing) : null;
+    const poses = immersive && this.wanted.size ? this.input.poses(frame, space, sources, this.wanted) : null;
+    this.sample = sample;
+    this.#send(sample, poses, began);
+    this.hands.show(sources, this.pointing.distances, this.telling.state.source);
+    this.links.showPictures(this.room, this.wishes);
+    this.stage.render();
+    this.frameMs.push(performance.now() - began);
+    if (this.frameMs.length > 600) this.frameMs.splice(0, 300);
+  }
+
+  #send(sample, poses, now) {
+    const idle = sample === null && poses === null && !this.driven;
+    this.driven = sample !== null;
+    if (idle && now - this.#idleAt < IDLE_MS) return;
+    this.#idleAt = now;
+    this.links.input(sample, poses);
+  }
+
+  /** Pressed anew: who comes with it pressed has pressed nothing. */
+  #stopIfPressed(sources) {
+    const stopping = this.input.stops(sources);
+    if (stopping && !this.#stopping) this.stop();
+    this.#stopping = stopping;
+  }
+
+  /** Kinds of poses that have a topic. */
+  get wanted() {
+    return new Set(Object.keys(POSE_TYPES).filter((kind) => this.settings.get(kind)));
+  }
+
+  // -- what somebody does --------------------------------------------------------------------------------------------
+
+  stop() {
+    this.overlay.pad.release();
+    this.links.stop();
+    this.telling.event("stop pressed");
+  }
+
+  /** Twice within three seconds: a slip releases nothing. */
+  release() {
+    if (this.sure) {
+      clearTimeout(this.calming);
+      this.sure = false;
+      this.links.release();
+    } else {
+      this.sure = true;
+      this.calming = setTimeout(() => {
+        this.sure = false;
+        this.telling.tell();
+      }, SURE_MS);
+    }
+    this.telling.tell();
+  }
+
+  #actions() {
+    return {
+      choose: (id) => this.choose(id),
+      enter: (mode) => this.enter(mode),
+      stop: () => this.stop(),
+      release: () => this.release(),
+      control: (action) => this.links.control({ action }),
+      give: () => this.links.control({ action: "give", to: this.telling.state.candidates[0] }),
+    };
+  }
+
+  async enter(mode) {
+    this.links.poke(); // others lose their connection on entering
+    try {
+      await this.immersion.enter(mode);
+    } catch (error) {
+      this.telling.event(`the browser does not enter: ${error.message}`);
+    }
+  }
+
+  /** A button of the board was pressed. */
+  press(id) {
+    const { settings } = this;
+    const actions = {
+      stop: () => this.stop(),
+      release: () => this.release(),
+      before: () => this.step(-1),
+      after: () => this.step(1),
+      take: () => this.links.control({ action: "take" }),
+      back: () => this.links.control({ action: "release" }),
+      give: () => this.links.control({ action: "give", to: this.telling.state.candidates[0] }),
+      smaller: () => settings.set("scale", Math.max(0.02, settings.get("scale") / 1.6)),
+      larger: () => settings.set("scale", Math.min(1, settings.get("scale") * 1.6)),
+      flat: () => settings.set("curve", settings.get("curve") > 0 ? 0 : 0.35),
+      arrange: () => this.room.arrange(),
+      hand: () => settings.set("hand", settings.get("hand") === "left" ? "right" : "left"),
+      leave: () => this.immersion.leave(),
+    };
+    actions[id]?.();
+    this.telling.tell();
+  }
+
+  // -- what happens --------------------------------------------------------------------------------------------------
+
+  #listen() {
+    this.links.addEventListener("presence", ({ detail }) => this.#setOnline(detail.robots));
+    this.links.addEventListener("access", ({ detail: { kind, reason } }) => {
+      this.telling.event(reason);
+      if (["changed", "no_token", "ended"].includes(kind)) location.reload();
+    });
+    this.links.addEventListener("value", ({ detail }) => this.#take(detail));
+    this.settings.addEventListener("change", ({ detail: { name, value } }) => this.#follow(name, value));
+    this.room.menu.onPress = (id) => this.press(id);
+    this.immersion.addEventListener("modes", () => this.overlay.setModes(this.immersion.modes));
+    this.immersion.addEventListener("entered", () => this.#immersed(true));
+    this.immersion.addEventListener("left", () => this.#immersed(false));
+    this.immersion.addEventListener("attention", () => this.#attend());
+    document.addEventListener("visibilitychange", () => this.#attend());
+    addEventListener("blur", () => this.#lostFocus());
+    addEventListener("focus", () => this.#attend());
+    addEventListener("online", () => this.links.poke());
+    navigator.connection?.addEventListener?.("change", () => this.links.poke());
+    addEventListener("pagehide", () => this.links.away("the page was closed"));
+    addEventListener("pageshow", (event) => event.persisted && location.reload());
+    addEventListener("keydown", (event) => {
+      if (event.key === "Escape" && !document.querySelector("dialog[open]")) this.stop();
+    });
+    this.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+  }
+
+  #immersed(immersive) {
+    this.overlay.pad.release();
+    this.links.away("the headset was put on or off");
+    this.stage.setImmersive(immersive);
+    this.stage.setReal(this.immersion.mode === "immersive-ar");
+    this.links.poke();
+    this.#attend();
+  }
+
+  /** Whoever is not there any more has let go of everything. */
+  #attend() {
+    const { session } = this.immersion;
+    const hidden = session ? !this.immersion.attended : document.hidden;
+    if (hidden) this.overlay.pad.release();
+    this.links.away(hidden ? (session ? "the headset is off" : "the page is hidden") : "");
+    if (!hidden) this.links.poke();
+  }
+
+  /** In XR the window has no focus, and somebody is there all the same. */
+  #lostFocus() {
+    if (this.immersion.session) return;
+    this.overlay.pad.release();
+    this.links.input(null, null);
+  }
+
+  #follow(name, value) {
+    this.room.follow(name, value);
+    this.links.settings(this.settings.values);
+    if (["cameras", "rightEye", "layers", "values"].includes(name)) this.#wish();
+    if (name === "driveTopic") this.#aim();
+  }
+
+  #setOnline(robots) {
+    this.online = robots;
+    this.#askMembers();
+    this.#showTargets();
+    if (!this.target && this.targets.length) {
+      const wanted = /^#robot\/(\d+)$/.exec(location.hash);
+      const kept = wanted ? `robot/${wanted[1]}` : keptAs(CHOSEN);
+      this.choose(this.targets.some(({ id }) => id === kept) ? kept : this.targets[0].id);
+    }
+  }
+
+  #showTargets() {
+    const shown = this.targets;
+    const lost = this.target && !shown.some(({ id }) => id === this.target.id);
+    if (lost) shown.push({ ...this.target, label: `${this.target.label} · lost` });
+    this.overlay.setTargets(shown, this.target?.id);
+  }
+
+  /** Which robots are in which group. */
+  async #askMembers() {
+    const mesh = await get("/view/mesh");
+    if (!mesh?.robots) return;
+    this.members = Object.fromEntries(mesh.robots.map(({ id, group }) => [id, group]));
+    this.#showTargets();
+    if (this.target?.groups.length || this.target?.id.startsWith("group/")) this.choose(this.target.id);
+  }
+
+  async #askOffers() {
+    const { target } = this;
+    if (!target || document.hidden) return;
+    const offers = await get(`/view/robots/${target.seen}/offers`);
+    if (!offers || offers.error || this.target !== target) return;
+    const before = JSON.stringify([this.offers.publishers, this.offers.subscribers]);
+    this.offers = { publishers: offers.publishers ?? {}, subscribers: offers.subscribers ?? {} };
+    if (JSON.stringify([this.offers.publishers, this.offers.subscribers]) === before) return;
+    this.#wish();
+    if (this.drive !== JSON.stringify(this.#driveTopic())) this.#aim();
+  }
+
+  #driveTopic() {
+    return driveTopic(this.offers.subscribers, this.settings.get("driveTopic"), TWIST);
+  }
+
+  #aim() {
+    const found = this.#driveTopic();
+    this.drive = JSON.stringify(found);
+    const [topic, type] = found ?? ["", ""];
+    this.links.aim({ ...this.target, topic, type });
+  }
+
+  #wish() {
+    this.wishes = this.target ? wishes(this.target.seen, this.offers.publishers, this.settings.values, SHOWN) : [];
+    this.room.setPanels(this.wishes.filter(({ eye }) => eye === "left").map(({ panel }) => panel));
+    const right = this.wishes.find(({ eye }) => eye === "right")?.panel;
+    for (const screen of this.room.screens.values()) screen.setOther(screen.key === right);
+    this.links.watch(this.wishes);
+  }
+
+  #take(message) {
+    if (message.robot !== this.target?.seen) return;
+    if (message.shown === "battery") this.telling.setBattery(message);
+    else if (message.shown === "text") this.telling.setText(message.topic, message.lines);
+    else this.room.model.take(message.shown, message);
+  }
+}
+
+async function get(path) {
+  try {
+    const response = await fetch(path, { cache: "no-store" });
+    return response.ok ? await response.json() : null;
+  } catch {
+    return null;
+  }
+}
+
+function keep(name, value) {
+  try {
+    localStorage.setItem(name, value);
+  } catch {
+    // a browser that keeps nothing
+  }
+}
+
+function keptAs(name) {
+  try {
+    return localStorage.getItem(name);
+  } catch {
+    return null;
+  }
+}
+
+async function begin() {
+  const me = await asked();
+  if (me.wanted) return login();
+  const scene = new Scene(me);
+  window.macsXr = scene; // for tests, and for who looks at it from a console
+  scene.start();
+}
+
+begin();

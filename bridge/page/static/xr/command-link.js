@@ -1,0 +1,416 @@
+/**
+ * What a headset says: commands, poses, control, the stop, on a socket of their own, in a worker.
+ *
+ * The scene tells with each of its frames what hands do, and when they did it; here it is decided whether that goes out.
+ * It does not when nobody holds on, the picture is old, the robot is stopped or has somebody else in control, the connection
+ * is not fresh, or the scene has not said anything for a while: a scene that hangs drives nothing.
+ */
+
+import { CommandClock } from "../macs-clock.js";
+import { Headset } from "../macs.js";
+import { Types } from "../ros.js";
+import { stamp } from "./axes.js";
+import { lockout } from "./freshness.js";
+import { Halt } from "./halt.js";
+import { Hold } from "./hold.js";
+import { POSE_TYPES, TWIST } from "./wire-types.js";
+
+const FOLLOW_MS = 1000;
+const SILENCE_MS = 3000;
+const RETRY_MS = [20, 50, 100, 200, 300, 500];
+const STATUS_MS = 500;
+/** Nothing goes to a gateway that has not answered for so long. */
+const FRESH_MS = 200;
+/** A gateway that is asked on entering XR, after sleep or in a new network, and has not answered by then, is reached anew. */
+const POKE_MS = 400;
+const ZEROS_MS = [40, 80];
+const AGAIN_MS = 500;
+const LEAST_TICK_MS = 5;
+const ROBOTS = 16;
+
+export class CommandLink {
+  #hold = new Hold();
+  #target = null;
+  #drive = null;
+  #poses = new Map();
+  #seen = new Map();
+  #settings = {};
+  #away = "";
+  #madeAt = 0;
+  #sentAt = -Infinity;
+  #status = new Map();
+  #owed = 0;
+  #timer = null;
+  #refusal = "";
+
+  /** `tell(message)` tells the scene; `me` is what this token may; `kept` a stop of the page before. */
+  constructor({ url, me, kept, tell }) {
+    this.tell = tell;
+    this.me = me;
+    this.types = new Types("");
+    this.headset = new Headset(url, { silenceMs: SILENCE_MS, retryMs: RETRY_MS });
+    this.clock = new CommandClock(this.headset);
+    this.halt = new Halt(this.headset, me, kept);
+    this.online = [];
+    this.#listen();
+    this.headset.keepConnecting();
+    this.headset.follow(FOLLOW_MS);
+    setInterval(() => this.#askStatus(), STATUS_MS);
+    setInterval(() => this.#report(), 250);
+  }
+
+  /** Ask the gateway now: the way to it may be another one. */
+  async poke() {
+    if (!this.headset.connected) return;
+    const answered = await this.headset.online({ timeoutMs: POKE_MS }).catch(() => null);
+    if (answered === null && this.headset.connected) this.headset.drop();
+  }
+
+  /** Whom commands are for: {robots, groups, topic, type}; null: nobody. */
+  aim(target) {
+    this.#letGo("another robot was chosen");
+    this.#drive?.node.close();
+    this.#drive = null;
+    this.#closePoses();
+    this.#status.clear();
+    this.#refusal = "";
+    this.#target = target && { ...target, robots: target.robots.slice(0, ROBOTS), groups: target.groups ?? [] };
+    this.clock.mean(target && this.me.may.includes("command") ? this.#target.robots : []);
+    this.#askStatus();
+    this.#judge();
+    if (target?.topic && this.me.may.includes("command")) this.#aimDrive();
+    this.#openPoses();
+  }
+
+  /** What somebody chose: {forward, turn, hz, lockoutS, poseHz, frame, …, head, left, right …} */
+  set(settings) {
+    const before = this.#settings;
+    this.#settings = settings;
+    if (Object.keys(POSE_TYPES).some((kind) => before[kind] !== settings[kind])) {
+      this.#closePoses();
+      this.#openPoses();
+    }
+    this.#judge();
+  }
+
+  /** A picture that driving depends on: how old it is is judged here; null: it is none any more. */
+  see(key, seen) {
+    if (seen === null) this.#seen.delete(key);
+    else this.#seen.set(key, seen);
+    this.#judge();
+  }
+
+  /** What hands do: {at, sample, poses}; `at` by this worker's clock. */
+  input({ at, sample, poses }) {
+    this.#madeAt = at;
+    this.#judge();
+    const was = this.#hold.held;
+    const began = this.#hold.input(sample, performance.now());
+    if (was && !this.#hold.held) this.#ended();
+    if (began) this.#owed = 0;
+    if (began) this.#tick();
+    else if (this.#hold.held && performance.now() - this.#sentAt >= 1000 / this.#settings.hz - 2) this.#tick();
+    if (poses) this.#sendPoses(poses, at);
+  }
+
+  /** Nobody looks or holds any more, and why; empty: somebody does again. */
+  setAway(why) {
+    this.#away = why;
+    this.#judge();
+  }
+
+  /** Ask for control, or give it: {action: "take" | "release" | "give", to}. */
+  async control(request) {
+    const { robots = [], topic } = this.#target ?? {};
+    for (const robot of robots) {
+      try {
+        const { done, reason } = await this.headset.ask(robot, "RobotControl", { ...request, topic });
+        if (!done) this.#say("control", reason || "the robot does not give control");
+      } catch (error) {
+        this.#say("control", error.message);
+      }
+    }
+    this.#askStatus();
+  }
+
+  stop() {
+    this.#letGo("a stop is pressed");
+    if (!this.halt.press()) this.#say("stop", "this token may not stop");
+  }
+
+  release() {
+    this.halt.release();
+  }
+
+  close() {
+    this.#letGo("the page was closed");
+    this.clock.close();
+    this.headset.close();
+  }
+
+  // -- driving -------------------------------------------------------------------------------------------------------
+
+  async #aimDrive() {
+    const { topic, type, robots, groups } = this.#target;
+    const drive = { topic, shape: TWIST[type], node: this.headset.advertise(topic, type, { robots, groups }), type: null };
+    this.#drive = drive;
+    try {
+      drive.type = await this.types.get(type, robots[0] ?? this.#target.seen);
+      drive.zero = drive.type.write(drive.shape({}, {}, 0));
+    } catch (error) {
+      this.#say("drive", error.message);
+    }
+    this.#judge();
+  }
+
+  /** Why nobody may drive now, in words; empty when he may. */
+  #judge() {
+    const now = performance.now();
+    const was = this.#hold.held;
+    const quiet = this.#quiet(now);
+    const holder = [...this.#status.values()].map((each) => each.holder).find((each) => each && each !== this.#own);
+    let why = quiet;
+    if (!why && !this.me.may.includes("command")) why = "this token may not drive";
+    else if (!why && !this.#drive) why = "the robot takes no velocities";
+    else if (!why && !this.#drive.zero) why = "the type of its commands is asked for";
+    else if (!why && holder) why = `${named(holder)} has control`;
+    this.#hold.bar(why);
+    if (was && !this.#hold.held) this.#ended();
+    clearTimeout(this.#timer);
+    if (this.#hold.held) this.#timer = setTimeout(() => this.#tick(), this.#untilNext(now));
+    if (why !== this.told) this.#report();
+    this.told = why;
+  }
+
+  /** Why nothing at all goes out. */
+  #quiet(now) {
+    if (this.#away) return this.#away;
+    if (!this.headset.connected) return "no connection";
+    if (!this.#target) return "no robot is chosen";
+    const { robots } = this.#target;
+    if (robots.length && !robots.some((robot) => this.online.includes(robot))) return "the robot is not online";
+    return this.halt.bars(robots) || this.#blind(now);
+  }
+
+  #blind(now) {
+    return lockout(this.#ages(now), (this.#settings.lockoutS ?? 0.3) * 1000);
+  }
+
+  #ages(now) {
+    return [...this.#seen.values()].map(({ at, late }) => (at === null ? null : now - at + late));
+  }
+
+  /** When there is something to do next: a command, or the picture gets too old. */
+  #untilNext(now) {
+    const next = 1000 / (this.#settings.hz ?? 30) - (now - this.#sentAt);
+    const ages = this.#ages(now).filter((age) => age !== null);
+    const old = ages.length && this.#settings.lockoutS > 0 ? this.#settings.lockoutS * 1000 - Math.max(...ages) + 1 : Infinity;
+    return Math.max(LEAST_TICK_MS, Math.min(next, old));
+  }
+
+  #tick() {
+    const now = performance.now();
+    const was = this.#hold.held;
+    const due = this.#hold.due(now);
+    if (was && due === null) this.#ended();
+    if (due === null || this.#blind(now)) return this.#judge();
+    if (now - this.#sentAt >= 1000 / this.#settings.hz - 2) this.#send(due, now);
+    this.#judge();
+  }
+
+  #send({ forward, turn }, now) {
+    const { type, shape, node } = this.#drive;
+    const linear = { x: forward * this.#settings.forward };
+    const angular = { z: turn * this.#settings.turn };
+    this.#sentAt = now;
+    const message = type.write(shape(linear, angular, performance.timeOrigin + this.#madeAt));
+    const { robots, groups } = this.#target;
+    if (node.publish(message, { robots, groups, freshMs: FRESH_MS, madeAt: this.#madeAt })) {
+      this.speed = { linear: linear.x, angular: angular.z };
+    } else {
+      this.#letGo("the connection is not fresh");
+    }
+  }
+
+  #letGo(why) {
+    const was = this.#hold.held;
+    this.#hold.release(why);
+    if (was) this.#ended();
+  }
+
+  /** A zero at once and twice more, and once again when the gateway is known to have taken it and the robot is there. */
+  #ended() {
+    const [drive, target] = [this.#drive, this.#target];
+    this.speed = { linear: 0, angular: 0 };
+    const zero = () => {
+      if (!this.#hold.held) drive?.node.publish(drive.zero, { robots: target.robots, groups: target.groups });
+    };
+    zero();
+    for (const ms of ZEROS_MS) setTimeout(zero, ms);
+    this.#owe(drive, target, zero);
+    this.#report();
+  }
+
+  async #owe(drive, target, zero) {
+    const debt = (this.#owed = this.#owed + 1);
+    while (this.#owed === debt && !this.#hold.held && this.#drive === drive) {
+      const there = await this.headset.online().catch(() => null);
+      if (this.#owed !== debt || this.#hold.held) return;
+      if (there && (!target.robots.length || target.robots.every((robot) => there.robots.includes(robot)))) return zero();
+      await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+    }
+  }
+
+  // -- poses ---------------------------------------------------------------------------------------------------------
+
+  #openPoses() {
+    if (!this.#target || !this.me.may.includes("command")) return;
+    const { robots, groups, seen } = this.#target;
+    for (const [kind, type] of Object.entries(POSE_TYPES)) {
+      const topic = this.#settings[kind];
+      if (!topic || this.#poses.has(kind)) continue;
+      const one = { node: this.headset.advertise(topic, type, { robots, groups }), type: null, sentAt: -Infinity };
+      this.#poses.set(kind, one);
+      this.types.get(type, robots[0] ?? seen).then(
+        (found) => (one.type = found),
+        (error) => this.#say("poses", error.message),
+      );
+    }
+  }
+
+  #closePoses() {
+    for (const { node } of this.#poses.values()) node.close();
+    this.#poses.clear();
+  }
+
+  #sendPoses(poses, at) {
+    if (!this.#poses.size || this.#quiet(performance.now())) return;
+    const header = { stamp: stamp(performance.timeOrigin + at), frame_id: this.#settings.frame };
+    for (const [kind, one] of this.#poses) {
+      const value = poses[kind];
+      if (!value || !one.type || at - one.sentAt < 1000 / this.#settings.poseHz - 3) continue;
+      one.sentAt = at;
+      const { robots, groups } = this.#target;
+      one.node.publish(one.type.write({ header, ...value }), { robots, groups, freshMs: FRESH_MS, madeAt: at });
+    }
+  }
+
+  // -- what is heard -------------------------------------------------------------------------------------------------
+
+  get #own() {
+    return `unity/${this.headset.id}`;
+  }
+
+  #listen() {
+    const { headset } = this;
+    headset.addEventListener("link", ({ detail: { up, id, why, resumed } }) => {
+      if (!up) this.#letGo("the connection is lost");
+      else if (this.#target) this.#askStatus();
+      this.tell({ op: "link", which: "commands", up, id, why, resumed });
+      this.#judge();
+    });
+    headset.addEventListener("presence", ({ detail: { robots } }) => this.#setOnline(robots));
+    headset.addEventListener("gone", ({ detail }) => {
+      const gone = detail.filter(({ type }) => type === 1).map(({ id }) => id);
+      this.#setOnline(this.online.filter((robot) => !gone.includes(robot)));
+    });
+    headset.addEventListener("refused", ({ detail: { robot, name, kind, reason } }) => {
+      const ours = name === this.#drive?.topic;
+      if (ours) {
+        this.#refusal = reason;
+        this.#letGo(`${kind}: ${reason}`);
+        this.#askStatus();
+      }
+      this.#say("refused", `${robot ? `robot ${robot}` : "the gateway"} refused ${name}: ${reason}`);
+    });
+    headset.addEventListener("access", ({ detail: { kind, reason } }) => this.tell({ op: "access", kind, reason }));
+    this.halt.addEventListener("change", () => {
+      this.#judge();
+      this.tell({ op: "stop", ...this.halt.words(headset.connected), kept: this.halt.kept, stopped: this.halt.stopped() });
+    });
+  }
+
+  #setOnline(robots) {
+    const came = robots.filter((robot) => !this.online.includes(robot));
+    this.online = robots;
+    for (const robot of came) this.types.forget(robot);
+    this.halt.setOnline(robots);
+    this.tell({ op: "presence", robots });
+    this.#judge();
+  }
+
+  /** Who has control, and whether it is stopped, as each robot says it itself. */
+  async #askStatus() {
+    const target = this.#target;
+    if (!target || !this.headset.connected || this.#away === "hidden") return;
+    for (const robot of target.robots.length ? target.robots : [target.seen].filter(Boolean)) {
+      const answer = await get(`/view/robots/${robot}/status`);
+      if (target !== this.#target) return;
+      if (!answer || answer.error) continue;
+      const node = answer.nodes?.find((each) => each.name === target.topic && (each.control || each.deadman));
+      this.#status.set(robot, {
+        holder: node?.control?.holder ?? null,
+        exclusive: Boolean(node?.control),
+        secondsLeft: node?.control?.seconds_left ?? 0,
+        deadmanS: node?.deadman?.silence_s ?? null,
+        drops: answer.drops ?? {},
+        registrants: node?.registrants ?? [],
+      });
+      this.halt.note(robot, answer.stopped === true);
+    }
+    this.#judge();
+  }
+
+  /** Other headsets that would command this robot: whom control can be given to. */
+  #candidates(status) {
+    const all = new Set(status.flatMap(({ registrants }) => registrants));
+    return [...all].filter((each) => each.startsWith("unity/") && each !== this.#own).map((each) => Number(each.slice(6)));
+  }
+
+  #say(kind, text) {
+    this.tell({ op: "event", kind, text });
+  }
+
+  /** What the scene shows. */
+  #report() {
+    const status = [...this.#status.values()];
+    const holder = status.map((each) => each.holder).find(Boolean) ?? null;
+    const clock = this.#target?.robots.map((robot) => this.clock.of(robot)).find((each) => each?.known);
+    this.tell({
+      op: "state",
+      id: this.headset.id,
+      connected: this.headset.connected,
+      roundTripMs: this.headset.roundTripMs,
+      held: this.#hold.held,
+      source: this.#hold.source,
+      barred: this.#hold.barred,
+      why: this.#hold.why,
+      blind: this.#blind(performance.now()),
+      speed: this.speed ?? { linear: 0, angular: 0 },
+      exclusive: status.some((each) => each.exclusive),
+      holder: holder && (holder === this.#own ? "you" : named(holder)),
+      candidates: this.#candidates(status),
+      secondsLeft: status[0]?.secondsLeft ?? 0,
+      deadmanS: status[0]?.deadmanS ?? null,
+      drops: status[0]?.drops ?? {},
+      maxAgeS: clock?.maxAgeS ?? null,
+      refusal: this.#refusal,
+      unsent: this.#drive?.node.unsent ?? 0,
+    });
+  }
+}
+
+/** `headset 7` for `unity/7`. */
+function named(agent) {
+  const [type, id] = agent.split("/");
+  return `${{ unity: "headset", ros: "robot" }[type] ?? type} ${id}`;
+}
+
+async function get(path) {
+  try {
+    const response = await fetch(path, { cache: "no-store" });
+    return response.ok ? await response.json() : null;
+  } catch {
+    return null;
+  }
+}

@@ -1,0 +1,151 @@
+/** What is known, told in words and colours: on the boards, below the pictures, and on the screen. */
+
+import { digits } from "../page/dom.js";
+import { quality, statusRows } from "./room.js";
+
+/** Before the worker of commands has said anything. */
+const NOTHING = {
+  connected: false,
+  roundTripMs: null,
+  held: false,
+  source: null,
+  barred: "nothing is known yet",
+  why: "",
+  blind: "",
+  speed: { linear: 0, angular: 0 },
+  exclusive: false,
+  holder: null,
+  candidates: [],
+  secondsLeft: 0,
+  deadmanS: null,
+  drops: {},
+  maxAgeS: null,
+};
+const REPEATED_MS = 5000;
+
+export class Telling {
+  constructor(scene) {
+    this.scene = scene;
+    this.state = NOTHING;
+    this.stop = { state: "free", text: "" };
+    this.battery = null;
+    this.texts = new Map();
+    this.last = { text: "", at: 0 };
+    const { links } = scene;
+    links.addEventListener("state", ({ detail }) => this.#take(detail));
+    links.addEventListener("stop", ({ detail }) => {
+      this.stop = detail;
+      this.tell();
+    });
+    links.addEventListener("event", ({ detail }) => this.event(detail.text));
+    links.addEventListener("link", ({ detail: { which, up, why, resumed } }) => {
+      this.event(up ? `${which}: connected${resumed ? " again, as the same headset" : ""}` : `${which}: connection lost (${why})`);
+    });
+  }
+
+  /** Of another robot nothing is known. */
+  clear() {
+    this.battery = null;
+    this.texts.clear();
+  }
+
+  /** Something happened, in words. */
+  event(text) {
+    const now = performance.now();
+    if (text === this.last.text && now - this.last.at < REPEATED_MS) return;
+    this.last = { text, at: now };
+    this.scene.overlay.tell(text);
+  }
+
+  setBattery({ percentage, voltage }) {
+    const part = Number.isFinite(percentage) ? `${Math.round(percentage * 100)} % · ` : "";
+    const tone = percentage > 0.4 ? "good" : percentage > 0.2 ? "warn" : "bad";
+    this.battery = { text: `${part}${digits(voltage)} V`, tone: Number.isFinite(percentage) ? tone : undefined };
+  }
+
+  setText(topic, lines) {
+    this.texts.set(topic, lines.map((line) => `${topic.split("/").pop()}: ${line}`));
+  }
+
+  /** All of it, as it is now. */
+  tell() {
+    const { scene, state, stop } = this;
+    const now = performance.now();
+    scene.room.tellPictures(scene.links.rates, scene.wishes, state.blind, now);
+    scene.overlay.setState(state, scene.sample ?? {});
+    scene.overlay.setStop(stop, scene.sure);
+    this.#tellStatus(now);
+    this.#tellMenu();
+  }
+
+  #take(state) {
+    const changed = state.barred !== this.state.barred || state.held !== this.state.held || state.holder !== this.state.holder;
+    this.state = state;
+    if (changed) this.tell();
+  }
+
+  #tellStatus(now) {
+    const { scene, state, stop } = this;
+    const limits = [
+      state.deadmanS ? `dead-man ${state.deadmanS} s` : "",
+      state.maxAgeS ? `commands at most ${state.maxAgeS} s old` : "",
+    ].filter(Boolean);
+    const values = [...(limits.length ? [limits.join(" · ")] : []), ...[...this.texts.values()].flat()];
+    const rows = { state, stop, battery: this.battery, picture: this.#picture(now), event: this.last.text, values };
+    scene.room.status.set({
+      title: scene.target?.label ?? "No robot is online",
+      badge: badge(state),
+      rows: statusRows(rows),
+      buttons: [],
+    });
+  }
+
+  /** How old the picture is that driving depends on. */
+  #picture(now) {
+    const { links, wishes } = this.scene;
+    if (!links.sightUp.connected) return { text: "connection lost", tone: "bad" };
+    const rate = links.rates.get(wishes.find(({ guards }) => guards)?.key);
+    if (!rate) return { text: "none chosen", tone: "muted" };
+    const age = rate.pictureAgeMs === null ? null : rate.pictureAgeMs + now - rate.at;
+    const [text, tone] = age === null ? ["none yet", "bad"] : quality(age, 150, 300);
+    return { text: `${digits(rate.hz)} Hz · ${text} old · ${digits(rate.bytesPerS / 1000)} kB/s`, tone };
+  }
+
+  #tellMenu() {
+    const { scene, stop } = this;
+    const { settings } = scene;
+    const off = !scene.me.may.includes("stop");
+    const release = stop.state === "free" ? [] : [{ id: "release", label: scene.sure ? "Sure?" : "Release", off }];
+    scene.room.menu.set({
+      title: "Menu",
+      rows: [],
+      buttons: [
+        [{ id: "before", label: "‹ Robot" }, { id: "after", label: "Robot ›" }],
+        this.#control(),
+        [{ id: "smaller", label: "World −" }, { id: "larger", label: "World +" }, { id: "arrange", label: "Arrange" }],
+        [
+          { id: "flat", label: "Curve", on: settings.get("curve") > 0 },
+          { id: "hand", label: `Pinch: ${settings.get("hand")}` },
+          { id: "leave", label: "Leave", off: !scene.immersion.session },
+        ],
+        [{ id: "stop", label: "STOP", tone: "stop", off }, ...release],
+      ],
+    });
+  }
+
+  #control() {
+    const { exclusive, holder, candidates } = this.state;
+    if (holder !== "you") return [{ id: "take", label: "Take control", off: !exclusive || holder !== null }];
+    const [other] = candidates;
+    return [
+      { id: "back", label: "Give back" },
+      { id: "give", label: other === undefined ? "Give" : `Give to ${other}`, off: other === undefined },
+    ];
+  }
+}
+
+function badge({ connected, held, barred }) {
+  if (!connected) return { text: "no connection", tone: "bad" };
+  if (held) return { text: "driving", tone: "good" };
+  return barred ? { text: "not driving", tone: "warn" } : { text: "ready", tone: "accent" };
+}
