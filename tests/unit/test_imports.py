@@ -8,7 +8,8 @@ import importlib.util
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -60,10 +61,21 @@ INPUT_OUTPUT = {
 }
 
 
-def imported(path: Path) -> Iterator[tuple[str, bool]]:
+@cache
+def parsed(path: Path) -> ast.Module:
+    """A file is parsed once for all rules."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
+def imported(path: Path) -> frozenset[tuple[str, bool]]:
     """The modules that a file imports, absolute, each with whether it is imported when the file is."""
+    return frozenset(_imported(path))
+
+
+def _imported(path: Path) -> Iterator[tuple[str, bool]]:
     package = path.relative_to(ROOT).with_suffix("").parts[:-1]
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = parsed(path)
     later = {id(node) for scope in ast.walk(tree) if runs_later(scope) for node in ast.walk(scope)}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -85,6 +97,16 @@ def runs_later(scope: ast.AST) -> bool:
     return isinstance(scope, ast.FunctionDef | ast.AsyncFunctionDef)
 
 
+def short(path: Path) -> str:
+    """A file's name, as it is told."""
+    return str(path.relative_to(ROOT))
+
+
+def those(wrong: Iterable[tuple[Path, set[str]]]) -> dict[str, set[str]]:
+    """Files with what is wrong in them, where anything is."""
+    return {short(path): names for path, names in wrong if names}
+
+
 def roots(path: Path) -> set[str]:
     """The top-level packages that a file imports anywhere."""
     return {name.partition(".")[0] for name, _ in imported(path)}
@@ -97,43 +119,40 @@ def test_there_is_something_to_walk() -> None:
     assert BRIDGE
 
 
-@pytest.mark.parametrize("path", CORE, ids=lambda path: path.name)
-def test_the_core_imports_no_input_or_output(path: Path) -> None:
+def test_the_core_imports_no_input_or_output() -> None:
     """In macs_zenoh: no bridge, no ROS, no sockets; asyncio and zenoh only where they are said to be."""
-    used = {name.partition(".")[0] for name, at_once in imported(path) if at_once or path != OFFERED}
-    assert not used & INPUT_OUTPUT
-    assert "zenoh" not in used or path in WITH_ZENOH
-    assert "asyncio" not in used or path in WITH_ASYNCIO
+    used = {
+        path: {name.partition(".")[0] for name, at_once in imported(path) if at_once or path != OFFERED}
+        for path in CORE
+    }
+    assert those((path, names & INPUT_OUTPUT) for path, names in used.items()) == {}
+    assert those((path, names & {"zenoh"}) for path, names in used.items() if path not in WITH_ZENOH) == {}
+    assert those((path, names & {"asyncio"}) for path, names in used.items() if path not in WITH_ASYNCIO) == {}
 
 
-@pytest.mark.parametrize("path", CORE, ids=lambda path: path.name)
-def test_the_core_needs_only_what_it_declares(path: Path) -> None:
+def test_the_core_needs_only_what_it_declares() -> None:
     """Everything macs_zenoh imports is the standard library, itself or a declared dependency."""
-    offered = {"bridge"} if path == OFFERED else set()
-    assert roots(path) <= sys.stdlib_module_names | {"tomllib"} | NEEDED_FROM_OUTSIDE | {"macs_zenoh"} | offered
+    known = sys.stdlib_module_names | {"tomllib"} | NEEDED_FROM_OUTSIDE | {"macs_zenoh"}
+    assert those((path, roots(path) - known - ({"bridge"} if path == OFFERED else set())) for path in CORE) == {}
 
 
-@pytest.mark.parametrize(
-    "path", [p for p in CORE if p not in WITH_ASYNCIO and p.name != "__init__.py"], ids=lambda p: p.name
-)
-def test_pure_modules_do_not_reach_back(path: Path) -> None:
+def test_pure_modules_do_not_reach_back() -> None:
     """A pure module never imports the mesh or the agent API."""
-    assert not {name for name, _ in imported(path)} & {"macs_zenoh.mesh", "macs_zenoh.agent"}
+    pure = [path for path in CORE if path not in WITH_ASYNCIO and path.name != "__init__.py"]
+    upwards = {"macs_zenoh.mesh", "macs_zenoh.agent"}
+    assert those((path, {name for name, _ in imported(path)} & upwards) for path in pure) == {}
 
 
-@pytest.mark.parametrize("path", BRIDGE, ids=lambda path: str(path.relative_to(ROOT)))
-def test_the_bridge_does_not_import_tests_or_zenoh(path: Path) -> None:
+def test_the_bridge_does_not_import_tests_or_zenoh() -> None:
     """The bridge reaches Zenoh through macs_zenoh only, ROS only in the robot's packages, and never tests."""
-    used = roots(path)
-    assert not used & {"tests", "zenoh"}
-    if path.parent.name not in {"ros", "awareness"}:
-        assert "rclpy" not in used
+    assert those((path, roots(path) & {"tests", "zenoh"}) for path in BRIDGE) == {}
+    without_ros = [path for path in BRIDGE if path.parent.name not in {"ros", "awareness"}]
+    assert those((path, roots(path) & {"rclpy"}) for path in without_ros) == {}
 
 
-@pytest.mark.parametrize("path", [p for p in BRIDGE if p.parent.name == "cli"], ids=lambda path: path.name)
-def test_help_is_instant(path: Path) -> None:
+def test_help_is_instant() -> None:
     """A CLI module imports what is heavy inside its functions, not when it is loaded."""
-    heavy = (
+    ours = (
         "macs_zenoh.mesh",
         "macs_zenoh.agent",
         "macs_zenoh.join",
@@ -141,16 +160,23 @@ def test_help_is_instant(path: Path) -> None:
         "bridge.gateway",
         "bridge.headset",
     )
-    at_once = {name for name, when_loaded in imported(path) if when_loaded}
-    assert not {name for name in at_once if name.startswith(heavy) or name.partition(".")[0] in HEAVY}
+    verbs = [path for path in BRIDGE if path.parent.name == "cli"]
+    at_once = {path: {name for name, when_loaded in imported(path) if when_loaded} for path in verbs}
+    assert len(verbs) > 20
+    heavy = {
+        path: {name for name in names if name.startswith(ours) or name.partition(".")[0] in HEAVY}
+        for path, names in at_once.items()
+    }
+    assert those(heavy.items()) == {}
 
 
-@pytest.mark.parametrize("path", PURE, ids=lambda path: path.name)
-def test_the_protocol_stands_alone(path: Path) -> None:
+def test_the_protocol_stands_alone() -> None:
     """What decides without input or output needs nothing but itself and the pure modules beside it."""
-    ours = {name for name, _ in imported(path) if name.startswith("macs_zenoh.")}
     allowed = tuple(f"macs_zenoh.{name}" for name in ("protocol", "errors", "plain", "config", "sections", "versions"))
-    assert not {name for name in ours if not name.startswith(allowed)}
+    ours = {path: {name for name, _ in imported(path) if name.startswith("macs_zenoh.")} for path in PURE}
+    assert (
+        those((path, {name for name in names if not name.startswith(allowed)}) for path, names in ours.items()) == {}
+    )
 
 
 HEAVY = {"zenoh", "rosbags", "rich", "argcomplete"}
@@ -158,27 +184,31 @@ KEY = re.compile(r"/?(macs/|@/|@adv\b)|\*\*/$")
 ENDPOINT = re.compile(r"(tcp|tls|quic|ws)/$")
 
 
-@pytest.mark.parametrize("path", [*CORE, *BRIDGE], ids=lambda path: str(path.relative_to(ROOT)))
-def test_one_module_spells_keys_and_one_endpoints(path: Path) -> None:
+def test_one_module_spells_keys_and_one_endpoints() -> None:
     """No other text in the code begins as a key of the mesh or of Zenoh, or puts an endpoint together."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    documents = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    texts = [
-        node.value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documents
-    ]
-    if path.name != "keyexpr.py":
-        assert [text for text in texts if KEY.match(text) and " " not in text] == []
-    if path.name != "endpoints.py":
-        made = [part for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values[:1]]
-        assert [p.value for p in made if isinstance(p, ast.Constant) and ENDPOINT.fullmatch(str(p.value))] == []
+    keys, endpoints = {}, {}
+    for path in (*CORE, *BRIDGE):
+        nodes = list(ast.walk(parsed(path)))
+        documents = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        texts = {
+            node.value
+            for node in nodes
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documents
+        }
+        if path.name != "keyexpr.py":
+            keys[path] = {text for text in texts if KEY.match(text) and " " not in text}
+        if path.name != "endpoints.py":
+            made = [part for node in nodes if isinstance(node, ast.JoinedStr) for part in node.values[:1]]
+            begin = {str(part.value) for part in made if isinstance(part, ast.Constant)}
+            endpoints[path] = {text for text in begin if ENDPOINT.fullmatch(text)}
+    assert those(keys.items()) == {}
+    assert those(endpoints.items()) == {}
 
 
 def test_the_oldest_python_can_load_it() -> None:
     """No class is a named tuple and something else as well, such as generic: Python 3.10 refuses to load that."""
     for path in (*CORE, *BRIDGE):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.ClassDef) and len(node.bases) > 1:
                 assert "NamedTuple" not in {ast.unparse(base) for base in node.bases}, f"{path.name}: {node.name}"
 
@@ -206,7 +236,7 @@ def test_every_error_can_be_caught() -> None:
 
 def test_what_is_listed_is_what_the_type_checker_sees() -> None:
     """Each public name is imported for the type checker, from where it is loaded."""
-    tree = ast.parse(OFFERED.read_text(encoding="utf-8"))
+    tree = parsed(OFFERED)
     seen = {
         alias.name: f"{'macs_zenoh.' if node.level else ''}{node.module}"
         for scope in ast.walk(tree)
@@ -246,15 +276,14 @@ def test_tests_and_benchmarks_name_what_exists() -> None:
 def test_tests_import_each_other_by_full_names() -> None:
     """As ``tests.ros.driven``: a name without its folder is found in none of the ways in which tests are run, and a
     module that is imported by two names exists twice."""
-    short = {path.stem for path in (ROOT / "tests").rglob("*.py")} - sys.stdlib_module_names
-    used = {(path, name) for path in (ROOT / "tests").rglob("*.py") for name in roots(path) & short}
+    alone = {path.stem for path in (ROOT / "tests").rglob("*.py")} - sys.stdlib_module_names
+    used = {(path, name) for path in (ROOT / "tests").rglob("*.py") for name in roots(path) & alone}
     assert sorted(f"{path.relative_to(ROOT)} imports {name}" for path, name in used) == []
 
 
 def nowhere(path: Path) -> Iterator[tuple[int, str]]:
     """Names of ours in a file that do not exist, with their lines. What needs ROS is looked at where ROS is."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    nodes = list(ast.walk(tree))
+    nodes = list(ast.walk(parsed(path)))
     modules: dict[str, ModuleType] = {}
     for node in nodes:
         if not isinstance(node, ast.ImportFrom) or node.level or not (node.module or "").startswith(OURS):
