@@ -315,7 +315,8 @@ class Agent:
             timeout_s: how long the robots may take to answer.
 
         It holds for robots that come later or come back as well. Several subscriptions of one topic share what goes
-        over the mesh; what a latched topic holds comes to the first of them only.
+        over the mesh. What a latched topic holds comes to each of them: to later ones what the first have had, up to
+        ``depth`` messages.
 
         Raises Refused with the robot's reason when none of those online lets it, CallTimeout, Unreachable when no
         robot tells its type, UsageError, Closed.

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from msgspec import structs
 
 from .errors import CallTimeout, Closed, MacsError, Refused, Unreachable, UsageError, WireError
+from .held import Held, latches
 from .mesh import Sample
 from .mesh import Subscription as Declared
 from .protocol.directory import Change
@@ -128,7 +129,11 @@ class Nodes:
             raise UsageError("a depth of at least 1 message is needed")
         robots, groups = chosen(robot, group)
         node = await self._node(NodeType.SUBSCRIBER, topic, of_type, robots, groups, timeout_s)
-        return await self._use(TopicSubscription(self, node, robots, groups, depth), node, timeout_s, depth)
+        latching = await self._latching(node, self._online(robots, groups), timeout_s)
+        subscription = TopicSubscription(self, node, robots, groups, depth)
+        for each in latching & node.held.keys():  # from here on it hears what comes
+            self._give(subscription, node.held[each].newest(depth))
+        return await self._use(subscription, node, timeout_s, depth)
 
     async def advertise(
         self, topic: str, robot: Chosen, group: Chosen, of_type: str | None, timeout_s: float
@@ -272,6 +277,13 @@ class Nodes:
                 raise answer
         return type_behind(topic, kind, told)
 
+    async def _latching(self, node: Node, robots: Collection[int], timeout_s: float) -> set[int]:
+        """Those robots whose topic holds messages for late ones, of which others here have had them."""
+        asked = [robot for robot in robots if robot in node.held]
+        asking = [self.agent.call(ROS, robot, "offers", timeout_s=timeout_s) for robot in asked]
+        answers = zip(asked, await asyncio.gather(*asking, return_exceptions=True), strict=True)
+        return {robot for robot, answer in answers if isinstance(answer, bytes) and latches(answer, node.topic)}
+
     def means(self, user: NodeUser, robot: int) -> bool:
         """Whether a robot is one of those that a user named, by its id or its group."""
         if robot in user.robots:
@@ -331,6 +343,7 @@ class Nodes:
         node.users.remove(user)
         if not node.users:
             self._nodes.pop(node.key, None)
+            node.held.clear()
         gone = sorted(user.robots - node.robots), sorted(user.groups - node.groups)
         if not self._closed and any(gone):
             self._calls.register(RemoveNode(*self.agent.key, *node.key), *gone)
@@ -345,6 +358,8 @@ class Nodes:
             if registrants is None:
                 if (stream := self._streams.pop((robot, name), None)) is not None:
                     stream.close()
+                if (node := self._nodes.get((NodeType.SUBSCRIBER, name))) is not None:
+                    node.held.pop(robot, None)
             elif (robot, name) not in self._streams:
                 key = STREAM.of(type=ROS, id=robot, node=name)
                 take = partial(self._take_data, robot, name)
@@ -358,9 +373,18 @@ class Nodes:
                 continue
             of_type, now = node.wanted.data_exchange_type, time.monotonic()
             messages = [TopicMessage(robot, node.topic, of_type, cdr, self.types, now) for cdr in data]
+            self._hold(node, robot, messages)
             for user in list(node.users):
                 if self.means(user, robot):
                     self._give(user, messages)
+
+    def _hold(self, node: Node, robot: int, messages: Iterable[TopicMessage]) -> None:
+        """For subscriptions that come later."""
+        held = node.held.get(robot)
+        if held is None:
+            held = node.held[robot] = Held()
+        for message in messages:
+            held.put(message, node.wanted.buffer_size)
 
     def _give(self, user: NodeUser, messages: Iterable[TopicMessage]) -> None:
         assert isinstance(user, TopicSubscription)
@@ -435,6 +459,7 @@ class Nodes:
             for node in self._nodes.values():
                 node.confirmed.discard(change.agent.id)
                 node.refused.pop(change.agent.id, None)
+                node.held.pop(change.agent.id, None)  # it gives anew what it holds
                 node.changed.set()
             if not change.online:
                 for (robot, _, _), answer in self._open.items():

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
 from .errors import Closed, OutOfRange, UsageError
 from .handles import Callbacks, Handle
+from .held import Held
 from .protocol.messages import ROS, AddNode, Metadata, NodeType
 from .protocol.offers import short_type
 from .protocol.registrations import NodeKey
@@ -74,6 +75,8 @@ class Node:
     refused: dict[int, str] = field(default_factory=dict)
     """Robots that refused it, and why; 0 for all of them."""
     changed: asyncio.Event = field(default_factory=asyncio.Event)
+    held: dict[int, Held[TopicMessage]] = field(default_factory=dict)
+    """By robot, for subscriptions that come later."""
 
     @property
     def topic(self) -> str:

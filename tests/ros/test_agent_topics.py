@@ -10,7 +10,6 @@ from contextlib import AsyncExitStack
 
 import pytest
 from geometry_msgs.msg import Twist
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
@@ -299,15 +298,6 @@ async def test_who_reads_slowly_loses_the_oldest_and_it_is_counted(agent: Agent,
     assert slow.dropped == agent.drops["topic_full"] > 0
     assert [str((await heard(slow)).value["data"]) for _ in range(3)] == ["3", "4", "5"]
     assert quick.dropped == 0
-
-
-async def test_a_held_message_comes_to_the_first_consumer(agent: Agent, peer: Peer) -> None:
-    """Of a latched topic, who subscribes first gets what was published before."""
-    qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    publisher = await peer.publisher(String, "/map", qos)
-    await peer.session.run(lambda: publisher.publish(String(data="the map")))
-    latched = await agent.subscribe("/map", robot=ROBOT, type="std_msgs/String")
-    assert (await heard(latched)).value == {"data": "the map"}
 
 
 async def test_all_ends_with_the_agent(router: str, robot: RobotAgent, peer: Peer) -> None:
