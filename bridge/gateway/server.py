@@ -15,43 +15,23 @@ from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 
-from msgspec import structs
-
-from bridge.audit import NO_AUDIT, Audit, open_audit, who
 from bridge.listening import for_others
 from bridge.settings import GatewaySettings
 from bridge.tokens.store import path_of
-from macs_zenoh.errors import Refused, UsageError
+from macs_zenoh.errors import UsageError
 from macs_zenoh.losses import Losses
-from macs_zenoh.managers import Asker, Managers
-from macs_zenoh.mesh import AtOnce, Mesh, OnBatch, Subscription
+from macs_zenoh.managers import Managers
+from macs_zenoh.mesh import Mesh
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.addresses import joined
-from macs_zenoh.protocol.budget import Budget
 from macs_zenoh.protocol.credit import Credit, Credits
 from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.directory import AgentInfo, Change
-from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, STREAM, UNICAST, type_name
-from macs_zenoh.protocol.limits import (
-    NAMED_EACH,
-    NAMED_IN_ALL,
-    NAMED_PER_ADDRESS,
-    NODES_EACH,
-    NODES_IN_ALL,
-    NODES_PER_ADDRESS,
-)
+from macs_zenoh.protocol.keyexpr import BROADCAST, STREAM, UNICAST
 from macs_zenoh.protocol.messages import (
     ROS,
     UNITY,
     AccessRefused,
-    AddNode,
-    DataRefused,
-    Metadata,
-    NodeRefused,
-    NodeType,
-    Refusal,
-    RemoveNode,
-    encode_data,
 )
 from macs_zenoh.protocol.ping import GatewayAgent, encode_told
 from macs_zenoh.protocol.rate_limit import TOGETHER, Pace
@@ -78,37 +58,37 @@ from macs_zenoh.protocol.tcp_agent import (
 )
 from macs_zenoh.protocol.trace import SOCKET
 from macs_zenoh.protocol.wire import Layout
-from macs_zenoh.registration_calls import RobotCalls, StreamChanges
+from macs_zenoh.registration_calls import StreamChanges
 from macs_zenoh.timeouts import within
 
-from .admission import Admission, Churn
-from .agents import Agents, Group
+from .agents import Agents
 from .connection import Connection
 from .declarations import AgentDeclarations
 from .delivery import Delivery, Stream
-from .departures import PIECE_S, Departures, Pieces
+from .departures import Departures, Pieces
 from .door import Door, Entrance, entrances
+from .entry import Entry
 from .forwarding import Forwarding
+from .groups import Groups
 from .judged import JudgedFrames
 from .leases import Leases
 from .listeners import Listeners
+from .managing import Managing
 from .memory import Memory
+from .node_registry import NodeRegistry
+from .record import Record
+from .refusing import Refusing
 from .renumbering import Renumbering
 from .robot_ids import RobotIds
 from .roll import Roll
 from .sleepers import Sleepers
 from .stead import Stead
-from .waiting import NAMED_S, WaitingRoom
+from .subscriptions import Subscriptions
+from .waiting import NAMED_S
 
 log = logging.getLogger("macs.gateway")
 
 FLUSH_S = 1.0
-
-CALM_S = 0.25
-"""So long after one change of its group an agent's next one is seen by others."""
-
-OVERLAP_S = 0.1
-"""How long an agent is seen in its former group as well: in no moment it seems to be gone."""
 
 NO_MANAGERS: Managers = {}
 
@@ -118,8 +98,7 @@ class Gateway:
 
     def __init__(self, mesh: Mesh, settings: GatewaySettings, managers: Managers = NO_MANAGERS) -> None:
         self.mesh = mesh
-        self._managers = managers
-        self._custom = {name: manager.Data for name, manager in managers.items()}
+        self._managing = Managing(managers)
         self._all_closed = asyncio.Event()
         self.settings = settings
         self.port = 0
@@ -134,12 +113,6 @@ class Gateway:
             frames_per_s=settings.max_frames_per_s,
         )
         self._scratch = bytearray(FrameDecoder.SPACE_BYTES)  # sockets of one loop receive one after the other
-        self._admission = Admission(
-            settings.allow, settings.max_connections, settings.max_connections_per_address, settings.groups
-        )
-        self._nodes = Budget("interface nodes", each=NODES_EACH, per_address=NODES_PER_ADDRESS, total=NODES_IN_ALL)
-        named = "robots and groups named in registrations"
-        self._named = Budget(named, each=NAMED_EACH, per_address=NAMED_PER_ADDRESS, total=NAMED_IN_ALL)
         self._credits: Credits[str] = Credits(settings.max_frames_per_s)
         self._memory = Memory(settings.outbox_bytes, settings.max_frame_bytes)
         self._numbers = 0
@@ -147,59 +120,61 @@ class Gateway:
         """Of connections that have ended."""
         self._requests = Credit(TOGETHER * settings.max_requests_per_s, time.monotonic())
         """Of all who send robots much."""
-        self._churn = Churn()
-        self._coming: dict[Connection, asyncio.TimerHandle] = {}
-        """Who is not greeted yet, since many from there have come and gone."""
-        self._greeting: asyncio.Handle | None = None
         self._leaving = Pieces(self._has_closed)
         self._departures = Departures(self.agents.online, lambda gone: self._roll.telling(gone))
-        self._waiting = WaitingRoom(settings.handshake_timeout_s, self._no_id)
-        self._subscriptions: dict[str, Subscription] = {}
+        self._subscriptions = Subscriptions(mesh)
+        self._record = record = Record(self._drops)
         self._door = Door(
             path_of(settings.tokens_file),
             on_changed=self._rights_changed,
-            on_ended=self._token_ended,
+            on_ended=lambda connection: self._refusing.ended(connection),
             on_look=lambda: self.listeners.look(),
-            on_file=lambda event, name: self._audit.record(event, who(token=name)),
+            on_file=record.token,
         )
         self.listeners = Listeners(settings, entrances(settings), self._door, self._connection, self._drops, self)
         self.directory = self._presence.directory
         """Who is online."""
         self._robot_ids = RobotIds(settings.robots)
-        self._audit: Audit = NO_AUDIT
+        self._refusing = Refusing(self._door, record)
         stead = Stead(mesh, self._layout)
         judged = JudgedFrames()
         self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged)
         self._delivery = Delivery(self.agents, self.directory, self._layout, stead, judged, forwarding.afar)
         self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
         self._roll = Roll(self._presence, self.agents)
+        self._groups = Groups(self.agents, self._presence, self._subscriptions, self._delivery, self._roll)
         self._sleepers = Sleepers(
-            settings.resume_s,
-            self.agents,
-            self._presence,
-            on_asleep=self._falls_asleep,
-            note=lambda event, connection: self._audit.record(event, _who(connection)),
+            settings.resume_s, self.agents, self._presence, on_asleep=self._falls_asleep, note=record.agent
         )
         self._leases = Leases(
             mesh,
             settings.block,
             settings.blocks,
             on_block=self._block_leased,
-            on_ids=self._greet_waiting,
+            on_ids=lambda: self._entry.greet_waiting(),
             on_lost=lambda block: self._renumbering.block_lost(block),
         )
-        self._robots = RobotCalls(
-            mesh, self.directory, self._layout, on_streams=self._streams_wanted, on_refused=self._tell_refusal
+        self._entry = Entry(
+            settings, self._leases, self._drops, record, is_taken=self._is_not_for_headsets, on_id=self._greet
+        )
+        self._registry = NodeRegistry(
+            mesh,
+            self.directory,
+            self._layout,
+            self.agents,
+            record,
+            on_streams=self._streams_wanted,
+            tell=settings.tell_refusals,
         )
         self._renumbering = Renumbering(
             mesh.zid,
             self._presence,
             self.agents,
             self._leases,
-            self._robots,
+            self._registry.robots,
             self._declarations,
             on_change=self._id_changes,
-            on_block_left=lambda block: self._unsubscribe(UNICAST.every(type=UNITY, block=block)),
+            on_block_left=lambda block: self._subscriptions.remove(UNICAST.every(type=UNITY, block=block)),
         )
 
     @property
@@ -217,9 +192,9 @@ class Gateway:
         return [
             ("macs_outbox_bytes", "bytes that wait for agents that read slowly", self._memory.waiting.used),
             ("macs_unfinished_bytes", "bytes of frames that have begun", self._memory.unfinished.used),
-            ("macs_registered_nodes", "interface nodes that agents have registered", self._nodes.used),
+            ("macs_registered_nodes", "interface nodes that agents have registered", self._registry.nodes.used),
             ("macs_streams", "topics of robots that somebody here receives", len(self._delivery.streams)),
-            ("macs_waiting_connections", "connections that wait for an id", len(self._waiting) + len(self._coming)),
+            ("macs_waiting_connections", "connections that wait for an id", len(self._entry)),
         ]
 
     def carried(self) -> tuple[int, int]:
@@ -235,18 +210,14 @@ class Gateway:
 
         Raises ConfigError when the block is somebody else's, Unreachable when the port cannot be had.
         """
-        settings = self.settings
-        name = f"gateway {joined(for_others(settings.host), settings.port)}"
-        self._audit = open_audit(
-            settings.audit_file, name, settings.audit_max_bytes, settings.audit_files, self._audit_lost
-        )
+        self._record.open(self.settings, f"gateway {joined(for_others(self.settings.host), self.settings.port)}")
         self.mesh.tells, self.mesh.away, self.mesh.told = self._now, self._away, self._told
         await self._presence.start()
-        self.mesh.on_link(lambda up: self._robots.repeat_all() if up else None)
+        self.mesh.on_link(lambda up: self._registry.robots.repeat_all() if up else None)
         await self._leases.take()
-        self._subscribe(BROADCAST.every(), self._delivery.broadcast)
-        self._subscriptions["ping"] = self.mesh.answer_pings()
-        self._subscriptions["slow"] = self._forwarding.afar.listen()
+        self._subscriptions.add(BROADCAST.every(), self._delivery.broadcast)
+        self._subscriptions.keep(self.mesh.answer_pings())
+        self._subscriptions.keep(self._forwarding.afar.listen())
         await self.listeners.open()
         self.port = self.listeners.port
         self._door.start()
@@ -278,11 +249,8 @@ class Gateway:
 
     def _now(self) -> dict[str, int]:
         """What `macs doctor` is told besides losses."""
-        waiting = {"waiting_for_id": len(self._waiting)} if self._waiting.longest_s > NAMED_S else {}
-        return {**waiting, **self._audit.troubles()}
-
-    def _audit_lost(self, count: int) -> None:
-        self._drops.once("audit_lost", "the record of who did what is not whole", count=count, level=logging.ERROR)
+        waiting = {"waiting_for_id": self._entry.waiting} if self._entry.longest_s > NAMED_S else {}
+        return {**waiting, **self._record.troubles()}
 
     async def close(self) -> None:
         """Stop accepting, tell the mesh, send what waits for ``FLUSH_S`` at most, leave."""
@@ -290,13 +258,13 @@ class Gateway:
         self._sleepers.close()
         self._door.close()
         self._renumbering.close()
-        self._robots.close()
-        connections = [*self.agents.connections(), *self._waiting, *self._coming]
-        self._waiting.close()
+        self._registry.robots.close()
+        connections = [*self.agents.connections(), *self._entry]
+        self._entry.close()
         if connections:
             for connection in connections:
                 if connection.greeted and connection.peer.extensions:
-                    self._tell_access(connection, AccessRefused("stops", "the gateway stops"))
+                    self._refusing.tell(connection, AccessRefused("stops", "the gateway stops"))
                 connection.finish("the gateway stops")
             with suppress(asyncio.TimeoutError):
                 await within(self._all_closed.wait(), FLUSH_S)
@@ -309,88 +277,44 @@ class Gateway:
         self._leases.close()
         self._declarations.close()
         self._presence.close()
-        for subscription in self._subscriptions.values():
-            subscription.close()
-        await asyncio.to_thread(self._audit.close)
+        self._subscriptions.close()
+        await asyncio.to_thread(self._record.close)
         if self.drops:
             log.info("lost in all: %s", ", ".join(f"{name} {count}" for name, count in sorted(self.drops.items())))
 
     # -- connections ---------------------------------------------------------------------------------------------
 
     def _connection(self, entrance: Entrance) -> Connection:
-        settings = self.settings
-        return Connection(
-            self,
-            entrance,
-            memory=self._memory,
-            outbox_bytes=settings.outbox_bytes,
-            write_timeout_s=settings.write_timeout_s,
-        )
+        bytes_, timeout_s = self.settings.outbox_bytes, self.settings.write_timeout_s
+        return Connection(self, entrance, memory=self._memory, outbox_bytes=bytes_, write_timeout_s=timeout_s)
 
     def opened(self, connection: Connection) -> bool:
         """Let a connection in, or not. It is greeted at once, or as soon as there is an id for it."""
-        connection.stranger = connection.entrance.wants_token(connection.host)
-        refusal = self._admission.judge(connection.host, stranger=connection.stranger)
-        if refusal is not None:
-            name, why = refusal
-            self._drops.once(name, "%s is refused: %s", connection.address, why)
-            self._audit.record("refused", who(address=connection.address), name, why)
-            return False
-        self._admission.enter(connection.host, stranger=connection.stranger)
-        wait_s = self._churn.wait_s(connection.host, time.monotonic())
-        if wait_s:
-            self._drops.once("coming_and_going", "%s waits: many from there have just left", connection.address)
-            timer = asyncio.get_running_loop().call_later(wait_s, self._let_in, connection)
-            self._coming[connection] = timer
-        else:
-            self._let_in(connection)
-        return True
+        return self._entry.let_in(connection)
 
-    def _let_in(self, connection: Connection) -> None:
-        self._coming.pop(connection, None)
-        self._waiting.enter(connection)
-        self._greet_waiting()
-
-    def _greet_waiting(self) -> None:
-        """Give waiting connections ids of our blocks that no agent of any type has, in pieces."""
-        if self._greeting is None:
-            self._greet_some()
-
-    def _greet_some(self) -> None:
-        self._greeting = None
-        until = time.monotonic() + PIECE_S
-        while self._waiting:
-            if time.monotonic() > until:
-                self._greeting = asyncio.get_running_loop().call_soon(self._greet_some)
-                return
-            agent_id = self._leases.take_id(self._is_not_for_headsets, wanting=len(self._waiting))
-            if agent_id is None:
-                if self._leases.exhausted:
-                    for connection in self._waiting:
-                        self._no_id(connection)
-                return
-            connection = self._waiting.next()
-            self._numbers += 1
-            now = time.monotonic()
-            peer = TcpAgent(
-                agent_id,
-                self._numbers,
-                now,
-                limits=self._limits,
-                credit=self._credits.enter(connection.host, now),
-                custom=self._custom,
-                layout=self._layout,
-                scratch=self._scratch,
-                closed_groups=self._admission.closed_groups(connection.host),
-                admit=self._door.admit(connection),
-                stranger=connection.stranger,
-                recipient=Recipient(partial(self._registered_there, connection), self.settings.robot_packages),
-                resume=self._sleepers.resume_for(connection) if self.settings.resume_s else None,
-                members=self._robots_in,
-            )
-            self.agents.enter(agent_id, connection)
-            self._forwarding.enter(connection)
-            connection.greet(peer)
+    def _greet(self, connection: Connection, agent_id: int) -> None:
+        """There is an id for a connection."""
+        self._numbers += 1
+        now = time.monotonic()
+        peer = TcpAgent(
+            agent_id,
+            self._numbers,
+            now,
+            limits=self._limits,
+            credit=self._credits.enter(connection.host, now),
+            custom=self._managing.custom,
+            layout=self._layout,
+            scratch=self._scratch,
+            closed_groups=self._entry.admission.closed_groups(connection.host),
+            admit=self._door.admit(connection),
+            stranger=connection.stranger,
+            recipient=Recipient(partial(self._registry.knows, connection), self.settings.robot_packages),
+            resume=self._sleepers.resume_for(connection) if self.settings.resume_s else None,
+            members=self._robots_in,
+        )
+        self.agents.enter(agent_id, connection)
+        self._forwarding.enter(connection)
+        connection.greet(peer)
 
     def _robots_in(self, group: int) -> list[int]:
         return [agent.id for agent in self.directory.of_type(ROS) if agent.group == group]
@@ -401,15 +325,8 @@ class Gateway:
     def _is_not_for_headsets(self, agent_id: int) -> bool:
         return agent_id in self._robot_ids or self._is_elsewhere(agent_id)
 
-    def _no_id(self, connection: Connection) -> None:
-        """There was no id for a connection in time. It cannot be told: agents give up when anything comes before their
-        id, and they are waiting for that."""
-        self._waiting.leave(connection)
-        self._drops.once("no_id", "%s leaves: there is no id for it", connection.address)
-        connection.abort()
-
     def _block_leased(self, block: int) -> None:
-        self._subscribe(UNICAST.every(type=UNITY, block=block), self._delivery.inbox)
+        self._subscriptions.add(UNICAST.every(type=UNITY, block=block), self._delivery.inbox)
 
     def _id_changes(self, connection: Connection) -> None:
         """A connection is about to have another id."""
@@ -425,11 +342,9 @@ class Gateway:
         self._door.leave(connection)
         self._sleepers.left(connection)
         if not connection.asleep:
-            self._leaves_address(connection)
+            self._entry.leave_address(connection)
         if not connection.greeted:
-            if (timer := self._coming.pop(connection, None)) is not None:
-                timer.cancel()
-            self._waiting.leave(connection)
+            self._entry.leave(connection)
             return
         if connection.peer.dials_a_router:
             what = "%s is a Zenoh program: it wants a router, and this is a gateway"
@@ -442,74 +357,39 @@ class Gateway:
         self._delivery.forget()
         was_online, empty_group = self.agents.leave(connection)
         self._leases.give_back(connection.agent_id)
-        self._nodes.set(connection, connection.host, 0)
-        self._named.set(connection, connection.host, 0)
         self._credits.leave(connection.host, connection.peer.credit, time.monotonic())
-        self._group_emptied(empty_group)
+        self._groups.emptied(empty_group)
         if was_online:
             self._declarations.undeclare(connection.key)
-            self._robots.leave(connection.key)
-            self._audit.record("left", _who(connection))
+        self._registry.leave(connection, was_online=was_online)
+        if was_online:
+            self._record.agent("left", connection)
             log.debug("%s is offline", connection)
         if not self.agents:
             self._all_closed.set()
-        self._greet_waiting()
-
-    def _leaves_address(self, connection: Connection) -> None:
-        """A socket has ended."""
-        self._admission.leave(connection.host)
-        self._known(connection)
-        if connection.greeted:
-            now = time.monotonic()
-            self._churn.ended(connection.host, now - connection.greeted_at, now)
+        self._entry.greet_waiting()
 
     def sleeps(self, connection: Connection) -> bool:
         """Whether an agent whose socket is gone may come back, and sleeps now."""
         return self._sleepers.sleeps(connection)
 
     def _falls_asleep(self, connection: Connection) -> None:
-        self._leaves_address(connection)
+        self._entry.leave_address(connection)
         self._forwarding.sleeps(connection)
 
     def _resume(self, newcomer: Connection, event: Resumed) -> None:
         """A newcomer is who was here before: what was his own is not needed."""
         former = self.agents.find(event.former.agent_type, event.former.agent_id)
         assert former is not None
-        self._known(newcomer)
+        self._entry.known(newcomer)
         self._forwarding.never_mind(newcomer)
         self.agents.never_mind(event.spare_id)
         self._leases.give_back(event.spare_id)
         self._credits.leave(newcomer.host, event.spare_credit, time.monotonic())
         self._door.is_now(newcomer, former)
-        nodes, named = self._nodes.of(former), self._named.of(former)
-        self._nodes.set(former, former.host, 0)
-        self._named.set(former, former.host, 0)
-        self._sleepers.resumed(newcomer, event)
-        self._nodes.set(former, former.host, nodes)
-        self._named.set(former, former.host, named)
-        self._greet_waiting()
-
-    def _not_resumed(self, connection: Connection) -> None:
-        connection.drops["not_resumed"] += 1
-        count = self._door.failed(connection.entrance, connection.host, "session of its own", "not_resumed")
-        if count:
-            self._audit.record("refused", who(address=connection.address), "resume", f"{count} times by now")
-
-    def _known(self, connection: Connection) -> None:
-        """A connection is no stranger any more."""
-        if connection.stranger:
-            connection.stranger = False
-            self._admission.known(connection.host)
-
-    def _group_emptied(self, group: Group | None) -> None:
-        """Nobody of ours is in this group any more."""
-        if group is not None:
-            self._unsubscribe(GROUP.every(type=group[0], group=group[1]))
-
-    def _registered_there(self, connection: Connection, metadata: Metadata) -> bool:
-        """Whether an agent registered a message's node on the robot that sends it."""
-        sender = metadata.sender_agent_type, metadata.sender_agent_id
-        return sender[0] == ROS and self._robots.registered(connection.key, metadata, int(sender[1] or 0))
+        with self._registry.moved(former):
+            self._sleepers.resumed(newcomer, event)
+        self._entry.greet_waiting()
 
     # -- from a TCP agent to the mesh ----------------------------------------------------------------------------
 
@@ -540,147 +420,45 @@ class Gateway:
             self._joined(connection, event)
             connection.charge()
         elif isinstance(event, Registering):
-            self._register(connection, event)
+            self._registry.register(connection, event)
             connection.charge()
         elif isinstance(event, RegistrationRefused):
-            self._tell_refusal(connection.key, event.refused)
+            self._registry.refused(connection.key, event.refused)
         elif isinstance(event, Forbidden):
-            self._tell_forbidden(connection, event)
+            self._refusing.forbidden(connection, event)
         elif isinstance(event, NotLetIn):
-            count = self._door.failed(connection.entrance, connection.host)
-            if count:  # or who knocks all day would push what was done out of the record
-                told = "no valid token" if count == 1 else f"no valid token, {count} times by now"
-                self._audit.record("refused", who(address=connection.address), "join", told)
-            self._tell_access(connection, AccessRefused("no_token", "a valid token is wanted here"))
+            self._refusing.not_let_in(connection)
         elif isinstance(event, Withdrawn):
-            self._withdraw(connection, event)
+            self._registry.withdraw(connection, event)
         elif isinstance(event, Resumed):
             self._resume(connection, event)
         elif isinstance(event, NotResumed):
-            self._not_resumed(connection)
+            self._refusing.not_resumed(connection)
         elif isinstance(event, AskedOnline):
-            self._answer_online(connection, event.request_id)
+            connection.send_call(to_agent(self._roll.answer(connection), request_id=event.request_id))
             connection.charge()
         elif isinstance(event, Asked):
-            self._manage(connection, event)
+            self._managing.ask(connection, event)
             connection.charge()
-
-    def _register(self, connection: Connection, event: Registering) -> None:
-        """An agent registers on a node of robots, or takes that back."""
-        kind, agent_id = connection.key  # it may have become another one than when it said this
-        node = structs.replace(event.node, registrant_agent_type=kind, registrant_agent_id=agent_id)
-        if isinstance(node, AddNode):
-            why = None
-            if not connection.recipient.is_registered(node):
-                why = self._nodes.judge(connection, connection.host)
-            naming = self._robots.naming(node, event.robot_ids, event.groups)
-            why = why or self._named.judge(connection, connection.host, naming)
-            if why is not None:
-                connection.complain("too_many_nodes", why)
-                self._robots.refuse(node, next(iter(event.robot_ids), 0), why)
-                return
-            if connection.recipient.existing and (other := connection.recipient.other_type(node)) is not None:
-                self._robots.take_back_all(connection.key, other, node.node_name)
-                connection.recipient.unregistered(node.node_name, other)
-            connection.recipient.registered(node)
-            if node.node_type == NodeType.SUBSCRIBER:
-                connection.open_direct()
-            if not connection.peer.extensions:  # an existing program, which cannot say it itself
-                node = structs.replace(node, unity_cdr=True)
-        self._robots.register(node, event.robot_ids, event.groups)
-        self._audit.record(*_registering(connection, node, event))
-        if not isinstance(node, AddNode) and self._robots.find(connection.key, node.node_type, node.node_name) is None:
-            connection.recipient.unregistered(node.node_name, node.node_type)
-        self._nodes.set(connection, connection.host, connection.recipient.node_count)
-        self._named.set(connection, connection.host, self._robots.named(connection.key))
-
-    def _manage(self, connection: Connection, event: Asked) -> None:
-        """A management message for a manager that somebody added."""
-        asker = Asker(*connection.key, connection.peer.group)
-        try:
-            answer = self._managers[event.manager].manage(event.data, asker)
-            data = encode_data(answer) if answer is not None else None
-        except Refused as refusal:
-            connection.complain("refused_by_manager", f"{event.manager}: {refusal.reason}")
-            if connection.peer.extensions:  # an existing program expects its manager's own answer, or none
-                connection.send_call(to_agent(Refusal(refusal.reason), request_id=event.request_id))
-            return
-        except Exception:
-            log.exception("%s failed on a message of %s", event.manager, connection)
-            connection.complain("manager_failed", f"{event.manager} failed, see above")
-            return
-        if data is not None:
-            connection.send_call(to_agent(data, request_id=event.request_id))
-
-    def _tell_refusal(self, agent: AgentKey, refused: NodeRefused) -> None:
-        connection = self.agents.find(*agent)
-        if connection is None:
-            return
-        what = f"type {refused.node_type} {refused.tos_name or refused.node_name} at robot {refused.robot_id}"
-        self._audit.record("register", _who(connection), what, refused.reason)
-        connection.peer.registration_refused(refused)
-        if self.settings.tell_refusals:
-            connection.send_call(to_agent(refused))
-
-    # -- what a token does not permit ------------------------------------------------------------------------------
-
-    def _tell_access(self, connection: Connection, refused: AccessRefused) -> None:
-        connection.send_call(to_agent(refused))
-
-    def _tell_forbidden(self, connection: Connection, event: Forbidden) -> None:
-        """A message was not let pass: say so, in the way that robots say it to who knows that."""
-        about, kind = event.metadata, "not_permitted"
-        if not connection.may_tell(
-            (about.node_type, about.node_name, about.message_manager, event.robots, event.reason)
-        ):
-            return
-        what = f"type {about.node_type} {about.node_name}" if about.node_name else about.message_manager or "message"
-        self._audit.record("message", _who(connection), what, event.reason)
-        if not (about.node_name and connection.peer.extensions):
-            self._tell_access(connection, AccessRefused(kind, event.reason, about.request_id))
-            return
-        for robot in event.robots or (0,):
-            refused = DataRefused(robot, about.node_type, about.node_name, about.node_name, kind, event.reason)
-            connection.send_call(to_agent(refused))
-
-    def _withdraw(self, connection: Connection, event: Withdrawn) -> None:
-        """Registrations are not permitted any more."""
-        for node, why in event.nodes:
-            self._robots.take_back_all(connection.key, node.node_type, node.node_name)
-            connection.recipient.unregistered(node.node_name, node.node_type)
-            refused = NodeRefused(0, node.node_type, node.node_name, node.tos_name, why)
-            self._tell_refusal(connection.key, refused)
-        self._nodes.set(connection, connection.host, connection.recipient.node_count)
-        self._named.set(connection, connection.host, self._robots.named(connection.key))
 
     def _rights_changed(self, connection: Connection, grant: Grant) -> None:
         """A token has other rights: they hold at once."""
-        log.info("%s has other rights: its token %s has changed", connection, grant.name)
-        self._audit.record("rights_changed", _who(connection))
-        events = connection.peer.rights_change(grant)
-        self._tell_access(connection, AccessRefused("changed", "the rights of this token have changed"))
-        for event in events:
+        for event in self._refusing.changed(connection, grant):
             self.handle(connection, event)
-
-    def _token_ended(self, connection: Connection) -> None:
-        """A token holds no longer, and so do the connections of who came in by it."""
-        self._audit.record("token_ended", _who(connection))
-        self._tell_access(connection, AccessRefused("ended", "this token holds no longer"))
-        connection.close("its token holds no longer")
 
     def _joined(self, connection: Connection, event: Joined) -> None:
         if self.agents.find(*connection.key) is connection:
-            self._regroup(connection)
+            self._groups.change(connection)
             return
-        self._known(connection)
+        self._entry.known(connection)
         if event.agent_type != UNITY and not self._admit(connection):
             return
         self._declarations.declare(connection)
-        self._enter_group(connection)
+        self._groups.enter(connection)
         self._sleepers.joined(connection)
         self._renumbering.joined(connection)
         by = f" with token {connection.peer.grant.name}" if connection.peer.grant.name else ""
-        self._audit.record("joined", _who(connection), f"group {event.group}" if event.group else "")
+        self._record.agent("joined", connection, f"group {event.group}" if event.group else "")
         log.info("%s is online%s%s", connection, f" in group {event.group}" if event.group else "", by)
 
     def _admit(self, connection: Connection) -> bool:
@@ -690,7 +468,7 @@ class Gateway:
         agent_id = self._robot_ids.choose(before, lambda each: each in self.agents.ids or self._is_elsewhere(each))
         if agent_id is None:
             self._drops["robot_not_allowed"] += 1
-            self._audit.record("refused", who(address=connection.address), "join as robot", self._robot_ids.problem)
+            self._record.address("refused", connection.address, "join as robot", self._robot_ids.problem)
             connection.close(self._robot_ids.problem)
             return False
         if agent_id != before:
@@ -699,40 +477,6 @@ class Gateway:
             self.agents.forget_former((connection.peer.agent_type, before), connection)
             self._leases.give_back(before)
         return True
-
-    def _enter_group(self, connection: Connection) -> None:
-        """Let others see an agent in the group that it has told."""
-        kind, agent_id = connection.key
-        group = connection.peer.group
-        if group:
-            self._subscribe(GROUP.every(type=kind, group=group), self._delivery.group)
-        # the token last: whoever sees the agent can reach it
-        number, asleep = connection.peer.connection_number, connection.seen_asleep
-        token = self._presence.declare(kind, agent_id, group, number, asleep=asleep)
-        before, emptied = self.agents.join(connection, token)
-        self._group_emptied(emptied)
-        loop = asyncio.get_running_loop()
-        connection.grouped_at = loop.time()
-        if before is not None:
-            loop.call_later(OVERLAP_S, before.close)
-        self._delivery.forget()
-        self._roll.changed()
-
-    def _regroup(self, connection: Connection) -> None:
-        """An agent is in another group. Of many changes others see the first at once, and then the last."""
-        loop = asyncio.get_running_loop()
-        due = connection.grouped_at + CALM_S
-        if loop.time() < due:
-            if connection.regrouping is None:
-                connection.regrouping = loop.call_at(due, self._regroup, connection)
-            return
-        connection.regrouping = None
-        if self.agents.group_of(connection) != connection.peer.group:
-            self._enter_group(connection)
-            log.debug("%s is in group %d", connection, connection.peer.group)
-
-    def _answer_online(self, connection: Connection, request_id: int) -> None:
-        connection.send_call(to_agent(self._roll.answer(connection), request_id=request_id))
 
     # -- subscriptions -------------------------------------------------------------------------------------------
 
@@ -747,22 +491,13 @@ class Gateway:
                 continue
             if registrants is None:
                 self._delivery.streams.pop(key, None)
-                self._unsubscribe(key)
+                self._subscriptions.remove(key)
             else:
                 self._delivery.streams[key] = Stream((ROS, robot_id), node, registrants)
                 # whether a robot keeps a stream for recovery is seen from its messages: others cost nothing more
-                self._subscribe(key, self._delivery.stream, at_once=self._delivery.stream_at_once, reliable=True)
-
-    def _subscribe(
-        self, key: str, on_batch: OnBatch, *, at_once: AtOnce | None = None, reliable: bool = False
-    ) -> None:
-        if key not in self._subscriptions:
-            self._subscriptions[key] = self.mesh.subscribe(key, on_batch, at_once=at_once, reliable=reliable)
-
-    def _unsubscribe(self, key: str) -> None:
-        subscription = self._subscriptions.pop(key, None)
-        if subscription is not None:
-            subscription.close()
+                self._subscriptions.add(
+                    key, self._delivery.stream, at_once=self._delivery.stream_at_once, reliable=True
+                )
 
     # -- presence ------------------------------------------------------------------------------------------------
 
@@ -777,20 +512,6 @@ class Gateway:
         self._departures.tell(gone, [change.agent.key for change in changes if change.online])
         for change in changes:
             try:
-                self._robots.presence(change)
+                self._registry.robots.presence(change)
             except Exception:  # one robot's registrations must not cost another its own
                 log.exception("telling %s what is registered for it failed", change.agent)
-
-
-def _who(connection: Connection) -> dict[str, str]:
-    kind, agent_id = connection.key
-    return who(f"{type_name(kind)}/{agent_id}", connection.address, connection.peer.grant.name)
-
-
-def _registering(
-    connection: Connection, node: AddNode | RemoveNode, event: Registering
-) -> tuple[str, dict[str, str], str]:
-    at = [f"robot {each}" for each in event.robot_ids] + [f"group {each}" for each in event.groups]
-    name = node.tos_name if isinstance(node, AddNode) else node.node_name
-    verb = "register" if isinstance(node, AddNode) else "deregister"
-    return verb, _who(connection), f"type {node.node_type} {name} at {', '.join(at) or 'nobody'}"

@@ -245,8 +245,8 @@ async def test_what_comes_with_the_configuration_is_by_who_the_agent_becomes(
             await until(lambda: callers)
             assert robot.id != 9
             assert set(callers) == {(9, 9)}
-            assert len(gateway._robots._registrations) == 1
-        await until(lambda: not len(gateway._robots._registrations))
+            assert len(gateway._registry.robots._registrations) == 1
+        await until(lambda: not len(gateway._registry.robots._registrations))
 
 
 def _accepting(robot: macs_zenoh.Agent) -> list[macs_zenoh.Call]:

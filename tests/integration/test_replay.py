@@ -255,7 +255,7 @@ class Stage:
 
         def settled() -> bool:
             heard = all(len(self.players[name].heard) >= len(texts) for name, texts in self.expected.items())
-            return heard and not any(gateway._robots._calls for gateway in self.gateways)
+            return heard and not any(gateway._registry.robots._calls for gateway in self.gateways)
 
         try:
             await until(settled)

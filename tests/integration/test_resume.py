@@ -425,7 +425,7 @@ async def test_a_thousand_times_leave_nothing_behind(start_site: StartSite, capl
         await Headset.connect("127.0.0.1", site.gateway.port) as other,
     ):
         own_id = headset.id
-        site.gateway._churn.PER_S = 1e9  # type: ignore[misc]
+        site.gateway._entry.churn.PER_S = 1e9  # type: ignore[misc]
         said = 0
 
         async def times(count: int) -> None:

@@ -240,9 +240,9 @@ async def test_who_names_robots_without_end_is_refused(start_gateway: StartGatew
         neighbour.register(1, "/mine", [robot.id])
         await until(lambda: (neighbour.id, "nd__mine") in robot.nodes())
         key, connection = (UNITY, greedy.id), gateway.agents.find(UNITY, greedy.id)
-        assert gateway._named.of(connection) == NAMED_EACH
+        assert gateway._registry.named.of(connection) == NAMED_EACH
     await until(lambda: gateway.agents.find(*key) is None)
-    assert gateway._named.used == 0
+    assert gateway._registry.named.used == 0
 
 
 @pytest.mark.parametrize("count", [1000])

@@ -1,0 +1,72 @@
+"""An agent of a gateway is seen by others: online, and in the group that it has told."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+from macs_zenoh.presence import Presence
+from macs_zenoh.protocol.keyexpr import GROUP
+
+from .agents import Agents, Group
+from .connection import Connection
+from .delivery import Delivery
+from .roll import Roll
+from .subscriptions import Subscriptions
+
+log = logging.getLogger("macs.gateway")
+
+CALM_S = 0.25
+"""So long after one change of its group an agent's next one is seen by others."""
+
+OVERLAP_S = 0.1
+"""How long an agent is seen in its former group as well: in no moment it seems to be gone."""
+
+
+class Groups:
+    """Those in which agents of one gateway are."""
+
+    def __init__(
+        self, agents: Agents, presence: Presence, subscriptions: Subscriptions, delivery: Delivery, roll: Roll
+    ) -> None:
+        self._agents = agents
+        self._presence = presence
+        self._subscriptions = subscriptions
+        self._delivery = delivery
+        self._roll = roll
+
+    def enter(self, connection: Connection) -> None:
+        """Let others see an agent, in the group that it has told."""
+        kind, agent_id = connection.key
+        group = connection.peer.group
+        if group:
+            self._subscriptions.add(GROUP.every(type=kind, group=group), self._delivery.group)
+        # the token last: whoever sees the agent can reach it
+        number, asleep = connection.peer.connection_number, connection.seen_asleep
+        token = self._presence.declare(kind, agent_id, group, number, asleep=asleep)
+        before, emptied = self._agents.join(connection, token)
+        self.emptied(emptied)
+        loop = asyncio.get_running_loop()
+        connection.grouped_at = loop.time()
+        if before is not None:
+            loop.call_later(OVERLAP_S, before.close)
+        self._delivery.forget()
+        self._roll.changed()
+
+    def change(self, connection: Connection) -> None:
+        """An agent is in another group. Of many changes others see the first at once, and then the last."""
+        loop = asyncio.get_running_loop()
+        due = connection.grouped_at + CALM_S
+        if loop.time() < due:
+            if connection.regrouping is None:
+                connection.regrouping = loop.call_at(due, self.change, connection)
+            return
+        connection.regrouping = None
+        if self._agents.group_of(connection) != connection.peer.group:
+            self.enter(connection)
+            log.debug("%s is in group %d", connection, connection.peer.group)
+
+    def emptied(self, group: Group | None) -> None:
+        """Nobody of ours is in this group any more."""
+        if group is not None:
+            self._subscriptions.remove(GROUP.every(type=group[0], group=group[1]))

@@ -1,0 +1,51 @@
+"""Who did what at one gateway, for its audit file (docs/audit.md)."""
+
+from __future__ import annotations
+
+import logging
+
+from bridge.audit import NO_AUDIT, Audit, open_audit, who
+from bridge.settings import GatewaySettings
+from macs_zenoh.losses import Losses
+from macs_zenoh.protocol.keyexpr import type_name
+
+from .connection import Connection
+
+
+class Record:
+    """Keeps nothing before `open`, and nothing without an audit file."""
+
+    def __init__(self, losses: Losses) -> None:
+        self._losses = losses
+        self._audit: Audit = NO_AUDIT
+
+    def open(self, settings: GatewaySettings, name: str) -> None:
+        """Begin. Raises ConfigError when the file cannot be written."""
+        self._audit = open_audit(
+            settings.audit_file, name, settings.audit_max_bytes, settings.audit_files, self._not_whole
+        )
+
+    def agent(self, event: str, connection: Connection, what: str = "", result: str = "done") -> None:
+        """An agent did something, or something was done to it."""
+        kind, agent_id = connection.key
+        by = who(f"{type_name(kind)}/{agent_id}", connection.address, connection.peer.grant.name)
+        self._audit.record(event, by, what, result)
+
+    def address(self, event: str, address: str, what: str, result: str = "done") -> None:
+        """Somebody did something of whom only the address is known."""
+        self._audit.record(event, who(address=address), what, result)
+
+    def token(self, event: str, name: str) -> None:
+        """A token has changed."""
+        self._audit.record(event, who(token=name))
+
+    def troubles(self) -> dict[str, int]:
+        """What `macs doctor` shall find."""
+        return self._audit.troubles()
+
+    def close(self) -> None:
+        """Write what waits; blocks for a second at the most."""
+        self._audit.close()
+
+    def _not_whole(self, count: int) -> None:
+        self._losses.once("audit_lost", "the record of who did what is not whole", count=count, level=logging.ERROR)
