@@ -21,6 +21,7 @@ from tests.support.local import PATIENT_MS
 from tests.support.programs import Program, free_port
 from tests.support.waiting import PATIENCE_S, until
 
+DEPTH = frames.DEFAULT_BUFFER_SIZE
 KEY, ECHO = "macs/to/ros/7/from/unity/256", "macs/to/ros/8/from/unity/256"
 SETTINGS = f"""[gateway]
 robots = "any"
@@ -238,14 +239,18 @@ async def test_a_robot_program_that_streams_unpaced(port: int) -> None:
 
 
 async def test_a_headset_that_does_not_read_slows_down_nobody(port: int) -> None:
-    """Of two headsets on a robot program's topic one reads nothing: the other gets every message."""
+    """Of two headsets on a robot program's topic one reads nothing, of 16 MB: the other gets every message. No more
+    are on their way than wait for a slow reader in any case, as which the other counts while its thread has no time."""
     robot, receiver, stalled = Headset.join(port, 0, robot=True), Headset.join(port, 0), Headset.join(port, 0)
     await registered(robot, [receiver, stalled])
     count = 2000
-    load = pieces(sequence.topic(robot.id, 8192, count, [receiver.id, stalled.id], TOPIC))
     reading = Receiver(receiver, count)
     reading.start()
-    await ended(send(robot, load), reading)
+    load = sequence.topic(robot.id, 8192, count, [receiver.id, stalled.id], TOPIC)
+    for sent, frame in enumerate(load):
+        await until(lambda sent=sent: sent - len(reading.numbers) < DEPTH, PATIENCE_S)  # type: ignore[misc]
+        await asyncio.to_thread(robot.socket.sendall, frame)
+    await ended(reading)
     assert [n for _, n in reading.numbers] == list(range(count))
 
 
