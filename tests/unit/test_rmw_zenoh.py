@@ -193,7 +193,7 @@ PROFILES = st.builds(
     liveliness=st.sampled_from(Liveliness),
     lease_ns=DURATIONS,
 )
-NAMES = st.lists(st.from_regex(r"[A-Za-z_]\w{0,8}", fullmatch=True).filter(str.isascii), min_size=1, max_size=4).map(
+NAMES = st.lists(st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,8}", fullmatch=True), min_size=1, max_size=4).map(
     lambda levels: "/" + "/".join(levels)
 )
 
