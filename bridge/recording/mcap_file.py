@@ -40,8 +40,8 @@ REMEMBERED = 256
 """So many chunks can be given up, where the disk has no room for the index."""
 COMPRESSIONS = ("zstd", "lz4", "none")
 SAMPLES, SAMPLE_BYTES = 3, 16 << 10
-"""So much of a chunk is tried first: what gets no smaller, as pictures that are compressed or full of noise, is written
-as it is, for a tenth of the time."""
+"""So much of a chunk is tried first: what gets no smaller, as pictures that are compressed or full of noise, is
+written as it is, for a tenth of the time."""
 WORTH = 0.9
 """Of its size a sample has to have at most so much."""
 

@@ -448,7 +448,7 @@ class Mesh:
         )
 
     async def tokens(self, key: str, *, timeout_s: float = 2.0) -> list[str]:
-        """The tokens that exist now, as the routers know them: this session's own for certain, and what another one has
+        """The tokens that exist now, as the routers know them: this session's own for certain, what another one has
         declared a few milliseconds ago perhaps not yet. Where routers do not answer in time, those known by then."""
         found: list[str] = []
         ended = asyncio.Event()

@@ -240,7 +240,7 @@ async def test_a_robot_program_that_streams_unpaced(port: int) -> None:
 
 async def test_a_headset_that_does_not_read_slows_down_nobody(port: int) -> None:
     """Of two headsets on a robot program's topic one reads nothing, of 16 MB: the other gets every message. No more
-    are on their way than wait for a slow reader in any case, as which the other counts while its thread has no time."""
+    are on their way than wait for a slow reader in any case: the other is one while its thread has no time."""
     robot, receiver, stalled = Headset.join(port, 0, robot=True), Headset.join(port, 0), Headset.join(port, 0)
     await registered(robot, [receiver, stalled])
     count = 2000
