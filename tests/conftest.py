@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, settings
 
 from tests.support.isolation import isolate
 from tests.support.patience import be_patient
+from tests.support.thorough import examples
 
 NEED_ROS_TESTS = "MACS_NEED_ROS_TESTS"
 """Set by ``make test`` and CI: a run in which no ROS test passed is a failed run."""
@@ -56,7 +57,9 @@ sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # Timings never decide a test: a busy machine is no counterexample.
-settings.register_profile("macs", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "macs", deadline=None, max_examples=examples(100), suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("macs")
 
 

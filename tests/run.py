@@ -1,6 +1,7 @@
 """The tests: those that may share the machine at the same time, then one by one those that measure time.
 
-``python -m tests.run`` is what ``make test`` runs; ``--all`` adds those that take minutes (``make test-all``, CI);
+``python -m tests.run`` is what ``make test`` runs; ``--all`` adds those that take minutes, and all
+examples of those that draw their input (``make test-all``, CI);
 ``--fast`` is those of single modules (``make check``); with ``--backwards`` the last file comes first. A part is plain
 pytest: ``make test ARGS=tests/unit``.
 """
@@ -13,6 +14,7 @@ import subprocess
 import sys
 
 from tests.support import tools
+from tests.support.thorough import THOROUGH
 
 CORES = os.cpu_count() or 1
 WORKERS = min(4 * CORES, 12)
@@ -41,6 +43,8 @@ def run(words: list[str]) -> list[tuple[bool, int, int]]:
     order = ["--backwards"] if "--backwards" in words else []
     if "--fast" in words:
         return [part("fast", "tests/unit", *order, workers=max(2, CORES))]
+    if "--all" in words:
+        os.environ[THOROUGH] = "1"
     tiers = TIERS if "--all" in words else f"{TIERS} and not soak"
     parts = [part("together", "-m", f"{tiers} and not alone", *order, workers=WORKERS)]
     os.environ.pop("MACS_NEED_ROS_TESTS", None)  # judged by the first part

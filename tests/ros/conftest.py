@@ -18,6 +18,7 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.pop("ROS_STATIC_PEERS", None)
 
 import macs_zenoh
+from bridge import interfaces
 from bridge.interfaces import build
 from bridge.ros.agent import RobotAgent, open_robot
 from bridge.ros.session import RosSession
@@ -26,7 +27,7 @@ from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
 from tests.support.isolation import worker_number
 from tests.support.local import patient
-from tests.support.once import made_once
+from tests.support.once import made_of
 from tests.support.ros_peer import ROBOT, Peer
 from tests.support.waiting import until
 
@@ -37,14 +38,15 @@ for _ in range((os.getpid() + worker_number() * DOMAINS // 8) % DOMAINS):
     next(_domains)
 
 
-def _installed(package: str, factory: pytest.TempPathFactory) -> Path:
+def _installed(package: str) -> Path:
     """An interface package, built from its definitions; the processes of a test find it as well. Its prefix."""
 
     def make(into: Path) -> None:
-        with zipfile.ZipFile(build(Path(__file__).parent / package, into).wheel) as wheel:
+        with zipfile.ZipFile(build(source, into).wheel) as wheel:
             wheel.extractall(into)
 
-    into = made_once(factory, package, make)
+    source = Path(__file__).parent / package
+    into = made_of(package, [source, Path(interfaces.__file__).parent], make)
     prefix = next(into.glob("*.data")) / "data"
     sys.path.insert(0, str(into))
     for variable, value in (("AMENT_PREFIX_PATH", str(prefix)), ("PYTHONPATH", str(into))):
@@ -53,16 +55,16 @@ def _installed(package: str, factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def count_action(tmp_path_factory: pytest.TempPathFactory) -> Any:
+def count_action() -> Any:
     """An action. None comes from PyPI."""
-    _installed("macs_test_msgs", tmp_path_factory)
+    _installed("macs_test_msgs")
     return importlib.import_module("macs_test_msgs.action").Count
 
 
 @pytest.fixture(scope="session")
-def kinds(tmp_path_factory: pytest.TempPathFactory) -> Any:
+def kinds() -> Any:
     """Messages with every kind of field: the module that has them."""
-    _installed("macs_kinds_msgs", tmp_path_factory)
+    _installed("macs_kinds_msgs")
     return importlib.import_module("macs_kinds_msgs.msg")
 
 

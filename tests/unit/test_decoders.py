@@ -15,6 +15,7 @@ from macs_zenoh.protocol.decoders import FrameDecoder, MessageDecoder
 from macs_zenoh.protocol.limits import CONFIGURATION_BYTES, METADATA_BYTES
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, parse_frame
 from tests.support.recordings import one_by_one
+from tests.support.thorough import examples
 from tests.support.wire_values import bytes_of, cuts, frames, layouts, stream
 
 
@@ -210,7 +211,7 @@ def test_what_is_too_long_to_parse_is_skipped_and_not_stored(frame: bytes, what:
 # -- receiving straight into the decoder -----------------------------------------------------------------------------
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(st.data())
 def test_receiving_into_the_decoder_is_feeding_it(data: st.DataObject) -> None:
     """Filling `space` as far as bytes came and calling `advance` gives what `feed` gives, for small and big frames."""

@@ -15,6 +15,7 @@ from macs_zenoh.errors import BadField, WireError
 from macs_zenoh.protocol.existing import readable
 from macs_zenoh.protocol.judging import Judge, Judged, judge
 from macs_zenoh.protocol.messages import UNITY, Metadata, correct_sender
+from tests.support.thorough import examples
 
 SENDER = (UNITY, 513)
 ORDERS = (
@@ -95,7 +96,7 @@ def test_what_was_seen_before_changes_nothing() -> None:
     assert short > CASES // 20  # the short way was taken
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(
     parts=st.lists(
         st.sampled_from([*TRICKS, b"{", b'"requestId":', b"1", b"23", b'"nodeName":"n"', b":"]), max_size=9

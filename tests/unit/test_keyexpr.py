@@ -28,6 +28,7 @@ from macs_zenoh.protocol.keyexpr import (
     type_number,
 )
 from macs_zenoh.protocol.limits import KEY_BYTES
+from tests.support.thorough import examples
 
 FORBIDDEN = "/*$?#%"
 """Characters that Zenoh gives a meaning to, and the one that escapes them."""
@@ -116,7 +117,7 @@ def test_zenoh_takes_a_key_as_it_is(space_name: str, data: st.DataObject) -> Non
 
 
 @by_space
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(data=st.data())
 def test_every_includes_of(space_name: str, data: st.DataObject) -> None:
     """The expression for some fields includes each key with these fields, and none that differs in one of them."""
@@ -312,7 +313,7 @@ expressions = st.text("ab@*$/?#", max_size=9) | st.lists(
 keys = st.lists(st.sampled_from(["a", "b", "ab", "aab", "@a", "@ab", "@"]), min_size=1, max_size=5).map("/".join)
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=examples(500), deadline=None)
 @given(text=expressions)
 def test_what_zenoh_takes_for_an_expression_is_known_without_it(text: str) -> None:
     """Whatever is not a key expression in canonical form to Zenoh is refused with a reason, and nothing else is."""
@@ -324,7 +325,7 @@ def test_what_zenoh_takes_for_an_expression_is_known_without_it(text: str) -> No
         assert expression_problem(text) is None
 
 
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=examples(1000), deadline=None)
 @given(text=expressions.filter(lambda text: expression_problem(text) is None), key=keys)
 def test_a_key_fits_an_expression_as_zenoh_says(text: str, key: str) -> None:
     """A key is among those of an expression exactly if it is to Zenoh, with all its wildcards and verbatim chunks."""

@@ -73,6 +73,7 @@ from macs_zenoh.protocol.tcp_agent import (
 )
 from macs_zenoh.protocol.wire import MACS, Layout, encode_frame, encode_message, parse_frame, split_message
 from tests.support.recordings import BY_NAME, RECORDINGS, Recording, one_by_one, reading
+from tests.support.thorough import examples
 
 LIMITS = Limits(max_frame_bytes=1 << 20, handshake_timeout_s=10.0, idle_timeout_s=5.0, held_frames=4, held_bytes=1000)
 
@@ -933,7 +934,7 @@ hostile_frames = st.builds(
 )
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(st.lists(hostile_frames | st.binary(max_size=100), max_size=5), st.integers(0, 2))
 def test_any_bytes_give_events(frames: list[bytes], agent_type: int) -> None:
     """Whatever an agent sends there are only events: what is passed on has right sizes, readable metadata and its

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from macs_zenoh import typed
 from macs_zenoh.protocol.wire import parse_frame, split_message
 from macs_zenoh.typed import BadCdr, BadValue, MissingRosbags, Types, UnknownType, request_of, response_of
+from tests.support.thorough import examples
 from tests.unit.scripted_router import recorded
 
 
@@ -171,7 +172,7 @@ def test_bad_cdr_is_an_error(types: Types, cdr: bytes) -> None:
         "std_srvs/srv/SetBool_Response",
     ],
 )
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(body=st.binary(max_size=64))
 def test_any_bytes_are_a_message_or_bad(types: Types, type_name: str, body: bytes) -> None:
     """Whatever a robot sends either reads as JSON or is refused as bad CDR."""
@@ -192,7 +193,7 @@ JSON_VALUES = st.recursive(
 
 
 @pytest.mark.parametrize("type_name", ["sensor_msgs/JointState", "geometry_msgs/Twist", "std_msgs/Float32MultiArray"])
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(value=st.dictionaries(st.sampled_from(["header", "linear", "position", "data", "name", "layout"]), JSON_VALUES))
 def test_any_value_is_written_or_refused(types: Types, type_name: str, value: dict[str, object]) -> None:
     """Whatever somebody types is either written as CDR or refused with its field."""
