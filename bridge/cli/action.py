@@ -19,15 +19,13 @@ what it prints:
 from __future__ import annotations
 
 import argparse
-import json
 from typing import TYPE_CHECKING
 
 from bridge.cli import named, output
 from bridge.cli.topic import EVERY_ROBOT, ONE_ROBOT, _is_type
-from macs_zenoh.plain import plain
 
 if TYPE_CHECKING:
-    from bridge.graph.site import Looking, Site
+    from bridge.graph.site import Site
 
 SUMMARY = "actions of robots: list, send"
 
@@ -70,15 +68,7 @@ def run(args: argparse.Namespace) -> int:
 def _list(args: argparse.Namespace) -> int:
     from bridge.graph import lists
 
-    async def work(site: Looking) -> int:
-        found = lists.actions(await site.offers(site.must_be_online()))
-        if args.json:
-            output.say(json.dumps([action.facts("action") for action in found]))
-        for action in () if args.json else found:
-            output.say(plain(f"{action.name} [{action.type}]" if args.show_types else action.name))
-        return 0
-
-    return named.looking(args, work)
+    return named.list_found(args, "action", lists.actions)
 
 
 def _send(args: argparse.Namespace) -> int:

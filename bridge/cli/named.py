@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +11,11 @@ from bridge.cli import options, output, robots, running
 from bridge.principal import Principal
 from bridge.settings import Settings
 from macs_zenoh.errors import UsageError
+from macs_zenoh.plain import plain
 from macs_zenoh.protocol.messages import ROS, UNITY
 
 if TYPE_CHECKING:
+    from bridge.graph.lists import Named
     from bridge.graph.site import Looking, Site
 
 ANSWER_S = 5.0
@@ -92,6 +95,20 @@ def looking(args: argparse.Namespace, work: Callable[[Looking], Awaitable[int]])
             return await work(Looking(lambda: online, ask, chosen, args.wait))
 
     return running.until_stopped(run, interrupted=running.INTERRUPTED)
+
+
+def list_found(args: argparse.Namespace, kind: str, find: Callable[[Any], list[Named]]) -> int:
+    """List what robots have of a kind, as ``--json`` and ``--show-types`` say."""
+
+    async def work(site: Looking) -> int:
+        found = find(await site.offers(site.must_be_online()))
+        if args.json:
+            output.say(json.dumps([each.facts(kind) for each in found]))
+        for each in () if args.json else found:
+            output.say(plain(f"{each.name} [{each.type}]" if args.show_types else each.name))
+        return 0
+
+    return looking(args, work)
 
 
 def who_joins(args: argparse.Namespace, settings: Settings) -> tuple[int, int | None]:

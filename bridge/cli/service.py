@@ -20,15 +20,13 @@ what it prints:
 from __future__ import annotations
 
 import argparse
-import json
 from typing import TYPE_CHECKING
 
 from bridge.cli import named, output
 from bridge.cli.topic import EVERY_ROBOT, ONE_ROBOT, _is_type
-from macs_zenoh.plain import plain
 
 if TYPE_CHECKING:
-    from bridge.graph.site import Looking, Site
+    from bridge.graph.site import Site
 
 SUMMARY = "services of robots: list, call"
 
@@ -68,15 +66,7 @@ def run(args: argparse.Namespace) -> int:
 def _list(args: argparse.Namespace) -> int:
     from bridge.graph import lists
 
-    async def work(site: Looking) -> int:
-        found = lists.services(await site.offers(site.must_be_online()))
-        if args.json:
-            output.say(json.dumps([service.facts("service") for service in found]))
-        for service in () if args.json else found:
-            output.say(plain(f"{service.name} [{service.type}]" if args.show_types else service.name))
-        return 0
-
-    return named.looking(args, work)
+    return named.list_found(args, "service", lists.services)
 
 
 def _call(args: argparse.Namespace) -> int:

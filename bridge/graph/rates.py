@@ -60,11 +60,7 @@ class Arrivals:
         facts = self.facts()
         if facts is None:
             return None
-        rate_hz, least, greatest, deviation, window = facts
-        return (
-            f"average rate: {rate_hz:.3f}\n"
-            f"\tmin: {least:.3f}s max: {greatest:.3f}s std dev: {deviation:.5f}s window: {window}"
-        )
+        return _spread_lines("rate", *facts)
 
 
 class Sizes:
@@ -124,11 +120,14 @@ class Ages:
         facts = self.facts()
         if facts is None:
             return None
-        mean, least, greatest, deviation, window = facts
-        return (
-            f"average delay: {mean:.3f}\n"
-            f"\tmin: {least:.3f}s max: {greatest:.3f}s std dev: {deviation:.5f}s window: {window}"
-        )
+        return _spread_lines("delay", *facts)
+
+
+def _spread_lines(what: str, average: float, least: float, greatest: float, deviation: float, window: float) -> str:
+    return (
+        f"average {what}: {average:.3f}\n"
+        f"\tmin: {least:.3f}s max: {greatest:.3f}s std dev: {deviation:.5f}s window: {window}"
+    )
 
 
 def bytes_of(number: float) -> str:

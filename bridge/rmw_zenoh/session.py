@@ -19,6 +19,7 @@ from bridge.rmw_zenoh.goals import ZenohGoals
 from bridge.rmw_zenoh.places import is_within
 from bridge.rmw_zenoh.types import DESCRIPTION, KnownMessage, KnownTypes
 from bridge.ros.alarms import Alarms
+from bridge.ros.jobs import settle
 from bridge.ros.side import (
     ActionType,
     Client,
@@ -133,14 +134,7 @@ class ZenohSession:
         wait(before, timeout=DESCRIBE_S)  # what ends something comes after what uses it
         with self._lock:
             self._jobs.discard(future)
-        if not future.set_running_or_notify_cancel():
-            return
-        try:
-            result = job()
-        except Exception as error:  # noqa: BLE001 - it is raised where the result is awaited
-            future.set_exception(error)
-        else:
-            future.set_result(result)
+        settle(future, job)
 
     def _done(self, future: Future[Any]) -> None:
         with self._lock:

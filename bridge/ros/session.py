@@ -26,6 +26,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from bridge.ros.intake import Intake
+from bridge.ros.jobs import settle
 from bridge.ros.rclpy_side import RclpySide
 from macs_zenoh.errors import Unreachable
 
@@ -170,14 +171,7 @@ class RosSession(RclpySide):
     def _work(self) -> None:
         while self._jobs:
             job, future = self._jobs.popleft()
-            if not future.set_running_or_notify_cancel():
-                continue
-            try:
-                result = job()
-            except Exception as error:  # noqa: BLE001 - it is raised where the result is awaited
-                future.set_exception(error)
-            else:
-                future.set_result(result)
+            settle(future, job)
 
     def _stop(self) -> None:
         self._spinning = False

@@ -42,6 +42,7 @@ from macs_zenoh.protocol.rmw_zenoh.keyexpr import (
 from macs_zenoh.protocol.rmw_zenoh.qos import SERVICES, Durability, History, Qos, Reliability
 
 from .declared import Subscription
+from .leaving import leave
 from .opening import open_session
 from .panics import call, unwatched, watched
 from .threads import keep_attached
@@ -115,15 +116,7 @@ class RosNetwork:
 
     async def close(self) -> None:
         """Leave; tokens end. A process must not exit without it."""
-        closing = asyncio.ensure_future(asyncio.to_thread(self.session.close))
-        cancelled = False
-        while not closing.done():
-            try:
-                await asyncio.shield(closing)
-            except asyncio.CancelledError:  # a process that exits with an open session hangs
-                cancelled = True
-        if cancelled:
-            raise asyncio.CancelledError
+        await leave(self.session.close)
 
     # -- the graph -----------------------------------------------------------------------------------------------
 

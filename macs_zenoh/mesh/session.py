@@ -26,6 +26,7 @@ from macs_zenoh.versions import installed
 from .arrivals import Arrivals
 from .calls import Calls, OnAnswer
 from .declared import AtOnce, Handler, OnAged, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
+from .leaving import leave
 from .link_log import LinkLog
 from .loopback import Loopback
 from .opening import open_now, open_session
@@ -193,15 +194,7 @@ class Mesh:
         """Leave the mesh: what was put is sent first, tokens end. A process must not exit without it."""
         self._beating.cancel()
         self._calls.close()
-        closing = asyncio.ensure_future(asyncio.to_thread(self._close))
-        cancelled = False
-        while not closing.done():
-            try:
-                await asyncio.shield(closing)
-            except asyncio.CancelledError:  # a second signal: a process that exits with an open session hangs
-                cancelled = True
-        if cancelled:
-            raise asyncio.CancelledError
+        await leave(self._close)
 
     def _close(self) -> None:
         self._outgoing.close(timeout_s=1.0)
