@@ -224,8 +224,9 @@ class Agent:
         for key, payload, age_s, now in batch:
             messages = self._reader.read(key, payload, me, by_group=by_group)
             for message in guard.covered(key, len(payload), messages, now):
-                if guard.judge(message, key, age_s, now) and (self._nodes is None or not self._nodes.take(message)):
-                    self._on_message(message._replace(age_s=age_s))
+                judged = guard.judge(message, key, age_s, now)
+                if judged is not None and (self._nodes is None or not self._nodes.take(judged)):
+                    self._on_message(judged)
 
     def _subscribe(self, key: str, *, by_group: bool = False) -> Subscription:
         """Receive what comes on a key."""

@@ -32,6 +32,7 @@ import msgspec
 
 from macs_zenoh.errors import CallTimeout, Refused, Unreachable, UsageError, WireError
 from macs_zenoh.protocol.addresses import joined
+from macs_zenoh.protocol.command_clock import NO_CLOCK
 from macs_zenoh.protocol.limits import ANSWER_BYTES
 from macs_zenoh.protocol.messages import (
     BROADCAST,
@@ -39,6 +40,7 @@ from macs_zenoh.protocol.messages import (
     OTHER_TYPE,
     ROS,
     AccessRefused,
+    CommandClock,
     DataRefused,
     Metadata,
     NodeRefused,
@@ -68,6 +70,7 @@ from .nodes import (
     ServiceHandler,
     Subscription,
 )
+from .own_clock import OwnClock
 from .questions import ROUTER, Questions
 from .resumption import ACK_S, Frame, Session, StillMeant, always
 from .stream import TCP, Way
@@ -138,6 +141,8 @@ class Headset:
         self._acknowledged_at = 0.0
         self._welcome_request = 0
         self._questions = Questions()
+        self.clock = OwnClock(self._say_time)
+        """By which robots of `tell_times` are told when commands were made."""
         self._reading = asyncio.Event()
         self._reading.set()
         self._ended = asyncio.Event()
@@ -416,6 +421,28 @@ class Headset:
         )
         return _not_refused(answer)
 
+    async def tell_times(
+        self, agents: Collection[int], groups: Collection[int] = (), *, timeout_s: float = 2.0
+    ) -> set[int]:
+        """From now on commands to these robots and groups carry the time at which they were made, so that robots
+        refuse those that come late, again or out of order. Waits until the robots know the clock, so long at most, and
+        returns those that do: the others are older, or not there. Raises Unreachable."""
+        if not (self.clock.robots or self.clock.groups):
+            self._tasks.append(asyncio.get_running_loop().create_task(self.clock.keep_known()))
+        self.clock.robots.update(agents)
+        self.clock.groups.update(groups)
+        await self.clock.hello()
+        return await self.clock.wait_known(agents, timeout_s)
+
+    def time_of_command(self, agents: Collection[int], groups: Collection[int]) -> tuple[int, str]:
+        """What a command to these that is made now carries: the time, and by which clock."""
+        return (self.clock.stamp(), self.clock.name) if self.clock.tells(agents, groups) else (0, "")
+
+    async def _say_time(self, data: bytes, robots: Collection[int], groups: Collection[int]) -> None:
+        manager = CommandClock.manager
+        frame = frames.plain_data(self.id, data, to_type=ROS, ids=robots, groups=groups, manager=manager)
+        await self.send_frame(frame)
+
     async def send_frame(self, frame: bytes, still_meant: StillMeant | None = None) -> None:
         """Send bytes as they are, also what no headset would say; and again if they are lost with the connection, the
         headset comes back as the same agent, and they are ``still_meant`` then. Raises Unreachable without a
@@ -598,7 +625,9 @@ class Headset:
     def _take_id(self, metadata: Metadata, data: bytes) -> None:
         if metadata.message_manager != Welcome.manager:
             raise WireError(f"it is {metadata.message_manager or metadata.node_name!r}, not {Welcome.manager!r}")
-        self.id = decode_data(Welcome, data).agent_id
+        before, self.id = self.id, decode_data(Welcome, data).agent_id
+        if before != self.id:
+            self.clock.unknown()
         self._welcome_request = metadata.request_id
 
     def _configuration(self, own_id: int, *, first: bool = False) -> bytes:
@@ -690,6 +719,9 @@ class Headset:
             return
         elif not metadata.message_manager and self._questions.take(message):
             return
+        elif metadata.message_manager == CommandClock.manager and message.sender_type == ROS:
+            await self.clock.take(message.sender_id or 0, message.data)
+            return
         elif metadata.message_manager in _OF_SESSIONS and message.sender_type is None:
             self._take_session(message)
             return
@@ -712,6 +744,8 @@ class Headset:
             refused = decode_data(DataRefused, message.data)  # for robots to which it passes nothing on
         elif message.metadata.message_manager == DataRefused.manager and message.sender_type == ROS:
             refused = msgspec.structs.replace(decode_data(DataRefused, message.data), robot_id=message.sender_id or 0)
+            if refused.kind == NO_CLOCK:
+                self.clock.unknown(refused.robot_id)
         else:
             return
         node = self._nodes.get((refused.node_type, refused.node_name))

@@ -143,10 +143,12 @@ def node_data(
     *,
     request_id: int = 0,
     manager: str = "",
+    clock: str = "",
 ) -> bytes:
     """Data of an interface node to robots: a topic's message (type 2), a request (3) or a response (4), as CDR.
 
-    ``manager`` is empty in what the C# program sends; see `protocol.messages.CallFailure` and docs/actions.md.
+    ``manager`` is empty in what the C# program sends; see `protocol.messages.CallFailure` and docs/actions.md. With a
+    ``clock``, the request id is the time on it at which a command was made.
     Raises TooManyDestinations above 10 agents or 10 groups.
     """
     metadata = _metadata(
@@ -156,6 +158,7 @@ def node_data(
         node_type=node.kind,
         name=node.name,
         data_type=node.data_type,
+        clock=clock,
     )
     return encode_frame(ROS, tuple(agents), tuple(groups), message=encode_message(metadata, cdr))
 
@@ -209,15 +212,17 @@ def _metadata(
     node_type: int = 0,
     name: str = "",
     data_type: str = "",
+    clock: str = "",
 ) -> bytes:
-    return msgspec.json.encode(
-        {
-            "senderAgentType": UNITY,
-            "senderAgentId": agent_id,
-            "messageManager": manager,
-            "requestId": request_id,
-            "nodeType": node_type,
-            "nodeName": name,
-            "dataExchangeType": data_type,
-        }
-    )
+    metadata = {
+        "senderAgentType": UNITY,
+        "senderAgentId": agent_id,
+        "messageManager": manager,
+        "requestId": request_id,
+        "nodeType": node_type,
+        "nodeName": name,
+        "dataExchangeType": data_type,
+    }
+    if clock:
+        metadata["clock"] = clock
+    return msgspec.json.encode(metadata)

@@ -76,6 +76,10 @@ class Owner(Protocol):
     async def tell(self, frame: Callable[[int], bytes]) -> None:
         """Send what a reconnection would repeat anyway: without a connection it waits for that."""
 
+    def time_of_command(self, agents: Collection[int], groups: Collection[int]) -> tuple[int, str]:
+        """The time of a command to these robots and groups that is made now, and by which clock; 0 and empty where
+        none is told."""
+
     def forget(self, node: Node) -> None:
         """The node is closed."""
 
@@ -216,7 +220,9 @@ class Publisher(Node):
             agents, groups = sorted(self.agents), sorted(self.groups)
         if not agents and not groups:
             raise UsageError(f"{self.spec.tos_name} is registered with no robot and no group")
-        await self._owner.send_frame(frames.node_data(self._owner.id, self.spec, cdr, agents, groups))
+        request_id, clock = self._owner.time_of_command(agents, groups)
+        frame = frames.node_data(self._owner.id, self.spec, cdr, agents, groups, request_id=request_id, clock=clock)
+        await self._owner.send_frame(frame)
 
 
 class ServiceClient(Node):

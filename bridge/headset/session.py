@@ -187,6 +187,8 @@ class Session:
 
         async def work() -> int:
             there = await self._there(publisher, agents)
+            if args.timed:
+                await self._tell_times(there, args.groups)
             async with self._hint(args.topic, there if new else (), "subscribers") as hinted:
                 await asyncio.sleep(settle_s)
                 sent = await publish()
@@ -212,6 +214,10 @@ class Session:
             return sent
 
         return Job(work(), endless=not count)
+
+    async def _tell_times(self, robots: Collection[int], groups: Collection[int]) -> None:
+        for robot in sorted(set(robots) - await self.headset.tell_times(robots, groups)):
+            log.warning("robot %d does not judge commands by the time at which they were made", robot)
 
     def _published(self, args: argparse.Namespace, sent: int, refusals: dict[int, str]) -> int:
         """Say what came of `pub`. What some robots refused was sent; whether all of it was lost there is not known."""

@@ -154,7 +154,8 @@ def _add_pub(verbs: Any) -> None:
         '{"topic": "/talk", "sent": 3, "refused": [{"robot": 1, "reason": "the emergency stop holds"}]}.\n\n'
         "examples:\n"
         '  macs headset 127.0.0.1:7000 pub /cmd_vel geometry_msgs/Twist \'{"linear": {"x": 0.5}}\' --rate 10\n'
-        '  macs headset 127.0.0.1:7000 pub /talk std_msgs/String \'{"data": "$i"}\' --agents 1 --count 3',
+        '  macs headset 127.0.0.1:7000 pub /talk std_msgs/String \'{"data": "$i"}\' --agents 1 --count 3\n'
+        '  macs headset 127.0.0.1:7000 pub /cmd_vel geometry_msgs/Twist \'{"linear": {"x": 0.5}}\' --rate 10 --timed',
     )
     pub.add_argument("topic", metavar="TOPIC", help="name of the topic, as /topic")
     # one that may be left out before one that may not is taken for left out when an option comes first
@@ -164,6 +165,11 @@ def _add_pub(verbs: Any) -> None:
     _add_robots(pub)
     pub.add_argument("--rate", type=_positive_number, metavar="HZ", help="messages per second")
     pub.add_argument("--count", type=_positive, metavar="N", help="stop after N messages")
+    pub.add_argument(
+        "--timed",
+        action="store_true",
+        help="tell when each message was made: robots that know this refuse what comes late, again or out of order",
+    )
     pub.add_argument("--latched", action="store_true", help="the robot keeps the last message for late subscribers")
     pub.add_argument(
         "--settle",

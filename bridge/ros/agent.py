@@ -19,6 +19,7 @@ from typing import TypeVar
 from bridge.audit import open_audit, who
 from bridge.metrics.endpoint import watched_at
 from bridge.ros.checked import CheckedSettings
+from bridge.ros.command_clocks import ClockQuestions
 from bridge.ros.definitions import Definitions, offered_types
 from bridge.ros.figures import watched
 from bridge.ros.graph import Offers
@@ -41,7 +42,15 @@ from macs_zenoh.mesh import Mesh, now_s
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.guard import Guard
 from macs_zenoh.protocol.keyexpr import type_name, type_number
-from macs_zenoh.protocol.messages import AddNode, FunctionalityRequest, Metadata, RemoveNode, decode_data, encode_data
+from macs_zenoh.protocol.messages import (
+    AddNode,
+    CommandClock,
+    FunctionalityRequest,
+    Metadata,
+    RemoveNode,
+    decode_data,
+    encode_data,
+)
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.registrations import check_own
 from macs_zenoh.protocol.robot_state import STATUS, ControlReply, ControlRequest
@@ -116,6 +125,7 @@ class RobotAgent:
         self.checked = CheckedSettings(session, robot.rules, robot.drops)
         self.offers = Offers(robot, self.streams.publish, self._graph_changed)
         self._definitions = Definitions(session.definition)
+        self._clocks = ClockQuestions(robot, guard, self.nodes.rights.check)
         self._answering: dict[asyncio.Task[None], Registrant] = {}
         self._sessions: dict[Registrant, tuple[str, int]] = {}
         """Who has an id, or had it last."""
@@ -194,6 +204,8 @@ class RobotAgent:
         try:
             if message.metadata.node_name:
                 self.nodes.deliver(message)
+            elif message.metadata.message_manager == CommandClock.manager:
+                self._clocks.take(message)
             elif message.metadata.message_manager in self._managers:
                 self._manage(message)
             elif message.metadata.message_manager in REQUESTS and self.agent.mesh.backlogged:
@@ -214,6 +226,7 @@ class RobotAgent:
             self._guard.on_command = _ignore
         self.agent.on_message(_ignore)
         self.offers.close()
+        self._clocks.close()
         if self._mirrors is not None:
             self._mirrors.close()
         if self._stop_later is not None:
@@ -409,6 +422,7 @@ class RobotAgent:
     def _forget(self, gone: Registrant, *, for_good: bool = False) -> None:
         self.nodes.forget(gone, for_good=for_good)
         self.offers.forget(gone)
+        self._clocks.left(gone)
         for answer, asker in list(self._answering.items()):
             if asker == gone:
                 answer.cancel()

@@ -34,7 +34,12 @@ async def joined(
     robot = settings.robot
     own = managers.load(robot.managers)
     guard = Guard(
-        Limits(robot.max_commands_per_s, robot.max_requests_per_s, robot.max_command_age_s),
+        Limits(
+            robot.max_commands_per_s,
+            robot.max_requests_per_s,
+            robot.max_command_age_s,
+            robot.max_timed_command_age_s,
+        ),
         Layout(settings.mesh.id_slots, settings.mesh.group_slots),
     )
     async with macs_zenoh.join(

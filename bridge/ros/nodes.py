@@ -392,7 +392,10 @@ class InterfaceNodes:
         if key.node_type != NodeType.PUBLISHER:
             return message
         age_s = message.age_s + waited_s
-        most_s = self.robot.rules.settings.max_command_age_s
+        settings = self.robot.rules.settings
+        most_s = settings.max_command_age_s
+        if message.metadata.clock and settings.max_timed_command_age_s:
+            most_s = min(most_s or math.inf, settings.max_timed_command_age_s)
         stops = (self.stop is not None and key == self.stop.key) or says_halt(message)
         if not stops and 0 < most_s < age_s:
             reason = f"a command waited for {age_s:.2f} s, the last of it for its registration"

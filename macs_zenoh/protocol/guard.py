@@ -5,7 +5,8 @@ the message before it is even looked at. So a flood costs the robot a fixed shar
 never waits behind it. A sender is what its keys end in, which routers hold certificates to.
 
 Commands that have waited on their way are not carried out, unless they say to stand still (`halts`). How long they did
-is worked out from the stamps that the first router puts on samples, without comparing clocks (`Ages`).
+is worked out from the stamps that the first router puts on samples, without comparing clocks (`Ages`). Senders that
+tell when they made their commands are held to that as well (`command_clock`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import NamedTuple, Protocol
 
 from ..errors import WireError
 from .agent_id import AgentId
+from .command_clock import CommandClocks
 from .credit import Credit
 from .halts import halts
 from .keyexpr import GROUP, UNICAST, sender_of, type_number
@@ -237,9 +239,12 @@ class Limits(NamedTuple):
     commands_per_s: float = 0.0
     requests_per_s: float = 0.0
     max_command_age_s: float = 0.0
+    max_timed_command_age_s: float = 0.0
+    """The same of commands whose senders tell when they made them."""
 
 
 OnCommand = Callable[[Message], None]
+OnRefused = Callable[[Message, str, str], None]
 
 
 class OnDropped(Protocol):
@@ -279,12 +284,15 @@ class Guard:
         """Type and id of the robot, kept by the agent."""
         self.on_command: OnCommand | None = None
         self.on_dropped: OnDropped = lambda name, sender, why, count=1: None
+        self.on_refused: OnRefused = lambda message, kind, why: None
+        """Hears of single commands that were dropped, whose sender is to be told."""
         self._stop_name, self._stop_bytes = "", b""
         self._urgent = Allowances(limits.commands_per_s)
         self._requests = Allowances(limits.requests_per_s)
         self._rescued = Allowances(limits.commands_per_s)
         self._ages = Ages()
         self._fresh = Fresh(limits.max_command_age_s)
+        self.clocks = CommandClocks(limits.max_timed_command_age_s)
         self._pressed: OrderedDict[str, float] = OrderedDict()
         """When somebody asked for a stop last; who did so last is at the end."""
         self._reader = Reader(layout, self._found_bad)
@@ -332,8 +340,9 @@ class Guard:
                 return False
             sender = sender_of(key)
             for message in self._covered(self._urgent, sender, len(payload), messages, now):
-                if self._passes(message, sender, age_s, now):
-                    command(message._replace(age_s=age_s) if age_s > AGED_S else message)
+                most_s = self._passes(message, sender, age_s, now)
+                if most_s is not None:
+                    command(message._replace(age_s=most_s) if most_s > AGED_S else message)
         return True
 
     def covered(self, key: str, size: int, messages: list[Message], now: float) -> list[Message]:
@@ -353,13 +362,14 @@ class Guard:
             self.on_dropped("flooded", sender, FLOODED, len(messages) - len(kept))
         return kept
 
-    def judge(self, message: Message, key: str, age_s: float, now: float) -> bool:
-        """Whether a message that comes to the loop is delivered: commands among others, or in a sample too large to be
-        looked at before, are held to the same."""
+    def judge(self, message: Message, key: str, age_s: float, now: float) -> Message | None:
+        """A message that comes to the loop, with its age, if it is delivered: commands among others, or in a sample
+        too large to be looked at before, are held to the same."""
         if not _is_command(message):
-            return True
+            return message._replace(age_s=age_s)
         with self._lock:
-            return self._passes(message, sender_of(key), age_s, now)
+            most_s = self._passes(message, sender_of(key), age_s, now)
+        return None if most_s is None else message._replace(age_s=most_s)
 
     def pressed(self, sender: tuple[int, int], now: float) -> None:
         """Somebody stops the robot by asking, which overtakes what it puts: a release that it sent before is not what
@@ -390,16 +400,23 @@ class Guard:
                 if self._stops(message):
                     command(message)
 
-    def _passes(self, message: Message, sender: str, age_s: float, now: float) -> bool:
+    def _passes(self, message: Message, sender: str, age_s: float, now: float) -> float | None:
+        """How old a command is that is carried out, at most; None: it is not."""
         if self._stops(message):
-            return True
+            return age_s
         if self._overtaken(message, sender, age_s, now):
             self.on_dropped("too_old", sender, "a release was sent before the stop that its sender asked for")
-            return False
-        if self._fresh.take(sender, age_s, now) or says_halt(message):
-            return True
+            return None
+        halt = says_halt(message)
+        told = self.clocks.judge(sender, message.metadata, now, halts=halt)
+        if told.refusal is not None:
+            self.on_dropped(told.refusal.kind, sender, told.refusal.reason)
+            self.on_refused(message, *told.refusal)
+            return None
+        if self._fresh.take(sender, age_s, now) or halt:
+            return max(age_s, told.age_s)
         self.on_dropped("too_old", sender, f"a command has waited for {age_s:.2f} s on its way, or behind such a one")
-        return False
+        return None
 
     def _overtaken(self, message: Message, sender: str, age_s: float, now: float) -> bool:
         if not self._pressed or not self.stop_name or message.metadata.node_name != self.stop_name:

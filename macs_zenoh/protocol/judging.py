@@ -63,6 +63,7 @@ class _Shape(NamedTuple):
             usual.node_type,
             usual.node_name,
             usual.data_exchange_type,
+            usual.clock,
         )
         return Judged(metadata, raw if self.same else self.before + number + self.after, self.readable)
 

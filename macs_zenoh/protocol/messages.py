@@ -52,6 +52,10 @@ NodeName = Annotated[str, Meta(min_length=1, max_length=NAME_BYTES, pattern=PLAI
 """Of an interface node: a part of keys."""
 
 
+ClockName = Annotated[str, Meta(min_length=1, max_length=32, pattern=r"^[0-9a-z]*\Z")]
+"""Of the clock by which an agent tells when it made its commands."""
+
+
 class NodeType(IntEnum):
     """What an interface node is on the robot. MACS's own texts name 3 and 4 from the headset's side."""
 
@@ -92,6 +96,8 @@ class Metadata(Struct, frozen=True, rename="camel", forbid_unknown_fields=True):
     node_type: Annotated[int, Meta(ge=0, le=255)] = 0
     node_name: Name = ""
     data_exchange_type: Name = ""
+    clock: ClockName | UnsetType = UNSET
+    """Of a command: the request id is the time on this clock at which it was made (`command_clock`)."""
 
     @staticmethod
     def decode(data: bytes | bytearray | memoryview) -> Metadata:
@@ -101,14 +107,14 @@ class Metadata(Struct, frozen=True, rename="camel", forbid_unknown_fields=True):
         try:
             return _metadata_decoder.decode(data)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            # other keys than the seven plain ones: the tolerant way reads all of it, or tells what is wrong
+            # other keys than the plain ones: the tolerant way reads all of it, or tells what is wrong
             try:
                 return converted("metadata", snake_object("metadata", bytes(data)), Metadata)
             except BadJson:
                 raise BadJson("metadata", str(error)) from error
 
     def encode(self) -> bytes:
-        """Write compact JSON with all seven keys."""
+        """Write compact JSON with all seven keys, and the clock where there is one."""
         return msgspec.json.encode(self)
 
     def sent_by(self, agent_type: int, agent_id: int) -> Metadata:
@@ -338,6 +344,22 @@ class DataRefused(Struct, frozen=True, rename="camel"):
 OTHER_TYPE = "other_type"
 
 
+class CommandClock(Struct, frozen=True, rename="camel"):
+    """Between a robot and an agent that tells when it made its commands (`command_clock`).
+
+    From the agent: with a ``clock`` alone it says hello; with a ``question``'s number and ``at``, the time on that
+    clock, it answers. From the robot: a ``question``, 0 for none; whether the clock is ``known``, so that commands
+    pass; and how old these may be.
+    """
+
+    manager: ClassVar[str] = "CommandClock"
+    clock: ClockName
+    question: Annotated[int, Meta(ge=0, le=(1 << 53) - 1)] = 0
+    at: Annotated[int, Meta(ge=0, le=(1 << 53) - 1)] | UnsetType = UNSET
+    known: bool | UnsetType = UNSET
+    max_age_s: float | UnsetType = UNSET
+
+
 class CallFailure(Struct, frozen=True, rename="camel"):
     """In place of a service's response, in the data part: why there is none. Metadata names it as the manager.
 
@@ -366,7 +388,7 @@ class FunctionalityRequest(Management, frozen=True):
 MANAGERS: dict[str, type[Management]] = {kind.manager: kind for kind in Management.__subclasses__()}
 """Every manager by its name on the wire. Nothing is ever imported or created because a message names it."""
 
-FOR_NEWER = frozenset({DataRefused.manager})
+FOR_NEWER = frozenset({DataRefused.manager, CommandClock.manager})
 """Managers of messages between agents that existing programs do not have: not for who does not know our extensions."""
 
 NO_CUSTOM: Mapping[str, type[Struct]] = {}

@@ -21,6 +21,7 @@ from .messages import (
     ROS,
     UNITY,
     AddNode,
+    CommandClock,
     FunctionalityRequest,
     Metadata,
     NodeType,
@@ -60,6 +61,7 @@ _OF_REQUESTS: dict[str, Right] = {
     FunctionalityRequest.manager: "see",
     "RobotStatus": "see",
     "RobotControl": "command",
+    CommandClock.manager: "command",
 }
 """Requests to robots that are no own managers' (docs/robot.md)."""
 

@@ -52,10 +52,11 @@ class Link:
 
 
 @asynccontextmanager
-async def counted(router: str, *, buffer_bytes: int | None = None) -> AsyncIterator[Link]:
+async def counted(router: str, *, buffer_bytes: int | None = None, delay_s: float = 0.0) -> AsyncIterator[Link]:
     """A counting relay in front of the router at this endpoint; connect to ``link.endpoint``.
 
     ``buffer_bytes`` is what the kernel holds on either side of a link; otherwise it is megabytes on this machine.
+    ``delay_s`` is how much longer everything takes, either way.
     """
     link = Link()
     host, _, port = router.removeprefix("tcp/").rpartition(":")
@@ -67,6 +68,9 @@ async def counted(router: str, *, buffer_bytes: int | None = None) -> AsyncItera
                 await link.moves(up=up)
                 link.up_bytes += len(data) if up else 0
                 link.down_bytes += 0 if up else len(data)
+                if delay_s:
+                    asyncio.get_running_loop().call_later(delay_s, writer.write, data)
+                    continue
                 writer.write(data)
                 await writer.drain()
         writer.close()

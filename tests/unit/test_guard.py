@@ -254,9 +254,9 @@ def test_commands_among_others_are_held_to_their_age(guard: Guard, taken: list[M
     assert not guard.first(KEY, mixed, 0.7, 0.0)
     assert [message.metadata.node_name for message in taken] == [STOP]
     messages = Reader(MACS, lambda key, error: None).read(KEY, mixed, ME, by_group=False)
-    assert [guard.judge(message, KEY, 0.7, 0.0) for message in messages] == [False, True, True]
+    assert [guard.judge(message, KEY, 0.7, 0.0) is not None for message in messages] == [False, True, True]
     assert dropped == ["too_old"]
-    assert [guard.judge(message, KEY, 0.001, 1.0) for message in messages] == [True, True, True]
+    assert [guard.judge(message, KEY, 0.001, 1.0) is not None for message in messages] == [True, True, True]
 
 
 def test_a_group_copy_is_dropped_where_the_id_is_named(guard: Guard, taken: list[Message]) -> None:
@@ -391,4 +391,4 @@ def test_a_velocity_of_zero_passes_however_old(guard: Guard, taken: list[Message
     assert taken[0].age_s == age_s
     assert dropped == ["too_old"] * 3
     messages = Reader(MACS, lambda key, error: None).read(KEY, moving(1.0) + moving(0.0), ME, by_group=False)
-    assert [guard.judge(message, KEY, age_s, 10.0) for message in messages] == [False, True]
+    assert [guard.judge(message, KEY, age_s, 10.0) is not None for message in messages] == [False, True]

@@ -131,7 +131,14 @@ def test_a_stop_needs_its_right_and_no_other(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("manager", "right"),
-    [("RobotStatus", "see"), ("FunctionalityGetter", "see"), ("RobotControl", "command"), ("Own", "ask"), ("", "ask")],
+    [
+        ("RobotStatus", "see"),
+        ("FunctionalityGetter", "see"),
+        ("RobotControl", "command"),
+        ("CommandClock", "command"),
+        ("Own", "ask"),
+        ("", "ask"),
+    ],
 )
 def test_requests_to_robots_need_what_they_do(manager: str, right: Right) -> None:
     """To ask how a robot is, is to see; to take control, to command; for all else there is a right to ask."""

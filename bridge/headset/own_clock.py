@@ -1,0 +1,108 @@
+"""The clock by which a headset tells when it made its commands (`macs_zenoh.protocol.command_clock`)."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import secrets
+import time
+from collections.abc import Awaitable, Callable, Collection
+from contextlib import suppress
+
+from macs_zenoh.errors import Unreachable
+from macs_zenoh.protocol.command_clock import TICK_S
+from macs_zenoh.protocol.messages import CommandClock, decode_data, encode_data
+
+HELLO_S = 1.0
+"""Between two hellos to robots that do not know the clock."""
+HELLO_AGAIN_S = 20.0
+"""And to those that do, while they are commanded: otherwise they ask no more some time."""
+LAST = 900_000_000
+"""At this time another clock begins: gateways judge numbers of nine digits fastest."""
+
+Say = Callable[[bytes, Collection[int], Collection[int]], Awaitable[None]]
+"""Sends data of `CommandClock` to robots and groups of robots."""
+
+
+class OwnClock:
+    """Its time rises with each command, and begins at 1. ``now`` is in seconds, monotonic."""
+
+    def __init__(self, say: Say, now: Callable[[], float] = time.monotonic) -> None:
+        self._say = say
+        self._now = now
+        self._last = 0
+        self.robots: set[int] = set()
+        """Robots that are told the time."""
+        self.groups: set[int] = set()
+        self.known: dict[int, float] = {}
+        """Robots that take commands by it, and how old these may be, in s; 0: of any age."""
+        self._changed = asyncio.Event()
+        self._said_at = -math.inf
+        self._begin()
+
+    @property
+    def ticks(self) -> int:
+        """The time now."""
+        return int((self._now() - self._began) / TICK_S) + 1
+
+    def tells(self, robots: Collection[int], groups: Collection[int]) -> bool:
+        """Whether a command to these carries the time."""
+        return not (self.robots.isdisjoint(robots) and self.groups.isdisjoint(groups))
+
+    def stamp(self, ticks: int = 0) -> int:
+        """The time of a command that is made now, or was at ``ticks``; later than those before in any case."""
+        self._last = max(self._last + 1, ticks or self.ticks)
+        return self._last
+
+    async def hello(self) -> None:
+        """Say it to all who are told the time."""
+        if self.ticks > LAST:
+            self._begin()
+        self._said_at = self._now()
+        await self._say(encode_data(CommandClock(clock=self.name)), sorted(self.robots), sorted(self.groups))
+
+    async def take(self, robot: int, data: bytes) -> None:
+        """What a robot says of it. Raises what decoding raises."""
+        said = decode_data(CommandClock, data)
+        if said.clock != self.name:
+            return
+        if said.known:
+            self.known[robot] = said.max_age_s or 0.0
+            self._changed.set()
+        elif robot in self.known:
+            del self.known[robot]
+        if said.question:
+            answer = CommandClock(clock=self.name, question=said.question, at=self.ticks)
+            await self._say(encode_data(answer), (robot,), ())
+
+    def unknown(self, robot: int | None = None) -> None:
+        """A robot does not know it, or none does any more."""
+        for one in list(self.known) if robot is None else [robot]:
+            self.known.pop(one, None)
+
+    async def wait_known(self, robots: Collection[int], timeout_s: float) -> set[int]:
+        """Say hello until all of these know it, or for so long: those that do."""
+        deadline = self._now() + timeout_s
+        wanted = set(robots)
+        while not wanted <= self.known.keys() and (left_s := deadline - self._now()) > 0:
+            if self._now() - self._said_at >= HELLO_S:
+                await self.hello()
+            self._changed.clear()
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._changed.wait(), min(left_s, HELLO_S / 4))
+        return wanted & self.known.keys()
+
+    async def keep_known(self) -> None:
+        """Say hello as often as is needed, until cancelled."""
+        while True:
+            await asyncio.sleep(HELLO_S)
+            due_s = HELLO_S if self.robots - self.known.keys() else HELLO_AGAIN_S
+            if self._now() - self._said_at >= due_s or self.ticks > LAST:
+                with suppress(Unreachable):
+                    await self.hello()
+
+    def _begin(self) -> None:
+        self.name = secrets.token_hex(8)
+        self._began = self._now()
+        self._last = 0
+        self.known.clear()
