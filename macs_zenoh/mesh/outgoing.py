@@ -66,6 +66,10 @@ class Outgoing:
 
     PUBLISHERS = 4096
     LARGE_BYTES = 128 << 10
+    """Larger ones are given to Zenoh by a thread: on a slow link that takes long."""
+    HERE_BYTES = 8 << 10
+    """From so much on, Zenoh is not given what only our own subscriptions take: for the copy alone it takes longer than
+    for all else (64 KiB: 25 of 31 us, measured)."""
     SETTLE_S = 2.0
     FRESH_PUTS = 2
     """So often a key is put with before it gets a publisher: whoever names thousands of keys once must not cost
@@ -121,13 +125,14 @@ class Outgoing:
             self.drops["no_route"] += 1
         if self._marked and (mark := self._tracing.mark(key, command=traffic is Traffic.COMMAND)) is not None:
             publisher = Marked(publisher, mark)
-        if traffic is not CALL or (self._sender.idle and len(payload) <= self.LARGE_BYTES):
+        if traffic is not CALL or (len(payload) < self.HERE_BYTES and self._sender.idle):
             self._loopback.put(publisher, payload)
-        elif kept:  # one publisher numbers them all
-            if not self._sender.put(publisher, payload):
-                self.drops["backlog"] += 1
-        else:
-            self._put_apart(self._apart.get(key) or self._declare_apart(key, len(payload)), payload)
+        elif not kept:
+            self._put_large(key, publisher, payload)
+        elif self._is_quick(payload):
+            self._loopback.put(publisher, payload)
+        else:  # one publisher numbers them all
+            self._put_later(publisher, payload)
 
     def put_unasked(self, key: str, payload: Payload) -> None:
         """`Mesh.put_unasked`."""
@@ -207,12 +212,22 @@ class Outgoing:
             log.warning(text, shape.key, overrun.setting, overrun.limit, overrun.rule, overrun.reason)
         return overrun is None
 
-    def _put_apart(self, apart: _Apart, payload: Payload) -> None:
-        """Our own subscriptions get the payload as it is, now; the sender copies it for others, if any listen."""
-        self._loopback.put_here(apart.here, payload)
+    def _is_quick(self, payload: Payload) -> bool:
+        return self._sender.idle and len(payload) <= self.LARGE_BYTES
+
+    def _put_large(self, key: str, publisher: Outlet, payload: Payload) -> None:
+        """Our own subscriptions get the payload as it is, now; Zenoh copies it for others, if any listen."""
+        apart = self._apart.get(key) or self._declare_apart(key, len(payload))
         if time.monotonic() > apart.settled_at and not apart.away.matching_status.matching:  # type: ignore[attr-defined]
-            return
-        if not self._sender.put(apart.away, payload):
+            self._loopback.put_here(apart.here, payload)
+        elif self._is_quick(payload):
+            self._loopback.put(publisher, payload)
+        else:
+            self._loopback.put_here(apart.here, payload)
+            self._put_later(apart.away, payload)
+
+    def _put_later(self, publisher: Outlet, payload: Payload) -> None:
+        if not self._sender.put(publisher, payload):
             self.drops["backlog"] += 1
 
     def _declare(self, key: str, traffic: Traffic) -> _Outlet:
