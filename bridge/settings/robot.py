@@ -141,8 +141,8 @@ class RobotSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """A command that has waited longer than this on its way is not carried out, nor are those that waited with it. 0:
     all are."""
     max_timed_command_age_s: Annotated[float, Meta(ge=0, le=3600)] = 0.2
-    """A command of a headset that tells when it made it (docs/protocol.md) is not carried out when it may be older than
-    this: the way there and back counts. 0: of any age, but not repeated, and in order."""
+    """A command of a headset that tells when it made it (docs/protocol.md) is not carried out when it may be older:
+    the way there and back counts. 0: of any age, but not repeated, and in order."""
     max_frame_bytes: Bytes = 32 * 1024 * 1024
     """A larger message to headsets is not sent, and they are told. Gateways and headsets have limits of their own, by
     which such a message can end a connection."""

@@ -68,8 +68,8 @@ class Outgoing:
     LARGE_BYTES = 128 << 10
     """Larger ones are given to Zenoh by a thread: on a slow link that takes long."""
     HERE_BYTES = 8 << 10
-    """From so much on, Zenoh is not given what only our own subscriptions take: for the copy alone it takes longer than
-    for all else (64 KiB: 25 of 31 us, measured)."""
+    """From so much on, Zenoh is not given what only our own subscriptions take: the copy alone takes it longer than
+    all else (64 KiB: 25 of 31 us, measured)."""
     SETTLE_S = 2.0
     FRESH_PUTS = 2
     """So often a key is put with before it gets a publisher: whoever names thousands of keys once must not cost
