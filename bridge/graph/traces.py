@@ -126,13 +126,21 @@ class Tracing:
             putting = dict.fromkeys([*gateways, *list(others)[:MOST_OTHERS]])
             self._marking = [zid for zid in putting if zid not in (self._mesh.zid, self._robot_zid)]
             self._looking = [Noting(self._robot_zid, self._names[self._robot_zid])]
+            await self.skip()
             return
         self._marking = [self._robot_zid]
         self._looking = [Noting(zid, self._names[zid]) for zid in gateways]
         self._looking.append(Noting(self._mesh.zid, "here"))
+        await self.skip()
         self._scope = subscribed(self._site, self._topic, None)
         self._subscription = await self._scope.__aenter__()
         self._taking = asyncio.get_running_loop().create_task(self._take(self._subscription))
+
+    async def skip(self) -> None:
+        """Leave out what was noted until now: others have asked for it, and it may be old."""
+        await self._poll()
+        for noting in self._looking:
+            noting.reports.clear()
 
     async def end(self) -> None:
         """Receive the topic no more; what was asked for ends by itself."""

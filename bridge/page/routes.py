@@ -132,14 +132,18 @@ class Page:
             return _json({"error": problem_of(error)})  # the question was right: it is the robot that does not answer
 
     async def _trace(self, request: web.Request, visitor: Grant) -> web.StreamResponse:
+        """Of a topic, or of commands: those are ``?commands=``."""
         robot, topic = int(request.match_info["robot"]), request.query.get("topic", "")[:NAME_BYTES]
+        commands = "commands" in request.query
         problem = self._problem(robot, visitor)
-        if problem is None and visitor.rights is not None:
+        if problem is None and visitor.rights is not None and not commands:
             problem = visitor.rights.of_topic(topic)
+        if problem is None and not topic and not commands:
+            problem = "say which topic"
         if problem is not None:
             return _json({"error": problem})
         try:
-            return _json({"ways": await self._traces.of(robot, topic)})
+            return _json({"ways": await self._traces.of(robot, "" if commands else topic)})
         except MacsError as error:
             return _json({"error": problem_of(error)})
 

@@ -1,12 +1,15 @@
-"""Traces for pages: the hops of a topic's messages to this gateway, collected once for all who look, and only then."""
+"""Traces for pages: the hops of a topic's messages to this gateway, and of commands from here to a robot. They are
+collected once for all who look, and only then."""
 
 from __future__ import annotations
 
 import asyncio
+import math
+import time
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from bridge.graph.site import Site
 from bridge.graph.traces import Noting, Tracing
@@ -21,8 +24,18 @@ COUNT = 100
 """So many messages are enough for one look."""
 GOOD_S = 0.3
 ANSWER_S = 1.0
+FORGOTTEN_S = 5.0
+"""Where nobody has looked for so long, what came meanwhile is old."""
 TOPICS = 16
 """So many topics are traced at one time; whose messages are awaited is not forgotten for another."""
+
+
+class _Seen(NamedTuple):
+    """The last report that was looked at, by whom it was told, and when."""
+
+    by: str = ""
+    number: int = 0
+    at_s: float = -math.inf
 
 
 @dataclass
@@ -39,13 +52,27 @@ class _Here:
     timeout_s: float = ANSWER_S
 
 
-class _ToGateway(Tracing):
-    """Messages of a topic that somebody at this gateway receives anyway."""
+class _Look(Tracing):
+    """One look of several: it tells what has come since the last one, if that was just now. What is traced goes on
+    anyway: a topic that somebody at this gateway receives, commands that are sent here."""
 
-    async def begin(self) -> None:
-        self._names[self._mesh.zid] = "this gateway"
-        self._marking = [self._robot_zid]
-        self._looking = [Noting(self._mesh.zid, "this gateway")]
+    async def begin_after(self, seen: _Seen) -> None:
+        """Go on behind what was ``seen``."""
+        own = self._mesh.zid
+        self._names[own] = "this gateway"
+        self._marking = [own if self._commands else self._robot_zid]
+        noting = Noting(self._robot_zid if self._commands else own, "")
+        noting.name = self._names[noting.zid]
+        self._looking = [noting]
+        if time.monotonic() - seen.at_s < FORGOTTEN_S and seen.by == noting.zid:
+            noting.after = seen.number
+        else:
+            await self.skip()
+
+    def seen(self) -> _Seen:
+        """Up to where it has looked."""
+        (noting,) = self._looking
+        return _Seen(noting.zid, noting.after, time.monotonic())
 
 
 class Traces:
@@ -54,12 +81,15 @@ class Traces:
     def __init__(self, mesh: Mesh, directory: Directory) -> None:
         self._here = _Here(_Session(mesh, directory))
         self._kept: OrderedDict[tuple[int, str], Fresh[list[dict[str, Any]]]] = OrderedDict()
+        """By robot and topic; commands are those of no topic."""
+        self._seen: dict[tuple[int, str], _Seen] = {}
         self._one = asyncio.Lock()
         """What a program notes is told once: two that collect would each have a part."""
 
     async def of(self, robot: int, topic: str) -> list[dict[str, Any]]:
-        """Each way that messages took, as `bridge.graph.traces.Traced` tells it; none where no message came. Raises
-        Refused, Unreachable, UsageError."""
+        """Each way that messages took since the last look, as `bridge.graph.traces.Traced` tells it; none where no
+        message came. Without a topic it is commands that are sent through this gateway. Raises Refused, Unreachable,
+        UsageError."""
         fresh = self._kept.get((robot, topic))
         if fresh is None:
             if len(self._kept) >= TOPICS:
@@ -67,6 +97,7 @@ class Traces:
                 if idle is None:
                     raise Refused(f"{TOPICS} topics are traced for pages already")
                 del self._kept[idle]
+                self._seen.pop(idle, None)
             fresh = self._kept[robot, topic] = Fresh(partial(self._collect, robot, topic), GOOD_S)
         self._kept.move_to_end((robot, topic))
         return await fresh.now()
@@ -78,9 +109,9 @@ class Traces:
 
     async def _collect(self, robot: int, topic: str) -> list[dict[str, Any]]:
         async with self._one:
-            tracing = _ToGateway(cast(Site, self._here), robot, topic, every=1, commands=False)
-            await tracing.begin()
+            tracing = _Look(cast(Site, self._here), robot, topic or "/", every=1, commands=not topic)
+            await tracing.begin_after(self._seen.get((robot, topic), _Seen()))
             await tracing.collect(seconds=COLLECT_S, count=COUNT)
             found = await tracing.conclude()
-            await tracing.end()
+            self._seen[robot, topic] = tracing.seen()
         return [traced.facts() for traced in sorted(found, key=lambda each: -each.count)]

@@ -6,7 +6,7 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
 
 import pytest
@@ -21,7 +21,7 @@ from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, StreamData
 from macs_zenoh.protocol.trace import ROS_SENT, TAKEN, Point, TraceRequest
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
-from tests.support.links import counted
+from tests.support.links import counted, delayed
 from tests.support.programs import Program, ended
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
@@ -63,33 +63,6 @@ class Robot:
             text = encode_message(metadata.encode(), b"\x00\x01\x00\x00\x06\x00\x00\x00hello\x00")
             self._streams.publish(NODE, encode_frame(1, management=management, message=text))
             await asyncio.sleep(0.02)
-
-
-@asynccontextmanager
-async def delayed(endpoint: str, delay_s: float) -> AsyncIterator[str]:
-    """A relay in front of a router, by which all takes so much longer in either direction."""
-    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
-    loop = asyncio.get_running_loop()
-    tasks: set[asyncio.Task[None]] = set()
-
-    async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with suppress(ConnectionError):
-            while data := await reader.read(65536):
-                loop.call_later(delay_s, writer.write, data)
-        loop.call_later(delay_s, writer.close)
-
-    async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        there, back = await asyncio.open_connection(host, int(port))
-        for one, other in ((reader, back), (there, writer)):
-            tasks.add(asyncio.create_task(pump(one, other)))
-
-    server = await asyncio.start_server(accept, "127.0.0.1", 0)
-    try:
-        yield f"tcp/127.0.0.1:{server.sockets[0].getsockname()[1]}"
-    finally:
-        server.close()
-        for task in tasks:
-            task.cancel()
 
 
 @asynccontextmanager
@@ -263,3 +236,19 @@ async def test_nonsense_is_answered_with_nothing(router: str) -> None:
         for number in range(200):
             mesh.tracing.answer(trace.encode_request(TraceRequest(put=f"key{number}")))
         assert len(mesh.tracing.wanted) <= 64
+
+
+async def test_what_was_noted_before_is_not_told(router: str) -> None:
+    """A trace is of messages that come while somebody looks, whoever had others traced before."""
+    async with (
+        robot(router),
+        Program("gateway", "--port", "0", "-e", router) as gateway,
+        await Headset.connect("127.0.0.1", gateway.port) as headset,
+    ):
+        subscription = await headset.subscribe("/chatter", "std_msgs/String", agents=[7])
+        await asyncio.wait_for(anext(subscription), PATIENCE_S)
+        await traced(router, "--count", "30", "--seconds", "60")
+        receiver = f"gateway 127.0.0.1:{gateway.port}"
+        ways = await traced(router, "--seconds", "0.3")
+        counts = [way["count"] for way in ways if way["receiver"] == receiver]
+        assert all(count < 30 for count in counts), counts

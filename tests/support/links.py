@@ -102,3 +102,30 @@ async def counted(router: str, *, buffer_bytes: int | None = None, delay_s: floa
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+
+@asynccontextmanager
+async def delayed(endpoint: str, delay_s: float) -> AsyncIterator[str]:
+    """A relay in front of a router, by which all takes so much longer in either direction."""
+    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+    loop = asyncio.get_running_loop()
+    tasks: set[asyncio.Task[None]] = set()
+
+    async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(ConnectionError):
+            while data := await reader.read(65536):
+                loop.call_later(delay_s, writer.write, data)
+        loop.call_later(delay_s, writer.close)
+
+    async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        there, back = await asyncio.open_connection(host, int(port))
+        for one, other in ((reader, back), (there, writer)):
+            tasks.add(asyncio.create_task(pump(one, other)))
+
+    server = await asyncio.start_server(accept, "127.0.0.1", 0)
+    try:
+        yield f"tcp/127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    finally:
+        server.close()
+        for task in tasks:
+            task.cancel()

@@ -4,6 +4,10 @@ import { Keyed, digits, h, panel, say, show } from "./dom.js";
 
 const EVERY_MS = 500;
 const COLUMNS = 120;
+/** A topic's messages are told every second; one that comes more seldom is waited for. */
+const SILENT_MS = 5000;
+/** Chosen in the place of a topic. */
+const COMMANDS = "commands";
 const COLOURS = ["--plot-1", "--plot-2", "--plot-3", "--plot-4", "--hop-5", "--hop-6", "--hop-7", "--hop-8"];
 
 export class LatencyView {
@@ -13,7 +17,7 @@ export class LatencyView {
     this.hops = [];
     this.robotChoice = h("select", { id: "trace-robot", onchange: () => this.#robotChosen() });
     this.topicChoice = h("select", { id: "trace-topic", onchange: () => this.#clear() });
-    this.state = h("p", { class: "facts", role: "status", id: "trace-state" }, "Choose a robot and a topic.");
+    this.state = h("p", { class: "facts", role: "status", id: "trace-state" }, "Choose a robot and a topic, or commands.");
     this.canvas = h("canvas", { class: "bars", role: "img", "aria-label": "Time by hop, the newest at the right" });
     this.context = this.canvas.getContext("2d");
     this.body = h("tbody");
@@ -27,7 +31,7 @@ export class LatencyView {
       { class: "row choices" },
       h("label", { for: "trace-robot" }, "Robot"),
       this.robotChoice,
-      h("label", { for: "trace-topic" }, "Topic"),
+      h("label", { for: "trace-topic" }, "What"),
       this.topicChoice,
     );
     const scroll = h("div", { class: "scroll-x", tabindex: "0", role: "region", "aria-label": "Hops" }, table);
@@ -113,7 +117,8 @@ export class LatencyView {
     if (this.robotChoice.value !== robot) return;
     this.types = offers?.publishers ?? {};
     const topics = Object.keys(this.types).sort();
-    this.topicChoice.replaceChildren(...topics.map((topic) => h("option", { value: topic }, topic)));
+    const commands = h("option", { value: COMMANDS }, "Commands from this gateway");
+    this.topicChoice.replaceChildren(...topics.map((topic) => h("option", { value: topic }, topic)), commands);
     const own = topics.find((topic) => /^\/(pose|odom)$/.test(topic));
     if (own) this.topicChoice.value = own;
     this.#clear();
@@ -122,8 +127,15 @@ export class LatencyView {
   #clear() {
     this.looks = [];
     this.hops = [];
+    this.lookedAt = null;
     this.keyed.set([]);
+    show(this.clocks, false);
+    say(this.state, this.#commands ? "Waiting for commands: somebody has to drive." : "Waiting for messages.");
     this.dirty = true;
+  }
+
+  get #commands() {
+    return this.topicChoice.value === COMMANDS;
   }
 
   /** Ask while it is seen: nothing is traced otherwise. */
@@ -132,9 +144,11 @@ export class LatencyView {
       const seen = !this.element.hidden && !document.hidden && this.page.headset.connected;
       const [robot, topic] = [this.robotChoice.value, this.topicChoice.value];
       if (seen && robot && !topic) await this.#robotChosen(); // what it offers could not be told the last time
-      this.#receive(seen && robot && topic ? [Number(robot), topic, this.types[topic]] : null);
+      const type = this.types?.[topic];
+      this.#receive(seen && robot && type ? [Number(robot), topic, type] : null);
       if (seen && robot && topic) {
-        const told = await this.page.get(`/view/trace/${robot}?topic=${encodeURIComponent(topic)}`);
+        const what = this.#commands ? "commands=1" : `topic=${encodeURIComponent(topic)}`;
+        const told = await this.page.get(`/view/trace/${robot}?${what}`);
         if (robot === this.robotChoice.value && topic === this.topicChoice.value) this.#take(told);
       }
       await new Promise((resolve) => setTimeout(resolve, EVERY_MS));
@@ -156,10 +170,14 @@ export class LatencyView {
       return;
     }
     const [look] = told.ways;
+    const now = performance.now();
     if (!look) {
-      say(this.state, `no message of ${this.topicChoice.value} has come that was traced`);
+      if (now - (this.lookedAt ?? now) < SILENT_MS) return;
+      const what = this.#commands ? "command has been sent" : `message of ${this.topicChoice.value} has come`;
+      say(this.state, `no ${what} for ${Math.round((now - this.lookedAt) / 1000)} s that was traced`);
       return;
     }
+    this.lookedAt = now;
     this.looks.push(look);
     if (this.looks.length > COLUMNS) this.looks.shift();
     for (const { hop } of look.hops) if (!this.hops.includes(hop)) this.hops.push(hop);
