@@ -2,9 +2,10 @@
 
 Publishes a generated camera picture on ``/camera/image/compressed`` (sensor_msgs/CompressedImage, 10 Hz, best effort
 as cameras are), how far away what it shows is on ``/camera/depth`` (sensor_msgs/Image, 5 Hz), where it is on ``/pose``
-(geometry_msgs/PoseStamped, 20 Hz), a turret that swings on ``/turret/pose``, and its ``/battery``
-(sensor_msgs/BatteryState). Drives as ``/cmd_vel`` (geometry_msgs/Twist) says, and stops half a second after the last
-command. Serves ``/set_lights`` (std_srvs/SetBool), which the picture shows.
+(geometry_msgs/PoseStamped, 20 Hz), a turret that swings on ``/turret/pose``, its ``/battery``
+(sensor_msgs/BatteryState), and once, for all who come, the ``/map`` of its floor (nav_msgs/OccupancyGrid). Drives as
+``/cmd_vel`` (geometry_msgs/Twist) says, and stops half a second after the last command. Serves ``/set_lights``
+(std_srvs/SetBool), which the picture shows.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from typing import Any
 
 import rclpy
 from geometry_msgs.msg import PoseStamped, Twist
+from nav_msgs.msg import OccupancyGrid
 from rclpy.executors import ExternalShutdownException
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import BatteryState, CompressedImage, Image
 from std_srvs.srv import SetBool
 
 from bridge.logs import log_to_stderr
-from bridge.ros.demo_scene import Scene
+from bridge.ros.demo_scene import CELL_M, MAP_M, Scene, floor_map
 from bridge.ros.session import why
 
 log = logging.getLogger("macs.demo")
@@ -113,6 +115,9 @@ class DemoRobot:
         self._depth = node.create_publisher(Image, "/camera/depth", qos_profile_sensor_data)
         self._turret = node.create_publisher(PoseStamped, "/turret/pose", 10)
         self._power = node.create_publisher(BatteryState, "/battery", 10)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._map = node.create_publisher(OccupancyGrid, "/map", latched)
+        self._map.publish(self._drawn_map())
         node.create_subscription(Twist, COMMANDS, self._drive, 10)
         node.create_service(SetBool, "/set_lights", self._set_lights)
         node.create_timer(1 / POSE_HZ, self._publish_pose)
@@ -177,6 +182,19 @@ class DemoRobot:
         message.step = depth.shape[1] * depth.itemsize
         message.data = array.array("B", depth.tobytes())
         self._depth.publish(message)
+
+    def _drawn_map(self) -> Any:
+        cells = floor_map()
+        message = OccupancyGrid()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.frame_id = "map"
+        message.info.map_load_time = message.header.stamp
+        message.info.resolution = CELL_M
+        message.info.height, message.info.width = cells.shape
+        message.info.origin.position.x = message.info.origin.position.y = -MAP_M / 2
+        message.info.origin.orientation.w = 1.0
+        message.data = array.array("b", cells.tobytes())
+        return message
 
     def _publish_turret(self) -> None:
         angle = math.sin(self._now_s() / 2)

@@ -50,11 +50,23 @@ PILLARS = (
     Pillar(4.5, -6.5, 0.4, 1.7, GREEN),
     Pillar(12.0, -0.5, 0.6, 3.0, YELLOW),
 )
+MAP_M, CELL_M = 32.0, 0.1
+"""How long a side of the map is, and of one of its cells. The robot begins in its middle."""
 COLOURS = (RED, GREEN, BLUE, YELLOW)
 _FLOOR = ((96, 104, 116), (66, 73, 84))
 _SKY = ((206, 219, 232), (92, 132, 178))
 _LIGHT = 1.45
 """So much brighter is what is near, when the robot's lights are on."""
+
+
+def floor_map() -> Any:
+    """The floor from above, as an occupancy grid: rows from the south, 0 for free, 100 for a pillar or a wall."""
+    middles: Any = (numpy.arange(round(MAP_M / CELL_M)) + 0.5) * CELL_M - MAP_M / 2
+    x, y = middles[None, :], middles[:, None]
+    taken = numpy.maximum(numpy.abs(x), numpy.abs(y)) > MAP_M / 2 - 2 * CELL_M
+    for pillar in PILLARS:
+        taken |= (x - pillar.x) ** 2 + (y - pillar.y) ** 2 <= pillar.radius**2
+    return numpy.where(taken, 100, 0).astype(numpy.int8)
 
 
 class Scene:

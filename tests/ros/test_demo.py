@@ -142,6 +142,7 @@ async def test_the_demo_robot_shows_drives_and_ends(
         "/battery": "sensor_msgs/msg/BatteryState",
         "/camera/depth": "sensor_msgs/msg/Image",
         "/camera/image/compressed": "sensor_msgs/msg/CompressedImage",
+        "/map": "nav_msgs/msg/OccupancyGrid",
         "/pose": "geometry_msgs/msg/PoseStamped",
         "/turret/pose": "geometry_msgs/msg/PoseStamped",
     }

@@ -6,6 +6,7 @@ import { COMMANDS, Drive } from "./drive.js";
 import { Keyed, digits, h, say, show } from "./dom.js";
 import { Plot } from "./plot.js";
 import { TopicTable } from "./topic-table.js";
+import { MAP } from "./map.js";
 import { POSES, Trail } from "./trail.js";
 
 const STATUS_MS = 500;
@@ -163,7 +164,7 @@ class Shown {
   }
 
   restyle() {
-    if (this.trail) this.trail.dirty = true;
+    this.trail?.restyle();
     for (const plot of this.plots.values()) plot.restyle();
   }
 
@@ -241,6 +242,7 @@ class Shown {
       this.trail = new Trail(this.robot, ...pose, this.parts);
       this.areas.control.append(this.trail.element);
     }
+    this.trail?.setMaps(publishers.flatMap(([topic, type]) => (type === MAP ? [topic] : [])).sort());
     for (const [wanted, [paths, title]] of Object.entries(PLOTTED)) {
       const found = publishers.find(([, type]) => type === wanted);
       if (found && !this.plotted?.has(wanted)) {

@@ -1,6 +1,7 @@
-/** Where a robot is and was, on a grid of metres: ROS axes, x to the right and y up. */
+/** Where a robot is and was, on a map or a grid of metres: ROS axes, x to the right and y up. */
 
-import { digits, h, panel, say } from "./dom.js";
+import { digits, h, panel, say, show } from "./dom.js";
+import { MapLayer } from "./map.js";
 
 export const POSES = {
   "geometry_msgs/msg/PoseStamped": (message) => message.pose,
@@ -9,6 +10,7 @@ export const POSES = {
 };
 const POINTS = 4000;
 const STEP_M = 0.02;
+const SPANS = [2, 4, 8, 16, 32, 64, 128];
 
 export class Trail {
   #end = null;
@@ -21,8 +23,19 @@ export class Trail {
     this.canvas = h("canvas", { role: "img", "aria-label": `trail of robot ${robot}` });
     this.context = this.canvas.getContext("2d");
     this.figures = h("span", { class: "figures" });
-    const clear = h("button", { type: "button", class: "small", onclick: () => this.#clear() }, "Clear");
-    this.element = panel(`Position · ${topic}`, { id: "trail", tools: [this.figures, clear] }, this.canvas);
+    const button = (text, title, onclick) => h("button", { type: "button", class: "small", "aria-label": title, title, onclick }, text);
+    const tools = [
+      this.figures,
+      button("−", "Show more around it", () => this.#zoom(1)),
+      button("+", "Show less around it", () => this.#zoom(-1)),
+      h("button", { type: "button", class: "small", onclick: () => this.#clear() }, "Clear"),
+    ];
+    this.map = new MapLayer(robot, { topics, types }, () => this.#mapChanged());
+    this.mapChoice = h("select", { class: "small", id: "trail-map", onchange: () => this.map.choose(this.mapChoice.value) });
+    this.mapFigures = h("span", { class: "figures" });
+    const chosen = h("div", { class: "row message" }, h("label", { for: "trail-map" }, "Map"), this.mapChoice, this.mapFigures);
+    show((this.mapRow = chosen), false);
+    this.element = panel(`Position · ${topic}`, { id: "trail", tools }, this.canvas, chosen);
     this.dirty = true;
     this.pick = POSES[type];
     new ResizeObserver(() => (this.dirty = true)).observe(this.canvas);
@@ -34,6 +47,24 @@ export class Trail {
       },
       (error) => say(this.figures, error.message),
     );
+  }
+
+  /** The maps that the robot has. Its own (`/map`) is shown by itself; costmaps and the like are heavy, and chosen. */
+  setMaps(maps) {
+    const known = maps.join(" ");
+    if (known === this.knownMaps) return;
+    this.knownMaps = known;
+    const chosen = maps.includes(this.map.topic) ? this.map.topic : (maps.find((topic) => topic === "/map") ?? "");
+    const options = ["", ...maps].map((topic) => h("option", { value: topic }, topic || "none"));
+    this.mapChoice.replaceChildren(...options);
+    this.mapChoice.value = chosen;
+    show(this.mapRow, maps.length > 0);
+    if (chosen !== this.map.topic) this.map.choose(chosen);
+  }
+
+  restyle() {
+    this.map.restyle();
+    this.dirty = true;
   }
 
   /** With each frame that the screen shows. */
@@ -54,6 +85,7 @@ export class Trail {
     const scale = Math.min(width, height) / this.span;
     const centre = this.pose ?? { x: 0, y: 0 };
     const at = (x, y) => [width / 2 + (x - centre.x) * scale, height / 2 - (y - centre.y) * scale];
+    this.map.draw(context, style, at, scale);
     this.#grid(context, style, { width, height, scale, centre, at });
     this.#line(context, style.getPropertyValue("--trail"), at);
     if (this.pose) this.#arrow(context, style.getPropertyValue("--accent"), at);
@@ -62,11 +94,17 @@ export class Trail {
   close() {
     this.ended = true;
     this.#end?.();
+    this.map.close();
     this.element.remove();
   }
 
   #take(message) {
-    const { position, orientation: q } = this.pick(this.type.read(message.data));
+    const read = this.type.read(message.data);
+    const { position, orientation: q } = this.pick(read);
+    if (this.frame !== read.header.frame_id) {
+      this.frame = read.header.frame_id;
+      this.#mapChanged();
+    }
     const heading = Math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z));
     this.pose = { x: position.x, y: position.y, heading };
     const last = 2 * ((this.count - 1) % POINTS);
@@ -83,13 +121,27 @@ export class Trail {
     this.dirty = true;
   }
 
+  #zoom(by) {
+    const at = SPANS.indexOf(this.span) + by;
+    this.span = SPANS[Math.max(0, Math.min(SPANS.length - 1, at))];
+    this.dirty = true;
+  }
+
+  #mapChanged() {
+    const other = this.map.size && this.frame && this.map.frame !== this.frame;
+    say(this.mapFigures, `${this.map.text}${other ? `, the place in ${this.frame}` : ""}`);
+    this.mapFigures.classList.toggle("bad", Boolean(other || this.map.problem));
+    this.canvas.dataset.map = this.map.size?.join("x") ?? "";
+    this.dirty = true;
+  }
+
   #clear() {
     this.count = 0;
     this.dirty = true;
   }
 
   #grid(context, style, { width, height, scale, centre, at }) {
-    const step = scale > 40 ? 0.5 : scale > 8 ? 1 : 10;
+    const step = scale > 40 ? 0.5 : scale > 16 ? 1 : scale > 4 ? 5 : 10;
     context.lineWidth = 1;
     for (const metres of [step, 2 * step]) {
       context.strokeStyle = style.getPropertyValue(metres === step ? "--grid" : "--grid-strong");
