@@ -38,7 +38,7 @@ from typing import Any
 from msgspec import UNSET
 
 from bridge.cli import options, output, robots, running, terminal
-from bridge.cli.robots import Operator, Router
+from bridge.cli.robots import Operator
 from bridge.cli.terminal import BAD, HEADING, ODD, Block, Cell, Columns
 from macs_zenoh.errors import MacsError, NotServed, Refused, Unreachable
 from macs_zenoh.protocol.directory import AgentInfo
@@ -46,6 +46,7 @@ from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.named import Named
 from macs_zenoh.protocol.ping import Pong
 from macs_zenoh.protocol.robot_state import NodeStatus, Offered, RobotStatus, TopicQos
+from macs_zenoh.protocol.routers import Router
 
 SUMMARY = "who is online, and what robots are doing"
 VERBOSE = "all about each robot"

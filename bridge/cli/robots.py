@@ -16,7 +16,6 @@ from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
-from msgspec import Struct
 
 from bridge.principal import Principal
 from bridge.settings import OperatorSettings
@@ -30,6 +29,7 @@ from macs_zenoh.protocol.limits import ANSWER_BYTES
 from macs_zenoh.protocol.messages import OPERATOR, ROS, Metadata
 from macs_zenoh.protocol.named import Named, Names
 from macs_zenoh.protocol.ping import Pong
+from macs_zenoh.protocol.routers import Router
 from macs_zenoh.protocol.routing import call
 from macs_zenoh.protocol.wire import Layout
 
@@ -45,32 +45,6 @@ CLOCK_PINGS = 5
 """Of so many comparisons of two clocks the closest one counts."""
 
 WITHOUT_A_ROUTER = "(start one with `macs router`, or name it with -e; `macs doctor` looks closer)"
-
-
-class RouterSession(Struct, frozen=True):
-    """Somebody whom a router has a session with."""
-
-    peer: str = ""
-    whatami: str = ""
-
-
-class Router(Struct, frozen=True):
-    """A router, as its admin space has it."""
-
-    zid: str
-    version: str = ""
-    locators: list[str] = []
-    sessions: list[RouterSession] = []
-
-    @property
-    def linked(self) -> list[str]:
-        """Ids of the routers that it is linked with itself."""
-        return sorted({session.peer for session in self.sessions if session.whatami == "router"})
-
-    @property
-    def release(self) -> str:
-        """``1.10.2`` of ``v1.10.2-release built with rustc …``."""
-        return self.version.partition(" ")[0].partition("-")[0].removeprefix("v")
 
 
 def chosen_caller(args: argparse.Namespace, settings: OperatorSettings) -> AgentId:

@@ -28,8 +28,10 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AsyncExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, Any
+
+from msgspec import structs
 
 from bridge.cli import named, options, output, robots, running
 
@@ -66,9 +68,14 @@ def run(args: argparse.Namespace) -> int:
         from bridge.top.observer import Observer
         from bridge.top.screen import Screen, View
 
-        async with robots.session(settings.mesh, timeout_s=args.wait) as mesh:
+        async with AsyncExitStack() as stack:
+            mesh = await stack.enter_async_context(robots.session(settings.mesh, timeout_s=args.wait))
+            admin = mesh
+            if settings.mesh.namespace:
+                outside = structs.replace(settings.mesh, namespace=None)
+                admin = await stack.enter_async_context(robots.session(outside, timeout_s=args.wait))
             events: list[Event] = []
-            observer = Observer(mesh, robots.Operator(mesh, caller, args.wait), events.extend)
+            observer = Observer(mesh, robots.Operator(mesh, caller, args.wait), events.extend, admin)
             view = View(args.view, pattern=args.filter)
             screen = Screen(observer.picture, view, where=", ".join(settings.mesh.routers))
             await observer.begin()
@@ -164,6 +171,7 @@ def facts(observer: Observer) -> dict[str, Any]:
                 "state": picture.state_of(row),
                 "stopped": row.status.stopped if row.status else None,
                 "round_trip_ms": None if row.round_trip_s is None else round(1000 * row.round_trip_s, 3),
+                "link": _link(picture.link_of(row.info.zid, row.round_trip_s)),
                 "told_s": round(now - row.told_s, 3) if row.status else None,
                 "drops": dict(row.status.drops) if row.status else {},
             }
@@ -205,11 +213,21 @@ def facts(observer: Observer) -> dict[str, Any]:
                 "round_trip_ms": None if row.round_trip_s is None else round(1000 * row.round_trip_s, 3),
                 "answers": row.answers,
                 "lost": row.lost,
-                "links": row.links,
+                "links": sorted(row.links),
+                "links_ms": {zid: _ms(took_s) for zid, took_s in sorted(row.links.items())},
+                "link": _link(picture.link_of(row.zid, row.round_trip_s)),
             }
             for row in picture.programs.values()
         ],
     }
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else round(1000 * seconds, 3)
+
+
+def _link(link: tuple[str, float | None] | None) -> dict[str, Any] | None:
+    return None if link is None else {"router": link[0], "round_trip_ms": _ms(link[1])}
 
 
 def _rounded(number: float | None) -> float | None:

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 
+from bridge import link_bytes
 from bridge.listening import for_others
 from bridge.settings import GatewaySettings
 from bridge.tokens.store import path_of
@@ -212,6 +213,7 @@ class Gateway:
         """
         self._record.open(self.settings, f"gateway {joined(for_others(self.settings.host), self.settings.port)}")
         self.mesh.tells, self.mesh.away, self.mesh.told = self._now, self._away, self._told
+        link_bytes.tell_of(self.mesh)
         await self._presence.start()
         self.mesh.on_link(lambda up: self._registry.robots.repeat_all() if up else None)
         await self._leases.take()

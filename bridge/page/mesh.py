@@ -5,20 +5,20 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from functools import partial
 from typing import Any
 
 import msgspec
 
-from macs_zenoh.errors import MacsError
+from bridge.graph.links import Routers
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.protocol import keyexpr, ping
-from macs_zenoh.protocol.directory import Directory, published
+from macs_zenoh.protocol import ping
+from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.keyexpr import LEASE, PING
 from macs_zenoh.protocol.limits import NAME_BYTES
 from macs_zenoh.protocol.messages import ROS, UNITY
 from macs_zenoh.protocol.rights import Grant
+from macs_zenoh.protocol.routers import Router, between
 from macs_zenoh.versions import installed
 
 from .fresh import Fresh
@@ -35,21 +35,6 @@ SESSIONS = 1024
 """More are shown without the length of the way to them."""
 
 
-class _Session(msgspec.Struct):
-    """A session of a router, as its admin space has it."""
-
-    peer: str = ""
-    whatami: str = ""
-
-
-class _Router(msgspec.Struct):
-    """A router, likewise."""
-
-    zid: str
-    version: str = ""
-    sessions: list[_Session] = []
-
-
 class Picture:
     """Made when somebody looks, and no more often than it changes."""
 
@@ -57,8 +42,12 @@ class Picture:
         self._mesh = mesh
         self._directory = directory
         self._robots = robots
-        self._routers: Fresh[list[_Router]] = Fresh(self._ask_routers, ROUTERS_GOOD_S)
+        self._known = Routers(mesh)
+        self._routers: Fresh[list[Router]] = Fresh(self._known.look, ROUTERS_GOOD_S)
+        self._carried: dict[str, tuple[float, int]] = {}
+        """By session, what its links had carried when."""
         self._gateways: Fresh[set[str]] = Fresh(self._ask_gateways, ROUTERS_GOOD_S)
+        self._own: Fresh[dict[str, Any]] = Fresh(self._own_rate, PING_GOOD_S)
         self._pings: dict[str, Fresh[dict[str, Any]]] = {}
         self._room = asyncio.Semaphore(PINGS_AT_ONCE)
 
@@ -73,15 +62,17 @@ class Picture:
         gateways = {*(self._gateways.last() or ()), self._mesh.zid}
         sessions = {agent.zid for agent in (*robots, *headsets)} | gateways
         self._forget({agent.zid for agent in everybody} | gateways)
+        routers = self._shown_routers(sessions)
+        rate = self._own.last() or {}
         return {
             "time": time.time(),
             "own": self._mesh.zid,
             "linked": self._mesh.linked,
-            "routers": self._shown_routers(sessions),
+            "routers": routers,
             "gateways": sorted(gateways),
             "sessions": {
                 **self._shown_sessions(sessions),
-                self._mesh.zid: {"address": address, "version": installed("macs-zenoh"), "drops": dict(drops)},
+                self._mesh.zid: {"address": address, "version": installed("macs-zenoh"), "drops": dict(drops), **rate},
             },
             "robots": [
                 {"id": agent.id, "group": agent.group, "session": agent.zid, **_state(states.get(agent.id))}
@@ -94,23 +85,28 @@ class Picture:
         """Ask no more."""
         self._routers.close()
         self._gateways.close()
+        self._own.close()
         for fresh in self._pings.values():
             fresh.close()
 
     def _shown_routers(self, sessions: set[str]) -> list[dict[str, Any]]:
         routers = {router.zid: router for router in self._routers.last() or ()}
         linked = set(self._mesh.routers)
+        trips = self._known.trips
+        of_links = between({zid: router.linked for zid, router in routers.items()}, sorted(linked), trips)
         shown = []
         for zid in sorted(routers.keys() | linked):
-            router = routers.get(zid, _Router(zid))
-            peers = {session.peer for session in router.sessions}
+            router = routers.get(zid, Router(zid))
+            others = sorted(set(router.linked) & routers.keys())
             shown.append(
                 {
                     "zid": zid,
-                    "version": router.version.partition(" ")[0].partition("-")[0].removeprefix("v"),
+                    "version": router.release,
                     "linked": zid in linked,
-                    "sessions": sorted(sessions & ({published(peer) for peer in peers} | peers)),
-                    "routers": sorted(peers & routers.keys()),
+                    "roundTripMs": _ms(trips.of(zid)),
+                    "sessions": sorted(sessions & (router.behind | ({self._mesh.zid} if zid in linked else set()))),
+                    "routers": others,
+                    "linksMs": {other: _ms(of_links.get((zid, other))) for other in others},
                 }
             )
         return shown
@@ -119,6 +115,7 @@ class Picture:
         """Ping none but these, whoever may know of them."""
         for gone in self._pings.keys() - sessions:
             self._pings.pop(gone).close()
+            self._carried.pop(gone, None)
 
     def _shown_sessions(self, sessions: set[str]) -> dict[str, dict[str, Any]]:
         good_s = max(PING_GOOD_S, len(sessions) / PINGS_PER_S)
@@ -136,21 +133,30 @@ class Picture:
             answer = await self._mesh.query(PING.of(zid=zid), b"", timeout_s=PING_S)
             took_ms = (time.perf_counter() - began) * 1000
         said, _ = ping.decode(answer)
-        return {"roundTripMs": took_ms, "address": said.address, "version": said.macs, "drops": said.drops}
+        told = {"roundTripMs": took_ms, "address": said.address, "version": said.macs, "drops": said.drops}
+        return {**told, **self._rate(zid, said.link_bytes)}
+
+    async def _own_rate(self) -> dict[str, Any]:
+        return self._rate(self._mesh.zid, self._mesh.carried())
+
+    def _rate(self, zid: str, counts: tuple[int, int] | None) -> dict[str, float]:
+        """Bytes a second that a session's links have carried since it told them the last time."""
+        now = time.monotonic()
+        before = self._carried.pop(zid, None)
+        if counts is None:
+            return {}
+        self._carried[zid] = now, sum(counts)
+        if before is None or before[1] > sum(counts) or now <= before[0]:  # the link is another one
+            return {}
+        return {"bytesPerS": (sum(counts) - before[1]) / (now - before[0])}
 
     async def _ask_gateways(self) -> set[str]:
         leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every())]
         return {lease.zid for lease in leases if lease is not None}
 
-    async def _ask_routers(self) -> list[_Router]:
-        found: list[_Router] = []
-        if self._mesh.settings.namespace:  # what they tell is in none
-            return found
-        with suppress(MacsError):
-            for _, answer in await self._mesh.ask_all(keyexpr.ROUTERS, timeout_s=PING_S):
-                with suppress(msgspec.MsgspecError):
-                    found.append(msgspec.json.decode(answer, type=_Router))
-        return found
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else 1000 * seconds
 
 
 class _Control(msgspec.Struct):

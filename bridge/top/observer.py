@@ -14,6 +14,7 @@ from contextlib import suppress
 
 from bridge.cli import robots
 from bridge.cli.robots import Operator
+from bridge.graph.links import Routers
 from macs_zenoh.errors import MacsError, NotServed, Refused, Unreachable
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.presence import Presence
@@ -41,8 +42,11 @@ OnEvents = Callable[[list[Event]], None]
 class Observer:
     """Keeps a `Picture` up to date until it is cancelled. ``on_events`` hears of what changes, once all was seen."""
 
-    def __init__(self, mesh: Mesh, operator: Operator, on_events: OnEvents) -> None:
+    def __init__(self, mesh: Mesh, operator: Operator, on_events: OnEvents, admin: Mesh | None = None) -> None:
+        """``admin`` is a session without the namespace that ``mesh`` may have: routers tell of themselves in none."""
         self.picture = Picture()
+        self._admin = admin or mesh
+        self._known = Routers(self._admin)
         self._mesh = mesh
         self._operator = operator
         self._on_events = on_events
@@ -153,8 +157,5 @@ class Observer:
         return pong, time.monotonic() - began
 
     async def _routers(self) -> None:
-        began = time.monotonic()
-        found = await self._operator.routers(timeout_s=ANSWER_S)
-        took_s = time.monotonic() - began
-        rows = {router.zid: (", ".join(router.locators), router.release, router.linked) for router in found}
-        self._tell(self.picture.routers(rows, took_s, time.time()))
+        found = await self._known.look()
+        self._tell(self.picture.routers(found, self._admin.routers, self._known.trips, time.time()))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from msgspec import UNSET
@@ -11,6 +11,7 @@ from macs_zenoh.protocol.directory import AgentInfo, Change
 from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.ping import GatewayAgent, GatewayTold, Pong
 from macs_zenoh.protocol.robot_state import CarriedStatus, NodeStatus, RobotStatus
+from macs_zenoh.protocol.routers import Router, Trips, between
 
 from .events import Event, of_gateway, of_presence, of_program, of_robot
 
@@ -85,8 +86,10 @@ class ProgramRow:
     round_trip_s: float | None = None
     answers: bool = True
     lost: int = 0
-    links: list[str] = field(default_factory=list)
-    """Of a router: those that it is linked with."""
+    links: dict[str, float | None] = field(default_factory=dict)
+    """Of a router: those that it is linked with, and the link's round trip in seconds where it is known."""
+    behind: frozenset[str] = frozenset()
+    """Of a router: the sessions that it has."""
     counters: dict[str, int] | None = None
     """Of a gateway: what was lost and refused there, by name."""
 
@@ -190,14 +193,26 @@ class Picture:
         before, row.counters = row.counters, told.lost
         return [] if before is None else list(of_gateway(row.address or zid[:8], before, told.lost, at_s))
 
-    def routers(
-        self, found: Mapping[str, tuple[str, str, list[str]]], round_trip_s: float, at_s: float
-    ) -> list[Event]:
-        """Routers by their id: address, version, and those that they are linked with."""
+    def routers(self, found: Iterable[Router], own: Collection[str], trips: Trips, at_s: float) -> list[Event]:
+        """Routers as they tell of themselves; ``own`` are those that we are linked with."""
+        routers = {router.zid: router for router in found}
+        linked = between({zid: router.linked for zid, router in routers.items()}, own, trips)
         rows = {}
-        for zid, (address, version, links) in found.items():
-            rows[zid] = ProgramRow("router", zid, address, f"Zenoh {version}", round_trip_s, links=links)
+        for zid, router in routers.items():
+            links = {other: linked.get((zid, other)) for other in router.linked}
+            release = f"Zenoh {router.release}" if router.release else ""
+            address = ", ".join(router.locators)
+            rows[zid] = ProgramRow("router", zid, address, release, trips.of(zid), links=links, behind=router.behind)
         return self._programs("router", rows, at_s)
+
+    def link_of(self, zid: str, round_trip_s: float | None) -> tuple[str, float | None] | None:
+        """The router that a session is behind, and the round trip of the link to it; None: nobody tells."""
+        for row in self.programs.values():
+            if zid in row.behind:
+                if round_trip_s is None or row.round_trip_s is None:
+                    return row.zid, None
+                return row.zid, max(0.0, round_trip_s - row.round_trip_s)
+        return None
 
     def _programs(self, kind: str, rows: Mapping[str, ProgramRow], at_s: float) -> list[Event]:
         before = {zid for zid, row in self.programs.items() if row.kind == kind}

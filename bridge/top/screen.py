@@ -21,11 +21,14 @@ from .picture import Picture
 VIEWS = ("robots", "topics", "headsets", "links", "lost", "events")
 HELP = "1 robots 2 topics 3 headsets 4 links 5 lost 6 events  s r sort  / filter  ↑↓  q quit"
 EVENTS = 200
+SILENT = "does not answer"
 STALE_S = 5.0
 """What a robot told longer ago is shown as old."""
 
 Row = tuple[tuple[Any, ...], tuple[str, ...], str]
 """What it is sorted by, its cells, and a style."""
+Links = list[tuple[str, float | None]]
+"""By the session at the other end, with the round trip of the link."""
 
 
 @dataclass
@@ -191,14 +194,28 @@ class Screen:
         return ("ID", "TYPE", "GROUP", "ADDRESS", "TOKEN", "AGE", "SESSION", "STATE"), {0, 2, 5}, rows
 
     def _links(self, now: float) -> tuple[Sequence[str], set[int], list[Row]]:
+        """Programs by the way to them, and each link by its own round trip."""
         rows: list[Row] = []
+
+        def add(kind: str, zid: str, name: str, trip: float | None, lost: int, links: Links, note: str) -> None:
+            told = [f"{other[:SHORT]} {_ms(took_s)}" for other, took_s in links]
+            what = ", ".join([*told, *([note] if note else [])]) or "-"
+            longest = max((took_s for _, took_s in links if took_s is not None), default=None)
+            keys = (kind, zid, name, trip, lost, longest)
+            rows.append(
+                (keys, (kind, zid[:SHORT], name, _ms(trip), str(lost), what), "" if note != SILENT else "bold red")
+            )
+
         for row in self.picture.programs.values():
             behind = sum(info.zid == row.zid for info in self.picture.others.values())
-            what = ", ".join(zid[:SHORT] for zid in row.links) or "-" if row.kind == "router" else f"{behind} agents"
-            what = what if row.answers else f"{what}, does not answer"
-            keys = (row.kind, row.zid, row.address, row.round_trip_s, row.lost, what)
-            cells = (row.kind, row.zid[:SHORT], row.address or "?", _ms(row.round_trip_s), str(row.lost), what)
-            rows.append((keys, cells, "" if row.answers else "bold red"))
+            link = self.picture.link_of(row.zid, row.round_trip_s)
+            links = list(row.links.items()) if row.kind == "router" else [link] if link else []
+            note = SILENT if not row.answers else "" if row.kind == "router" else f"{behind} agents"
+            add(row.kind, row.zid, row.address or "?", row.round_trip_s, row.lost, links, note)
+        for number, robot in self.picture.robots.items():
+            link = self.picture.link_of(robot.info.zid, robot.round_trip_s)
+            lost = sum(robot.status.drops.values()) if robot.status else 0
+            add("robot", robot.info.zid, f"robot {number}", robot.round_trip_s, lost, [link] if link else [], "")
         return ("KIND", "SESSION", "ADDRESS", "RTT", "LOST", "LINKED WITH"), {3, 4}, rows
 
     def _lost(self, now: float) -> tuple[Sequence[str], set[int], list[Row]]:

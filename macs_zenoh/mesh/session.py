@@ -103,6 +103,8 @@ class Mesh:
         """What a gateway tells of its agents (`ping.encode_told`)."""
         self.away: Callable[[], list[tuple[int, int]]] = list
         """(type, id) of a gateway's agents that are silent."""
+        self.carried: Callable[[], tuple[int, int] | None] = lambda: None
+        """Bytes that its links have sent and received, as far as they are known."""
         self._linked_with: set[str] = set()
         self._link_log = LinkLog(settings.mode)
         self._on_link: Callbacks[Callable[[bool], None]] = Callbacks()
@@ -219,6 +221,11 @@ class Mesh:
     def on_link(self, callback: Callable[[bool], None]) -> Handle:
         """Call ``callback(up)`` whenever the connection to the routers is lost or back."""
         return self._on_link.add(callback)
+
+    @property
+    def links(self) -> list[tuple[str, str]]:
+        """The links of this session: the endpoint here, and the one there."""
+        return [(str(link.src), str(link.dst)) for link in self._session.info.links()]
 
     def on_router(self, callback: Callable[[str], None]) -> Handle:
         """Call ``callback(zid)`` whenever a connection to a router has come about, or has come back."""
@@ -412,6 +419,7 @@ class Mesh:
                 now=now,
                 away=self.away(),
                 address=self.address,
+                link_bytes=self.carried(),
             )
             if payload.startswith(trace.PREFIX):
                 payload = self.tracing.answer(payload)

@@ -162,6 +162,13 @@ ROUTERS = "@/*/router"
 """The admin space of each router that shows it: version, sessions, addresses."""
 ADMIN = (ROUTERS, ROUTERS + "/**")
 """The admin space of routers, read only: versions, sessions, links."""
+
+
+def router_figures(zid: str) -> str:
+    """What a router tells in few bytes: asked for to see how long the way to it is."""
+    return f"@/{zid}/router/metrics"
+
+
 _RECOVERY, _SOURCES = "@adv/**", "@adv/pub/"
 
 

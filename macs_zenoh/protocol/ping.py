@@ -56,6 +56,8 @@ class Pong(msgspec.Struct, frozen=True, kw_only=True):
     """Where headsets reach it, as HOST:PORT, when it is a gateway."""
     away: list[tuple[int, int]] = []
     """(type, id) of agents of a gateway that it has not heard of for a while, though they are connected."""
+    link_bytes: tuple[int, int] | None = None
+    """What its links to routers have sent and received since they came about, as its kernel counts."""
 
 
 def pong(
@@ -68,6 +70,7 @@ def pong(
     now: dict[str, int],
     away: list[tuple[int, int]],
     address: str = "",
+    link_bytes: tuple[int, int] | None = None,
 ) -> Pong:
     """What a program with these settings says of itself."""
     return Pong(
@@ -83,6 +86,7 @@ def pong(
         now=now,
         away=away[:MOST_AWAY],
         address=address,
+        link_bytes=link_bytes,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import sys
 import threading
 import traceback
 from collections import Counter
@@ -167,6 +168,9 @@ async def test_the_mesh_is_told_as_far_as_it_is_known(
         known = {5, 6} == set(robots) and all(robot["known"] for robot in robots.values())
         behind = {other.mesh.zid, *(robot["session"] for robot in robots.values())}
         timed = all(told["sessions"].get(zid, {}).get("roundTripMs") for zid in behind)
+        timed = timed and all(router["roundTripMs"] for router in told["routers"])
+        rated = [told["sessions"].get(each.mesh.zid, {}).get("bytesPerS") for each in (gateway, other)]
+        timed = timed and (sys.platform != "linux" or all(rate is not None and rate >= 0 for rate in rated))
         return told if known and timed and len(told["gateways"]) == 2 and told["routers"] else None
 
     told = await until(whole)

@@ -11,11 +11,14 @@ import socket
 import struct
 import sys
 import termios
+from contextlib import AsyncExitStack
 from typing import Any
 
 import macs_zenoh
 from bridge.headset.client import Headset
+from macs_zenoh.config import MeshSettings
 from macs_zenoh.protocol.greetings import INIT_SYN
+from tests.support.links import delayed
 from tests.support.processes import ROOT
 from tests.support.programs import Program, ended, free_port, macs
 from tests.support.routers import Router
@@ -185,6 +188,40 @@ async def test_top_shows_which_routers_are_linked() -> None:
             return len(routers) == 2 and all(set(links) == routers.keys() - {zid} for zid, links in routers.items())
 
         await until(linked, every_s=0.2)
+
+
+async def test_top_shows_how_long_each_link_takes() -> None:
+    """A link that takes 20 ms longer in either direction is the one that is shown to; those of the robot and of the
+    gateway are not. In a namespace as well."""
+    async with AsyncExitStack() as stack:
+        first = await stack.enter_async_context(Router())
+        slow = await stack.enter_async_context(delayed(first.endpoint, 0.02))
+        second = await stack.enter_async_context(Router(connect=[slow]))
+        words = ("--namespace", "hall")
+        settings = MeshSettings(connect=[first.endpoint], namespace="hall")
+        robot = await stack.enter_async_context(macs_zenoh.join("ros", id=7, settings=settings))
+
+        async def status(call: macs_zenoh.Call) -> bytes:
+            return json.dumps(STATE).encode()
+
+        robot.serve("status", status)
+        argv = ("gateway", "--port", "0", "-e", second.endpoint, *words)
+        await stack.enter_async_context(Program(*argv))
+
+        async def timed() -> bool:
+            said = await macs("top", "--json", "-e", second.endpoint, *words)
+            rows = {row["kind"]: row for row in said["programs"] if row["link"] or row["kind"] == "router"}
+            routers = [row for row in said["programs"] if row["kind"] == "router"]
+            of_routers = [took for row in routers for took in row["links_ms"].values()]
+            behind = said["robots"][0]["link"] if said["robots"] else None
+            if len(of_routers) != 2 or None in of_routers or "gateway" not in rows or behind is None:
+                return False
+            assert min(of_routers) >= 40
+            assert rows["gateway"]["link"]["router"] != behind["router"]
+            took = (behind["round_trip_ms"], rows["gateway"]["link"]["round_trip_ms"])
+            return None not in took and max(took) < 40  # of one answer a busy machine may make more
+
+        await until(timed, every_s=0.2)
 
 
 async def test_ping_says_how_long_a_robot_takes(router: str) -> None:

@@ -8,7 +8,6 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from bridge.cli.robots import Router
 from bridge.top.events import KINDS, Event, of_robot
 from bridge.top.picture import MOST_TOPICS, SILENT_AFTER, Picture
 from bridge.top.screen import Screen, View
@@ -23,6 +22,7 @@ from macs_zenoh.protocol.robot_state import (
     RobotStatus,
     StopStatus,
 )
+from macs_zenoh.protocol.routers import Router, Trips
 
 HOLDS = "the emergency stop holds (stopped)"
 
@@ -159,8 +159,8 @@ def test_gateways_and_routers_come_and_go() -> None:
     assert not picture.programs["g1"].answers
     (gone,) = picture.gateways({}, 3.0)
     assert gone.text == "gateway 10.0.0.5:7000 has gone"
-    assert kinds(picture.routers({"r1": ("tcp/10.0.0.1:7447", "1.10.2", ["r2"])}, 0.001, 1.0)) == ["came"]
-    assert kinds(picture.routers({}, 0.001, 1.0)) == ["left"]
+    assert kinds(picture.routers([Router("r1", "v1.10.2-x", ["tcp/10.0.0.1:7447"])], ["r1"], Trips(), 1.0)) == ["came"]
+    assert kinds(picture.routers([], [], Trips(), 1.0)) == ["left"]
 
 
 def test_links_are_read_from_what_routers_tell() -> None:

@@ -76,7 +76,7 @@ export class MeshView {
     ].map(([list, name]) => `${list.length} ${name}${list.length === 1 ? "" : "s"}`);
     say(this.summary, `${counts.join(" · ")}${linked ? "" : " · this gateway has lost its routers"}`);
     this.#table(picture);
-    const drawn = JSON.stringify([robots, headsets, gateways, routers, rounded(picture.sessions)]);
+    const drawn = JSON.stringify([robots, headsets, gateways, roundedTrips(routers), rounded(picture.sessions)]);
     if (drawn === this.known) return;
     this.known = drawn;
     this.#draw(picture);
@@ -125,13 +125,18 @@ export class MeshView {
     };
     for (const router of shownRouters) {
       const here = routerAt.get(router.zid);
-      for (const other of router.routers) if (other > router.zid) links.append(line(here, routerAt.get(other), "router"));
+      for (const other of router.routers) {
+        if (other > router.zid) links.append(line(here, routerAt.get(other), "router", { trip: router.linksMs[other] ?? undefined }));
+      }
       marks.append(mark(here, "router", "router", router.version ? `Zenoh ${router.version}` : router.zid.slice(0, 8)));
     }
     gateways.forEach((zid, at) => {
       const here = place(at, gateways.length, COLUMNS.gateways);
-      const { roundTripMs, address, drops } = sessions[zid] ?? {};
-      for (const router of routersOf(zid)) links.append(line(here, routerAt.get(router.zid), "gateway", roundTripMs));
+      const { address, drops } = sessions[zid] ?? {};
+      for (const router of routersOf(zid)) {
+        const carries = zid === own ? ofOwn(router, sessions[own]) : ofLink(router, sessions[zid]);
+        links.append(line(here, routerAt.get(router.zid), "gateway", carries));
+      }
       this.#headsets(links, marks, here, behind.get(zid) ?? []);
       marks.append(mark(here, "gateway", zid === own ? "this gateway" : "gateway", address ?? "", lostOf(drops)));
     });
@@ -139,10 +144,10 @@ export class MeshView {
       const column = Math.floor(at / 24);
       const inColumn = Math.min(24, robots.length - column * 24);
       const here = place(at % 24, inColumn, COLUMNS.robots - (columns - 1) * 40 + column * 70);
-      const { roundTripMs, drops } = sessions[robot.session] ?? {};
+      const { drops } = sessions[robot.session] ?? {};
       for (const router of routersOf(robot.session)) {
         const from = robots.length > 24 ? "faint" : "robot";
-        links.append(line(routerAt.get(router.zid), here, from, robots.length > 24 ? undefined : roundTripMs));
+        links.append(line(routerAt.get(router.zid), here, from, robots.length > 24 ? {} : ofLink(router, sessions[robot.session])));
       }
       const kind = robot.stopped ? "robot stopped" : "robot";
       marks.append(mark(here, kind, `Robot ${robot.id}`, robot.stopped ? "stopped" : "", lostOf(robot.drops, drops)));
@@ -174,12 +179,33 @@ export class MeshView {
   }
 }
 
-function line(from, to, kind, roundTripMs) {
+/** What a link of the session behind a router takes there and back, and carries. */
+function ofLink({ roundTripMs: toRouter }, { roundTripMs, bytesPerS } = {}) {
+  if (roundTripMs === undefined) return { bytesPerS };
+  // where nobody could ask the router it is known of the whole way only
+  return toRouter === null ? { most: roundTripMs, bytesPerS } : { trip: Math.max(0, roundTripMs - toRouter), bytesPerS };
+}
+
+/** The same of this gateway's own. */
+function ofOwn({ roundTripMs }, { bytesPerS } = {}) {
+  return { trip: roundTripMs ?? undefined, bytesPerS };
+}
+
+function line(from, to, kind, { trip, most, bytesPerS } = {}) {
   const middle = (from.x + to.x) / 2;
   const path = svg("path", { class: kind, d: `M${from.x} ${from.y} C${middle} ${from.y} ${middle} ${to.y} ${to.x} ${to.y}` });
-  if (roundTripMs === undefined) return path;
-  const text = svg("text", { class: "note", x: middle, y: (from.y + to.y) / 2 - 6 }, `${digits(roundTripMs)} ms`);
-  return svg("g", {}, path, text);
+  const at = { class: "note", x: middle, y: (from.y + to.y) / 2 - 6 };
+  const texts = [];
+  if (trip !== undefined) texts.push(`${digits(trip)} ms`);
+  else if (most !== undefined) texts.push(`≤ ${digits(most)} ms`);
+  const group = svg("g", { class: "link" }, path);
+  if (texts.length) group.append(svg("text", at, texts[0]));
+  if (bytesPerS !== undefined) group.append(svg("text", { ...at, y: at.y + 18 }, rate(bytesPerS)));
+  return group;
+}
+
+function rate(bytesPerS) {
+  return bytesPerS < 1e6 ? `${digits(bytesPerS / 1e3)} kB/s` : `${digits(bytesPerS / 1e6)} MB/s`;
 }
 
 function mark({ x, y }, kind, title, note, lost) {
@@ -198,9 +224,16 @@ function lostOf(...drops) {
   return found.map(([name, count]) => `${name} ${count}`).join(", ");
 }
 
-/** Round trips as they are shown: what nobody sees is no reason to draw. */
+/** Round trips and rates as they are shown: what nobody sees is no reason to draw. */
 function rounded(sessions) {
-  return Object.entries(sessions).map(([zid, { roundTripMs, drops }]) => {
-    return [zid, roundTripMs === undefined ? "" : digits(roundTripMs), drops];
+  return Object.entries(sessions).map(([zid, { roundTripMs, bytesPerS, drops }]) => {
+    return [zid, roundTripMs === undefined ? "" : digits(roundTripMs), bytesPerS === undefined ? "" : rate(bytesPerS), drops];
+  });
+}
+
+function roundedTrips(routers) {
+  const shown = (ms) => (ms === null ? "" : digits(ms));
+  return routers.map(({ zid, version, linked, sessions, roundTripMs, linksMs }) => {
+    return [zid, version, linked, sessions, shown(roundTripMs), Object.entries(linksMs).map(([other, ms]) => [other, shown(ms)])];
   });
 }
