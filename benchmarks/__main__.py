@@ -20,7 +20,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from . import awareness, cases, crowd, differing, door, peers, ports, recording, robot_speed, scale
+from . import awareness, cases, crowd, differing, door, peers, ports, recording, robot_speed, scale, traces
 from .figures import Figure, markdown, table
 from .peer_ends import KINDS
 from .plan import Plan
@@ -35,6 +35,7 @@ WITHOUT_ROS = {
     **ports.CASES,
     **door.CASES,
     **recording.CASES,
+    **traces.CASES,
 }
 CASES = {**WITHOUT_ROS, **WITH_ROS}
 ONLY_ASKED_FOR = ("mixed", "peers", "recording")
