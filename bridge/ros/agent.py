@@ -16,7 +16,6 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import TypeVar
 
-from bridge import link_bytes
 from bridge.audit import open_audit, who
 from bridge.metrics.endpoint import watched_at
 from bridge.ros.checked import CheckedSettings
@@ -153,7 +152,6 @@ class RobotAgent:
         self.agent.mesh.on_link(self._link)
         self._last_words = self.agent.mesh.last_words(self.nodes.last_words)
         self.agent.mesh.tells = self._troubles
-        link_bytes.tell_of(self.agent.mesh)
         for verb, handler in (
             ("add_node", self._add_node),
             ("remove_node", self._remove_node),

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 import macs_zenoh
+from bridge import link_bytes
 from bridge.ros.agent import STOP_MESSAGES_S, RobotAgent
 from bridge.ros.safety import EmergencyStop
 from bridge.ros.side import Side
@@ -51,6 +52,7 @@ async def joined(
         guard=guard,
         on_waiting=on_waiting,
     ) as agent:
+        link_bytes.tell_of(agent.mesh)
         ros_agent = RobotAgent(agent, session, robot, own, guard, emergency_stop)
         await ros_agent.start()
         log.info("robot %d serves %s", agent.id, session.full_name)
