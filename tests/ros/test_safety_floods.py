@@ -109,7 +109,13 @@ async def drives(heard: Heard) -> None:
     await until(lambda: 0.5 in heard.since(since))
 
 
-@pytest.mark.parametrize("name", [*PUTS, *QUERIES])
+USUAL = ("status in runs", "commands", "stop queries")
+"""One that waits in queues, one that is judged where it comes, one that asks: the others have once been faults too."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in USUAL else pytest.mark.soak) for name in (*PUTS, *QUERIES)]
+)
 async def test_a_stop_pressed_once_takes_effect(domain: int, peer: Peer, tmp_path: Path, name: str) -> None:
     """A headset's stop that is sent once, an operator's, and the dead-man when the driver falls silent; and nothing of
     the flood stays in memory."""
