@@ -47,6 +47,8 @@ SOAK = (
     "tests/integration/test_page_load.py",
     "tests/integration/test_page_many.py",
     "tests/integration/test_wheel.py::test_a_shipped_interface_package_builds",
+    "tests/integration/test_wheel.py::test_every_verb_is_there",
+    "tests/integration/test_wheel.py::test_init_writes_what_programs_take",
     "tests/ros/test_awareness_robots.py",
     "tests/ros/test_interfaces.py",
 )

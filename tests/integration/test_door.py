@@ -667,6 +667,7 @@ async def test_a_robot_whose_token_makes_it_none_is_told_of(
     await until(lambda: any("shows no valid token at the plain port" in message for message in caplog.messages))
 
 
+@pytest.mark.soak
 async def test_ten_thousand_attempts_leave_nothing_behind(
     start_door: StartDoor, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
