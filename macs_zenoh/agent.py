@@ -22,8 +22,7 @@ from .protocol.agent_id import AgentId
 from .protocol.directory import AgentInfo, Change, Directory
 from .protocol.guard import Guard
 from .protocol.keyexpr import BROADCAST, GROUP, type_name, type_number
-from .protocol.messages import BROADCAST as EVERYBODY
-from .protocol.messages import Metadata, NodeType
+from .protocol.messages import EVERYBODY, Metadata, NodeType
 from .protocol.reading import Message, Reader
 from .protocol.routing import call, inbox, keys_of
 from .protocol.wire import Layout, encode_frame, encode_message

@@ -24,7 +24,7 @@ from .mesh import Mesh, Traffic
 from .protocol.budget import may_have_one_more
 from .protocol.directory import Directory
 from .protocol.guard import STOP_TOPIC, presses
-from .protocol.messages import BROADCAST, ROS, Metadata, node_name
+from .protocol.messages import EVERYBODY, ROS, Metadata, node_name
 from .protocol.routing import call
 from .protocol.wire import Header, Layout
 
@@ -125,7 +125,7 @@ class Presses:
         return any((sender, robot) in self._unsettled for robot in robots)
 
     def _robots(self, header: Header) -> Iterable[int]:
-        if header.agent_type == BROADCAST:
+        if header.agent_type == EVERYBODY:
             return self._directory.ids(ROS)
         if header.agent_type != ROS:
             return ()

@@ -7,7 +7,7 @@ import logging
 from bridge.audit import NO_AUDIT, Audit, open_audit, who
 from bridge.settings import GatewaySettings
 from macs_zenoh.losses import Losses
-from macs_zenoh.protocol.keyexpr import type_name
+from macs_zenoh.protocol.agent_id import AgentId
 
 from .connection import Connection
 
@@ -27,8 +27,7 @@ class Record:
 
     def agent(self, event: str, connection: Connection, what: str = "", result: str = "done") -> None:
         """An agent did something, or something was done to it."""
-        kind, agent_id = connection.key
-        by = who(f"{type_name(kind)}/{agent_id}", connection.address, connection.peer.grant.name)
+        by = who(str(AgentId(*connection.key)), connection.address, connection.peer.grant.name)
         self._audit.record(event, by, what, result)
 
     def address(self, event: str, address: str, what: str, result: str = "done") -> None:

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 from macs_zenoh.protocol.credit import Credit
 from macs_zenoh.protocol.directory import AgentInfo
-from macs_zenoh.protocol.messages import BROADCAST as EVERYBODY
-from macs_zenoh.protocol.messages import ROS
+from macs_zenoh.protocol.messages import EVERYBODY, ROS
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.routing import keys_of
 from macs_zenoh.protocol.wire import Frames, Header

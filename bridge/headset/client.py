@@ -35,7 +35,7 @@ from macs_zenoh.protocol.addresses import joined
 from macs_zenoh.protocol.command_clock import NO_CLOCK
 from macs_zenoh.protocol.limits import ANSWER_BYTES
 from macs_zenoh.protocol.messages import (
-    BROADCAST,
+    EVERYBODY,
     EXTENSIONS,
     OTHER_TYPE,
     ROS,
@@ -385,7 +385,7 @@ class Headset:
         self,
         data: bytes,
         *,
-        to: int = BROADCAST,
+        to: int = EVERYBODY,
         ids: Collection[int] = (),
         groups: Collection[int] = (),
         manager: str = "",

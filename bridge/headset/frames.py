@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from macs_zenoh.protocol.messages import (
-    BROADCAST,
+    EVERYBODY,
     ROS,
     UNITY,
     AddNode,
@@ -167,7 +167,7 @@ def plain_data(
     agent_id: int,
     data: bytes | bytearray | memoryview,
     *,
-    to_type: int = BROADCAST,
+    to_type: int = EVERYBODY,
     ids: Collection[int] = (),
     groups: Collection[int] = (),
     manager: str = "",

@@ -22,7 +22,7 @@ from ..errors import BadField, BadJson, TooLong, UnknownManager
 from .json_fields import StructT, converted, fields_of, json_object, judged, snake, snake_object, wire_names
 from .limits import CONFIGURATION_BYTES, MANAGEMENT_BYTES, METADATA_BYTES, NAME_BYTES, REQUEST_BYTES
 
-BROADCAST = 0
+EVERYBODY = 0
 """Agent type of a header that goes to everybody."""
 ROS = 1
 """Agent type of robots."""

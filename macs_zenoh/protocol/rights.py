@@ -16,7 +16,7 @@ from msgspec import Meta, Struct, field
 from .credit import Credit
 from .guard import STOP_TOPIC
 from .messages import (
-    BROADCAST,
+    EVERYBODY,
     MANAGERS,
     ROS,
     UNITY,
@@ -119,11 +119,11 @@ class Rights(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def of_frame(self, header: Header, metadata: Metadata, name: str | None) -> str | None:
         """Why a frame for others may not go on; None: it may. ``name`` is that of the topic, service or action that
         the agent registered under the frame's node name, None when it registered none."""
-        if header.agent_type not in (BROADCAST, ROS, UNITY):
+        if header.agent_type not in (EVERYBODY, ROS, UNITY):
             return f"there are no agents of type {header.agent_type} to send to"
-        if header.agent_type == BROADCAST and not self.has("broadcast"):
+        if header.agent_type == EVERYBODY and not self.has("broadcast"):
             return _missing("broadcast")
-        why = None if header.agent_type == BROADCAST else self._named(header.agent_type, header.ids, header.groups)
+        why = None if header.agent_type == EVERYBODY else self._named(header.agent_type, header.ids, header.groups)
         if why is None and header.agent_type == UNITY:
             why = self._to_headsets(metadata)
         elif why is None and metadata.node_name:

@@ -9,8 +9,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 from .keyexpr import BROADCAST, CALL, GROUP, STREAM, UNICAST, block_of
-from .messages import BROADCAST as EVERYBODY
-from .messages import Metadata
+from .messages import EVERYBODY, Metadata
 from .wire import MACS, Header, Layout, encode_frame, encode_message
 
 

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from macs_zenoh.protocol.messages import (
-    BROADCAST,
+    EVERYBODY,
     MANAGERS,
     ROS,
     UNITY,
@@ -159,17 +159,17 @@ def test_headsets_and_everybody_need_rights_of_their_own() -> None:
     """Sending to headsets and to everybody is not part of what one may do with robots, nor is one of the other."""
     robots_only = rights("see", "command", "call", "serve", "act", "stop", "ask")
     assert robots_only.of_frame(header(UNITY, (300,)), Metadata(), None) is not None
-    assert robots_only.of_frame(header(BROADCAST), Metadata(), None) is not None
+    assert robots_only.of_frame(header(EVERYBODY), Metadata(), None) is not None
     assert rights("send").of_frame(header(UNITY, (300,), (3,)), Metadata(), None) is None
     assert rights("send").of_frame(header(UNITY, (), (4,)), Metadata(), None) is not None
-    assert rights("send", robots="any").of_frame(header(BROADCAST), Metadata(), None) is not None
+    assert rights("send", robots="any").of_frame(header(EVERYBODY), Metadata(), None) is not None
     loud = rights("broadcast", robots="any")
-    assert loud.of_frame(header(BROADCAST), Metadata(), None) is None
-    assert loud.of_frame(header(BROADCAST), data(2, "/cmd_vel"), "/cmd_vel") is not None
+    assert loud.of_frame(header(EVERYBODY), Metadata(), None) is None
+    assert loud.of_frame(header(EVERYBODY), data(2, "/cmd_vel"), "/cmd_vel") is not None
     for manager, needed in {"RobotStatus": "see", "RobotControl": "command", "Own": "ask"}.items():
         asking = Metadata(UNITY, 300, message_manager=manager)
-        assert loud.of_frame(header(BROADCAST), asking, None) is not None
-        assert rights("broadcast", needed, robots="any").of_frame(header(BROADCAST), asking, None) is None
+        assert loud.of_frame(header(EVERYBODY), asking, None) is not None
+        assert rights("broadcast", needed, robots="any").of_frame(header(EVERYBODY), asking, None) is None
     assert loud.of_frame(header(UNITY, (300,)), Metadata(), None) is not None
     assert loud.of_frame(header(7, (300,)), Metadata(), None) is not None
     with pytest.raises(ValueError, match="needs --robots any"):
