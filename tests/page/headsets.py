@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import array
 import asyncio
+import json
 import math
+import struct
+import time
+import zlib
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import CompressedImage
 
-from tests.page.conftest import Site
+from tests.page.conftest import Act, Site
+from tests.page.driving import Heard
 from tests.support.browser import ROOT, SCREENSHOTS, Watched, browser, opened
+from tests.support.ros_peer import Peer
 from tests.support.waiting import until
 
 IWER = ROOT / "build" / "npm" / "node_modules" / "iwer" / "build" / "iwer.min.js"
@@ -25,6 +35,23 @@ device.installRuntime({ forceInstall: true }); // Chromium has one, without a he
 device.position.set(0, 1.6, 0.2);
 window.device = device;
 """
+PICTURES = "/test/picture"
+PATIENT = {"lockoutS": 5}
+"""Settings of tests that are about something else: a machine that draws by its processor is slow at times."""
+
+PIXELS = """([across, down, size]) => new Promise((done) => {
+  const { stage } = macsXr;
+  const render = Object.getPrototypeOf(stage).render;
+  stage.render = () => {
+    render.call(stage);
+    delete stage.render;
+    const gl = stage.renderer.getContext();
+    const pixels = new Uint8Array(4 * size * size);
+    const [x, y] = [gl.drawingBufferWidth * across, gl.drawingBufferHeight * (1 - down)].map(Math.round);
+    gl.readPixels(x - size / 2, y - size / 2, size, size, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    done(Array.from(pixels));
+  };
+})"""
 PLACE = """([name, [x, y, z], q]) => {
   const hand = name.endsWith('Hand') ? device.hands[name.slice(0, -4)] : device.controllers[name];
   const one = name === 'head' ? device : hand;
@@ -98,6 +125,30 @@ class Headset:
         """What the worker of commands says."""
         return await self.value(f"macsXr.telling.state.{name}")
 
+    async def pixels(self, across: float = 0.5, down: float = 0.42, size: int = 48) -> list[int]:
+        """What is drawn around a place, from 0 to 1: read back from the frame that is drawn next."""
+        return [int(each) for each in await self.value(PIXELS, [across, down, size])]
+
+    async def drives(self, heard: Heard, take: Act, let_go: Act) -> None:
+        """Hold until the robot is told to go; anew where a busy machine let the scene stand still."""
+        heard.speeds.clear()
+
+        async def told() -> bool:
+            if not await self.state("held"):
+                await let_go()
+                await until(lambda: self.state("barred === ''"))
+                await self.frame()
+                await take()
+                await asyncio.sleep(0.1)
+            return len(heard.speeds) > 3 and heard.last is not None and heard.last > 0
+
+        await until(told, every_s=0.05)
+
+    async def frame(self, count: int = 2) -> None:
+        """Wait until the scene has had so many frames."""
+        before = await self.value("macsXr.frames")
+        await until(lambda: self.value(f"macsXr.frames >= {before + count}"))
+
     async def shot(self, name: str) -> Path:
         """A picture of what is seen."""
         SCREENSHOTS.mkdir(parents=True, exist_ok=True)
@@ -114,12 +165,15 @@ async def with_webgl(site: Site) -> AsyncIterator[Site]:
         yield site
 
 
-async def headset_at(site: Site, path: str = "xr", script: str = "", **options: Any) -> Headset:
-    """A headset that has opened the scene."""
-    options = {"viewport": {"width": 1280, "height": 800}, **options}
+async def headset_at(site: Site, path: str = "xr", settings: dict[str, Any] | None = None, **options: Any) -> Headset:
+    """A headset that has opened the scene, with these settings."""
+    options = {"viewport": {"width": 640, "height": 420}, **options}
     context = await site.browser.new_context(**options)
     await context.add_init_script(path=IWER)
-    await context.add_init_script(script=DEVICE + script)
+    kept = json.dumps(json.dumps({**PATIENT, **(settings or {})}))
+    await context.add_init_script(
+        script=f"{DEVICE}\nlocalStorage.getItem('macs.xr') ?? localStorage.setItem('macs.xr', {kept})"
+    )
     watched = await opened(context, site.url + path)
     site.pages.append(watched)
     return Headset(watched)
@@ -133,3 +187,68 @@ def about_up(radians: float) -> tuple[float, float, float, float]:
 async def pause(seconds: float) -> None:
     """For what must not happen meanwhile."""
     await asyncio.sleep(seconds)
+
+
+class Pictures:
+    """A camera that a test can freeze: small pictures at 30 Hz on a topic of its own."""
+
+    def __init__(self, domain: int) -> None:
+        self._peer = Peer(domain, "camera")
+        self._task: asyncio.Task[None] | None = None
+        self._mode = "go"
+        self._sent_at = 0.0
+        self._kept: Any = None
+
+    async def __aenter__(self) -> Pictures:
+        publisher = await self._peer.publisher(CompressedImage, PICTURES, qos_profile_sensor_data)
+        self._task = asyncio.create_task(self._run(publisher))
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+        self._peer.session.close()
+
+    def freeze(self) -> float:
+        """No picture any more; when the last one was sent."""
+        self._mode = "frozen"
+        return self._sent_at
+
+    def repeat(self) -> None:
+        """The last picture again and again, as a driver that hangs sends it."""
+        self._mode = "repeat"
+
+    def go_on(self) -> None:
+        """New pictures again."""
+        self._mode = "go"
+
+    async def _run(self, publisher: Any) -> None:
+        shade = 0
+        while True:
+            if self._mode == "go" or self._kept is None:
+                shade = (shade + 8) % 256
+                self._kept = self._picture(shade)
+            if self._mode != "frozen":
+                await self._peer.session.run(partial(publisher.publish, self._kept))
+                self._sent_at = time.monotonic()
+            await asyncio.sleep(1 / 30)
+
+    def _picture(self, shade: int) -> Any:
+        message = CompressedImage()
+        message.header.stamp = self._peer.session.node.get_clock().now().to_msg()
+        message.format = "png"
+        message.data = array.array("B", png(32, 24, shade))
+        return message
+
+
+def png(width: int, height: int, shade: int) -> bytes:
+    """A picture of one grey, as a PNG file."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    rows = (b"\0" + bytes([shade]) * width) * height
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    parts = (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows, 1)), chunk(b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)

@@ -54,6 +54,7 @@ class Scene {
     this.wishes = [];
     /** How long the work of each of the last frames took, in ms. */
     this.frameMs = [];
+    this.frames = 0;
   }
 
   start() {
@@ -114,6 +115,7 @@ class Scene {
     this.hands.show(sources, this.pointing.distances, this.telling.state.source);
     this.links.showPictures(this.room, this.wishes);
     this.stage.render();
+    this.frames += 1;
     this.frameMs.push(performance.now() - began);
     if (this.frameMs.length > 600) this.frameMs.splice(0, 300);
   }

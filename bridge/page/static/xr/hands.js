@@ -70,7 +70,7 @@ class Hand {
     let at = 0;
     for (const joint of Object.values(joints)) {
       if (at === JOINTS) break;
-      const size = joint.radius || 0.008;
+      const size = Math.min(0.011, joint.radius || 0.008);
       this.matrix.makeScale(size, size, size).setPosition(joint.x, joint.y, joint.z);
       this.joints.setMatrixAt(at++, this.matrix);
     }

@@ -16,7 +16,7 @@ export class Links extends EventTarget {
     /** key → what is known of a topic that is received. */
     this.rates = new Map();
     this.sightUp = { connected: false, id: 0, badMessages: 0 };
-    /** How long pictures took from the socket to the scene, in ms. */
+    /** How long the last pictures took until they were shown: since the socket, and since their stamp by whose clock it is, ms. */
     this.pictureMs = [];
     this.commands.onmessage = ({ data }) => this.#take(data);
     this.sight.onmessage = ({ data }) => this.#see(data);
@@ -66,13 +66,14 @@ export class Links extends EventTarget {
 
   /** Give each panel its newest picture, and ask for the next one. */
   showPictures(room, wishes) {
-    for (const [key, { bitmap, at }] of this.#pictures) {
+    for (const [key, { bitmap, at, stamp }] of this.#pictures) {
       const wish = wishes.find((each) => each.key === key);
       const screen = wish && room.screens.get(wish.panel);
       if (screen) screen.show(bitmap, wish.eye);
       else bitmap.close();
       this.sight.postMessage({ op: "shown", key });
-      this.pictureMs.push(performance.timeOrigin + performance.now() - at);
+      const now = performance.timeOrigin + performance.now();
+      this.pictureMs.push({ key, sinceSocket: now - at, sinceStamp: now - stamp });
       if (this.pictureMs.length > 600) this.pictureMs.splice(0, 300);
     }
     this.#pictures.clear();

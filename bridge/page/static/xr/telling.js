@@ -125,7 +125,7 @@ export class Telling {
         [{ id: "smaller", label: "World −" }, { id: "larger", label: "World +" }, { id: "arrange", label: "Arrange" }],
         [
           { id: "flat", label: "Curve", on: settings.get("curve") > 0 },
-          { id: "hand", label: `Pinch: ${settings.get("hand")}` },
+          { id: "hand", label: settings.get("hand") === "left" ? "Pinch L" : "Pinch R" },
           { id: "leave", label: "Leave", off: !scene.immersion.session },
         ],
         [{ id: "stop", label: "STOP", tone: "stop", off }, ...release],

@@ -1,0 +1,146 @@
+"""No command on what is old: pictures that freeze, somebody who is not there, a scene that hangs.
+
+With a real robot that keeps its last speed, so that every zero is the headset's."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import time
+from functools import partial
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from tests.page.conftest import Act, Site, StartSite
+from tests.page.driving import heard_at
+from tests.page.headsets import PICTURES, Headset, Pictures, headset_at, needs_headset, with_webgl
+from tests.support.browser import needs_browser
+from tests.support.waiting import until
+
+pytestmark = [needs_browser, needs_headset, pytest.mark.timeout(240)]
+
+LOCKOUT_S = 0.3
+
+
+@pytest.fixture
+async def site(start_site: StartSite) -> Site:
+    """One whose robot has no dead-man."""
+    return await start_site(rules="")
+
+
+def by_grip(headset: Headset) -> tuple[Act, Act]:
+    async def take() -> None:
+        await headset.squeeze("right", held=True)
+        await headset.stick("right", 0, -1)
+
+    async def let_go() -> None:
+        await headset.squeeze("right", held=False)
+
+    return take, let_go
+
+
+async def test_a_frozen_picture_turns_driving_off(site: Site) -> None:
+    """Pictures stop while it drives: a zero within 0.3 s, no command after that, the panel says why; and it
+    comes back by itself with them, to be taken hold of anew."""
+    async with with_webgl(site), heard_at(site) as heard, Pictures(site.domain) as pictures:
+        headset = await headset_at(site, settings={"cameras": [PICTURES], "lockoutS": LOCKOUT_S, "hz": 60})
+        await headset.ready()
+        await headset.enter()
+        take, let_go = by_grip(headset)
+        await headset.drives(heard, take, let_go)
+        froze_at = pictures.freeze()
+        await until(lambda: heard.last == 0.0)
+        took_s = heard.stopped_at - froze_at
+        after = len(heard.speeds)
+        await until(lambda: headset.value("macsXr.room.screens.get('/test/picture').veil.mesh.visible"))
+        assert "picture is" in await headset.state("barred")
+        await headset.shot("frozen")
+        await headset.frame(20)
+        assert set(heard.speeds[after:]) <= {0.0}, "a command on an old picture"
+        print(f"driving off {took_s * 1000:.0f} ms after the last picture, by its receiver's clock")
+        pictures.go_on()
+        await until(lambda: headset.state("barred === ''"))
+        await headset.frame(10)
+        assert set(heard.speeds[after:]) <= {0.0}, "held since before it was off"
+        await headset.drives(heard, take, let_go)
+        pictures.repeat()  # the same picture again and again
+        await until(lambda: heard.last == 0.0)
+        await let_go()
+    assert took_s <= LOCKOUT_S + 0.1, "later than it takes a loaded machine to say so"
+
+
+HIDE = "Object.defineProperty(document, 'hidden', {value: true, configurable: true});"
+SHOW = "delete document.hidden;"
+TELL = "document.dispatchEvent(new Event('visibilitychange'))"
+
+AIMED = "macsXr.links.aim({...macsXr.target, topic: '/cmd_vel', type: 'geometry_msgs/msg/Twist'})"
+WAYS = {
+    "headset_off": ("device.updateVisibilityState('hidden')", "device.updateVisibilityState('visible')"),
+    "menu_opened": ("device.updateVisibilityState('visible-blurred')", "device.updateVisibilityState('visible')"),
+    "scene_hangs": ("{ const end = Date.now() + 700; while (Date.now() < end); }", ""),
+    "no_robot": ("macsXr.links.aim(null)", AIMED),
+    "xr_ends": ("macsXr.immersion.leave()", ""),
+}
+
+
+async def test_who_is_not_there_has_let_go(site: Site) -> None:
+    """Taken off, its menu opened, hung, the robot given up, XR left: each ends with a zero, and nothing drives that
+    was not taken hold of anew. So does a page that is hidden or loses the focus, on a screen."""
+    async with with_webgl(site), heard_at(site) as heard:
+        headset = await headset_at(site)
+        await headset.ready()
+        await headset.enter()
+        take, let_go = by_grip(headset)
+        for name, (away, back) in WAYS.items():
+            await headset.drives(heard, take, let_go)
+            await headset.value(away)
+            await until(lambda: heard.last == 0.0)
+            after = len(heard.speeds)
+            if back:
+                await headset.value(back)
+                await until(lambda: headset.state("barred === ''"))
+            await headset.frame(10)
+            assert set(heard.speeds[after:]) <= {0.0}, name
+            await let_go()
+        await until(lambda: headset.value("!macsXr.stage.immersive"))
+        keys = headset.page.keyboard
+        take, let_go = partial(keys.down, "KeyW"), partial(keys.up, "KeyW")
+        for name, away, back in (
+            ("hidden", HIDE + TELL, SHOW + TELL),
+            ("blurred", "window.dispatchEvent(new Event('blur'))", ""),
+        ):
+            await headset.page.focus("#pad")
+            await headset.drives(heard, take, let_go)
+            await headset.value(away)
+            await until(lambda: heard.last == 0.0)
+            after = len(heard.speeds)
+            if back:
+                await headset.value(back)
+            await headset.frame(10)
+            assert set(heard.speeds[after:]) <= {0.0}, name
+            await let_go()
+
+
+async def test_a_gateway_that_stands_still_gets_no_more(site: Site) -> None:
+    """Nothing goes into a network that does not answer, and when it does, the robot is told to stand."""
+    async with with_webgl(site), heard_at(site) as heard:
+        headset = await headset_at(site)
+        await headset.ready()
+        await headset.enter()
+        take, let_go = by_grip(headset)
+        await headset.drives(heard, take, let_go)
+        site.gateway.send_signal(signal.SIGSTOP)
+        try:
+            await until(lambda: headset.state("held === false"))
+            await asyncio.sleep(0.5)
+        finally:
+            site.gateway.send_signal(signal.SIGCONT)
+        began = time.monotonic()
+        await until(lambda: heard.last == 0.0)
+        after = len(heard.speeds)
+        await headset.frame(10)
+        assert set(heard.speeds[after:]) <= {0.0}
+        assert time.monotonic() - began < 60
+        await let_go()
