@@ -11,9 +11,10 @@ import time
 import zlib
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from rclpy.qos import qos_profile_sensor_data
@@ -24,6 +25,9 @@ from tests.page.driving import Heard
 from tests.support.browser import ROOT, SCREENSHOTS, Watched, browser, opened
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from playwright.async_api import Browser
 
 IWER = ROOT / "build" / "npm" / "node_modules" / "iwer" / "build" / "iwer.min.js"
 WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
@@ -157,6 +161,20 @@ class Headset:
         return path
 
 
+@dataclass
+class Gate:
+    """Gateways without a robot, with a browser: the second one wants a token."""
+
+    browser: Browser
+    ports: tuple[int, int]
+    secret: str
+    pages: list[Watched] = field(default_factory=list)
+
+    def url_of(self, *, wanted: bool) -> str:
+        """Of the gateway that wants a token, or of the other one."""
+        return f"http://127.0.0.1:{self.ports[int(wanted)]}/"
+
+
 @asynccontextmanager
 async def with_webgl(site: Site) -> AsyncIterator[Site]:
     """A site whose browser has WebGL."""
@@ -165,16 +183,16 @@ async def with_webgl(site: Site) -> AsyncIterator[Site]:
         yield site
 
 
-async def headset_at(site: Site, path: str = "xr", settings: dict[str, Any] | None = None, **options: Any) -> Headset:
-    """A headset that has opened the scene, with these settings."""
-    options = {"viewport": {"width": 640, "height": 420}, **options}
-    context = await site.browser.new_context(**options)
+async def headset_at(site: Site | Gate, settings: dict[str, Any] | None = None, *, wanted: bool = False) -> Headset:
+    """A headset that has opened the scene, with these settings; ``wanted``: where a token is."""
+    context = await site.browser.new_context(viewport={"width": 640, "height": 420})
     await context.add_init_script(path=IWER)
     kept = json.dumps(json.dumps({**PATIENT, **(settings or {})}))
     await context.add_init_script(
         script=f"{DEVICE}\nlocalStorage.getItem('macs.xr') ?? localStorage.setItem('macs.xr', {kept})"
     )
-    watched = await opened(context, site.url + path)
+    url = site.url if isinstance(site, Site) else site.url_of(wanted=wanted)
+    watched = await opened(context, f"{url}xr")
     site.pages.append(watched)
     return Headset(watched)
 

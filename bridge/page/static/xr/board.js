@@ -44,6 +44,14 @@ export class Board {
     return id;
   }
 
+  /** The middle of a button in this panel's own metres; null where there is none. */
+  placeOf(id) {
+    const found = this.#buttons.find((each) => each.id === id);
+    if (!found) return null;
+    const { width, height } = this.sheet.canvas;
+    return { x: (found.x + found.w / 2 - width / 2) / PIXELS_PER_M, y: (height / 2 - found.y - found.h / 2) / PIXELS_PER_M };
+  }
+
   press(id) {
     this.onPress(id);
   }

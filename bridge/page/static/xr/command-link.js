@@ -39,7 +39,6 @@ export class CommandLink {
   #madeAt = 0;
   #sentAt = -Infinity;
   #status = new Map();
-  #owed = 0;
   #timer = null;
   #refusal = "";
 
@@ -69,8 +68,9 @@ export class CommandLink {
   /** Whom commands are for: {robots, groups, topic, type}; null: nobody. */
   aim(target) {
     this.#letGo("another robot was chosen");
-    this.#drive?.node.close();
+    const before = this.#drive;
     this.#drive = null;
+    if (before && !before.owes) this.#leave(before);
     this.#closePoses();
     this.#status.clear();
     this.#refusal = "";
@@ -107,7 +107,6 @@ export class CommandLink {
     const was = this.#hold.held;
     const began = this.#hold.input(sample, performance.now());
     if (was && !this.#hold.held) this.#ended();
-    if (began) this.#owed = 0;
     if (began) this.#tick();
     else if (this.#hold.held && performance.now() - this.#sentAt >= 1000 / this.#settings.hz - 2) this.#tick();
     if (poses) this.#sendPoses(poses, at);
@@ -152,7 +151,8 @@ export class CommandLink {
 
   async #aimDrive() {
     const { topic, type, robots, groups } = this.#target;
-    const drive = { topic, shape: TWIST[type], node: this.headset.advertise(topic, type, { robots, groups }), type: null };
+    const node = this.headset.advertise(topic, type, { robots, groups });
+    const drive = { topic, robots, groups, node, shape: TWIST[type], type: null, zero: null, owes: 0 };
     this.#drive = drive;
     try {
       drive.type = await this.types.get(type, robots[0] ?? this.#target.seen);
@@ -240,25 +240,48 @@ export class CommandLink {
 
   /** A zero at once and twice more, and once again when the gateway is known to have taken it and the robot is there. */
   #ended() {
-    const [drive, target] = [this.#drive, this.#target];
+    const drive = this.#drive;
+    const { robots, groups } = drive;
     this.speed = { linear: 0, angular: 0 };
     const zero = () => {
-      if (!this.#hold.held) drive?.node.publish(drive.zero, { robots: target.robots, groups: target.groups });
+      if (!this.#drives(drive)) drive.node.publish(drive.zero, { robots, groups });
     };
     zero();
     for (const ms of ZEROS_MS) setTimeout(zero, ms);
-    this.#owe(drive, target, zero);
+    this.#owe(drive, zero);
     this.#report();
   }
 
-  async #owe(drive, target, zero) {
-    const debt = (this.#owed = this.#owed + 1);
-    while (this.#owed === debt && !this.#hold.held && this.#drive === drive) {
+  /** Who takes hold of the same robots anew says himself what is to be. */
+  #drives(drive) {
+    return this.#hold.held && this.#drive === drive;
+  }
+
+  /** What is owed is owed also when another robot is chosen meanwhile. */
+  async #owe(drive, zero) {
+    const debt = (drive.owes += 1);
+    while (drive.owes === debt && !this.#drives(drive)) {
       const there = await this.headset.online().catch(() => null);
-      if (this.#owed !== debt || this.#hold.held) return;
-      if (there && (!target.robots.length || target.robots.every((robot) => there.robots.includes(robot)))) return zero();
+      if (drive.owes !== debt || this.#drives(drive)) break;
+      if (there && drive.robots.every((robot) => there.robots.includes(robot))) {
+        zero();
+        break;
+      }
       await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
     }
+    if (drive.owes !== debt) return;
+    drive.owes = 0;
+    if (this.#drive !== drive) this.#leave(drive);
+  }
+
+  /** A topic has one node for all robots: those that are driven now keep it. */
+  #leave({ node, robots, groups }) {
+    const now = this.#drive?.node === node ? this.#drive : { robots: [], groups: [] };
+    node.deregister({
+      robots: robots.filter((robot) => !now.robots.includes(robot)),
+      groups: groups.filter((group) => !now.groups.includes(group)),
+    });
+    if (!node.robots.size && !node.groups.size) node.close();
   }
 
   // -- poses ---------------------------------------------------------------------------------------------------------

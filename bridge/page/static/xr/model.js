@@ -27,12 +27,13 @@ import {
   ShaderMaterial,
   TorusGeometry,
 } from "../vendor/three.js";
-import { toScene } from "./axes.js";
+import { heading, toScene } from "./axes.js";
 
 export const TABLE = { radius: 0.46, height: 0.86, away: 0.95 };
 const TRAIL_POINTS = 4000;
 const TRAIL_STEP_M = 0.02;
 const FRAMES = 128;
+const BASES = ["base_link", "base_footprint"];
 const LEAST_ROBOT = 0.055;
 const EDGE_M = TABLE.radius + 0.05;
 
@@ -129,8 +130,11 @@ export class Model {
 
   /** What came of a robot, by how it is shown. */
   take(shown, value) {
-    if (shown === "pose" && value.pose) this.#pose(value.pose);
-    else if (shown === "scan" || shown === "cloud") this.#points(this[shown], shown, value);
+    if (shown === "pose" && value.pose) {
+      this.fromPose = true;
+      this.#pose(value.pose);
+    }
+    if (shown === "scan" || shown === "cloud") this.#points(this[shown], shown, value);
     else if (shown === "map") this.#map(value);
     else if (shown === "frames") this.#frames(value.frames);
     else if (shown === "joints") this.joints.set(value.joints);
@@ -147,6 +151,7 @@ export class Model {
     this.map?.removeFromParent();
     this.map = null;
     this.pose = null;
+    this.fromPose = false;
     this.joints.set([]);
     this.setLayers([...this.#shown]);
   }
@@ -223,6 +228,9 @@ export class Model {
     fill(this.frames.geometry, "color", colours, 3, true);
     this.frames.geometry.setDrawRange(0, points.length / 3);
     this.frames.userData.has = some.length > 0;
+    // who tells his place by no topic of its own tells it so
+    const base = this.fromPose ? null : frames.find(({ name }) => BASES.includes(name));
+    if (base) this.#pose({ ...base, heading: heading(base.orientation) });
   }
 }
 

@@ -1,0 +1,164 @@
+"""The scene for headsets by itself, at a gateway without robots: eyes, hands, panels, the table, who may."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy")  # the kit has a camera, which is a ROS node
+
+from bridge.page.routes import POLICY
+from macs_zenoh.protocol.rights import Rights
+from tests.page.conftest import with_token
+from tests.page.headsets import WEBGL, Gate, headset_at, needs_headset
+from tests.support.browser import browser, needs_browser
+from tests.support.programs import Program, free_port
+from tests.support.waiting import until
+
+pytestmark = [needs_browser, needs_headset, pytest.mark.timeout(120)]
+
+FILL = """async ([topic, width, height, colours]) => {
+  macsXr.telling.tell = () => {};
+  macsXr.room.setPanels([topic]);
+  const canvas = new OffscreenCanvas(width, height);
+  const context = canvas.getContext('2d');
+  colours.forEach((colour, at) => {
+    context.fillStyle = colour;
+    context.fillRect((at * width) / colours.length, 0, width / colours.length, height);
+  });
+  const screen = macsXr.room.screens.get(topic);
+  screen.show(await createImageBitmap(canvas, { imageOrientation: 'flipY' }));
+  screen.say({ figures: '', tone: 'good', veil: '' });
+}"""
+STEREO = "device.stereoEnabled = true"
+AIM = """([hand, [x, y, z], [tx, ty, tz]]) => {
+  const one = device.controllers[hand];
+  one.position.set(x, y, z);
+  const [dx, dy, dz] = [tx - x, ty - y, tz - z];
+  const yaw = Math.atan2(-dx, -dz);
+  const pitch = Math.atan2(dy, Math.hypot(dx, dz));
+  const [sy, cy, sp, cp] = [Math.sin(yaw / 2), Math.cos(yaw / 2), Math.sin(pitch / 2), Math.cos(pitch / 2)];
+  one.quaternion.set(cy * sp, sy * cp, -sy * sp, cy * cp);
+}"""
+WORLD = {
+    "scan": "{ points: new Float32Array(Array.from({length: 2000}, (_, i) => [0.05 * (i % 40) - 1, 0.1, 0.05 * "
+    "Math.floor(i / 40) - 1]).flat()), place: null }",
+    "map": "{ pixels: new Uint8Array(4 * 64).fill(220), width: 8, height: 8, size: [8, 8], origin: { position: "
+    "{ x: -4, y: -4, z: 0 }, orientation: { x: 0, y: 0, z: 0, w: 1 } } }",
+}
+
+
+@pytest.fixture
+async def gate(tmp_path: Path) -> AsyncIterator[Gate]:
+    """A router, a gateway and a browser with WebGL."""
+    secret, words = with_token(tmp_path / "tokens.json", Rights(may=["see"], robots="any"))
+    async with AsyncExitStack() as stack:
+        endpoint, ports = f"tcp/127.0.0.1:{free_port()}", (free_port(), free_port())
+        await stack.enter_async_context(Program("router", "-l", endpoint))
+        for port, more in zip(ports, ((), words), strict=True):
+            argv = ["--port", str(free_port()), "--web-port", str(port), "-e", endpoint, *more]
+            await stack.enter_async_context(Program("gateway", *argv))
+        gate = Gate(await stack.enter_async_context(browser(*WEBGL)), ports, secret)
+        yield gate
+        for page in gate.pages:
+            page.judge()
+
+
+def like(pixels: list[int], colour: tuple[int, int, int], by: int = 24) -> bool:
+    """Whether most of these pixels are of a colour."""
+    hits = [all(abs(pixels[at + part] - colour[part]) <= by for part in range(3)) for at in range(0, len(pixels), 4)]
+    return sum(hits) > len(hits) / 2
+
+
+async def test_each_eye_has_its_half_of_a_wide_picture(gate: Gate) -> None:
+    """Side by side: the left half is what the left eye sees, and a screen; the right half is the right eye's."""
+    headset = await headset_at(gate)
+    await until(lambda: headset.value("Boolean(window.macsXr)"))
+    await headset.value(FILL, ["/stereo", 1280, 480, ["#c03030", "#3030c0"]])
+    red, blue = (0xC0, 0x30, 0x30), (0x30, 0x30, 0xC0)
+    assert like(await headset.pixels(0.5, 0.36), red)
+    await headset.value(STEREO)
+    await headset.enter()
+    await headset.frame(3)
+    assert like(await headset.pixels(0.25, 0.45), red)
+    assert like(await headset.pixels(0.75, 0.45), blue)
+    await headset.shot("stereo")
+
+
+async def test_hands_move_panels_and_press_buttons(gate: Gate) -> None:
+    """A trigger on a panel takes it along and turns it to the head, the stick scales it; a button it presses once."""
+    headset = await headset_at(gate)
+    await until(lambda: headset.value("Boolean(window.macsXr)"))
+    await headset.value(FILL, ["/one", 640, 480, ["#30c030"]])
+    await headset.enter()
+    where = "(({ x, y, z }) => [x, y, z])(macsXr.room.screens.get('/one').group.position)"
+    before = await headset.value(where)
+    await headset.value(AIM, ["right", [0.2, 1.4, 0], before])
+    await headset.frame(3)
+    await headset.trigger("right", held=True)
+    await headset.frame(3)
+    await headset.value(AIM, ["right", [0.2, 1.4, 0], [before[0] - 1.5, before[1], before[2]]])
+    await headset.frame(3)
+    after = await headset.value(where)
+    assert after[0] < before[0] - 0.8
+    assert await headset.value("macsXr.room.screens.get('/one').group.rotation.y") > 0.2, "it looks away"
+    await headset.stick("right", 1, 0)
+    await until(lambda: headset.value("macsXr.room.screens.get('/one').group.scale.x > 1.3"))
+    await headset.stick("right", 0, 0)
+    await headset.trigger("right", held=False)
+    await headset.frame(3)
+    await headset.value(AIM, ["right", [0.2, 1.4, 0], before])
+    await headset.frame(3)
+    assert await headset.value(where) == after, "it is not held any more"
+
+    button = await headset.value(BUTTON, "flat")
+    await headset.value(AIM, ["left", [0, 1.3, 0], button])
+    await headset.frame(3)
+    assert await headset.value("macsXr.settings.get('curve')") > 0
+    await headset.trigger("left", held=True)
+    await until(lambda: headset.value("macsXr.settings.get('curve') === 0"))
+    await headset.frame(5)
+    assert await headset.value("macsXr.settings.get('curve')") == 0, "pressed once"
+    await headset.trigger("left", held=False)
+    await headset.shot("moved")
+
+
+BUTTON = """(id) => {
+  const { group } = macsXr.room.menu;
+  const at = macsXr.room.menu.placeOf(id);
+  group.updateMatrixWorld();
+  const { elements: m } = group.matrixWorld;
+  return [0, 1, 2].map((row) => m[row] * at.x + m[4 + row] * at.y + m[12 + row]);
+}"""
+
+
+async def test_the_world_is_drawn_on_the_table(gate: Gate) -> None:
+    """A scan and a map change what is seen there, and nothing outside its edge; layers that are off are not drawn."""
+    headset = await headset_at(gate)
+    await until(lambda: headset.value("Boolean(window.macsXr)"))
+    table, outside = (0.5, 0.82), (0.88, 0.95)
+    empty, beside = await headset.pixels(*table), await headset.pixels(*outside)
+    for layer, value in WORLD.items():
+        await headset.value(f"macsXr.room.model.take('{layer}', {value})")
+        assert await headset.pixels(*table) != empty, layer
+        assert await headset.pixels(*outside) == beside, layer
+    await headset.shot("table")
+    await headset.value("macsXr.room.follow('layers', [])")
+    assert await headset.pixels(*table) == empty
+
+
+async def test_who_may_is_asked_and_nothing_is_from_elsewhere(gate: Gate) -> None:
+    """Where a token is wanted the scene asks for it, and offers what it permits; its policy is the page's."""
+    headset = await headset_at(gate, wanted=True)
+    await headset.page.fill("#token", gate.secret)
+    await headset.page.click("button[type=submit]")
+    await headset.page.wait_for_selector("#scene")
+    assert not await headset.page.is_visible("#stop"), "this token may not stop"
+    response = await headset.page.goto(headset.page.url)
+    assert response is not None
+    assert response.headers["content-security-policy"] == POLICY
+    worker = await headset.page.request.get(f"{headset.page.url.rpartition('/')[0]}/xr/command-worker.js")
+    assert worker.headers["content-security-policy"] == POLICY
