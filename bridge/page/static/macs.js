@@ -287,7 +287,15 @@ export class Headset extends EventTarget {
    * asked `freshMs` ago. So no more goes into a network that stands still than what was sent in that time.
    */
   sendFresh(frames, freshMs) {
-    if (!this.#connected || this.waitingBytes > 0) return false;
+    return this.waitingBytes === 0 && this.isFresh(freshMs) && this.sendNow(frames);
+  }
+
+  /**
+   * Whether the gateway has answered what it was asked `freshMs` ago; it is asked. Who sends several messages at once asks
+   * this: `waitingBytes` counts those that have just been sent, however quick the network is.
+   */
+  isFresh(freshMs) {
+    if (!this.#connected) return false;
     const now = performance.now();
     if (this.#pulse.open && now - this.#pulse.askedAt > freshMs) return false;
     if (!this.#pulse.open) {
@@ -295,7 +303,7 @@ export class Headset extends EventTarget {
       const answered = () => (pulse.open = false);
       this.online({ timeoutMs: 60000 }).then(answered, answered);
     }
-    return this.sendNow(frames);
+    return true;
   }
 
   /** Send what a reconnection would repeat anyway; of a session that is asleep, when it goes on. */

@@ -38,6 +38,8 @@ export class CommandLink {
   #away = "";
   #madeAt = 0;
   #sentAt = -Infinity;
+  /** When nothing waited here last. */
+  #clearAt = 0;
   #status = new Map();
   #timer = null;
   #refusal = "";
@@ -225,11 +227,17 @@ export class CommandLink {
     this.#sentAt = now;
     const message = type.write(shape(linear, angular, performance.timeOrigin + this.#madeAt));
     const { robots, groups } = this.#target;
-    if (node.publish(message, { robots, groups, freshMs: FRESH_MS, madeAt: this.#madeAt })) {
+    if (this.#fresh(now) && node.publish(message, { robots, groups, madeAt: this.#madeAt })) {
       this.speed = { linear: linear.x, angular: angular.z };
     } else {
       this.#letGo("the connection is not fresh");
     }
+  }
+
+  /** Whether the gateway answers, and what was sent went. Poses and commands of one frame wait for each other a moment. */
+  #fresh(now) {
+    if (this.headset.waitingBytes === 0) this.#clearAt = now;
+    return this.headset.isFresh(FRESH_MS) && now - this.#clearAt <= FRESH_MS;
   }
 
   #letGo(why) {
@@ -307,14 +315,15 @@ export class CommandLink {
   }
 
   #sendPoses(poses, at) {
-    if (!this.#poses.size || this.#quiet(performance.now())) return;
+    const now = performance.now();
+    if (!this.#poses.size || this.#quiet(now) || !this.#fresh(now)) return;
     const header = { stamp: stamp(performance.timeOrigin + at), frame_id: this.#settings.frame };
     for (const [kind, one] of this.#poses) {
       const value = poses[kind];
       if (!value || !one.type || at - one.sentAt < 1000 / this.#settings.poseHz - 3) continue;
       one.sentAt = at;
       const { robots, groups } = this.#target;
-      one.node.publish(one.type.write({ header, ...value }), { robots, groups, freshMs: FRESH_MS, madeAt: at });
+      one.node.publish(one.type.write({ header, ...value }), { robots, groups, madeAt: at });
     }
   }
 
