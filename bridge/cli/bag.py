@@ -1,4 +1,4 @@
-"""What is in recordings, and new ones out of them: any MCAP file, of `macs record` or of anybody else.
+"""Look into recordings and make new ones from them: any MCAP file, whoever recorded it.
 
 `info` reads the index alone, however large the file is; everything else keeps a few chunks in memory. A recording
 whose program was killed has no index: `repair` writes one that has, with all that was on the disk. Nothing is written

@@ -1,10 +1,10 @@
-"""Rate, loss and latency through this mesh, measured politely: bounded, and with messages that come after all others.
+"""Measure rate, loss and latency through this mesh, politely: within limits, and with messages of the lowest priority.
 
 Without --robot two sessions of this program send from one to the other, through the router: one way, by one clock.
 With --robot the robot's agent sends each message back. Nothing is asked of ROS, and nothing moves.
 
-At most 10 MB a second, 2000 messages a second and 60 seconds; who wants to see where a mesh ends measures on one that
-nobody uses (`python -m benchmarks`).
+At most 10 MB a second, 2000 messages a second and 60 seconds; to find the limits of a mesh, measure one that nobody
+uses (`python -m benchmarks`).
 
 Exit code 0: done; 1: no router answers, nothing comes through, or --most-lost or --most-ms was exceeded; 2: wrong
 usage; 130: Ctrl-C before the end.

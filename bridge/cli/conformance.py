@@ -1,4 +1,4 @@
-"""Hold a program of anybody's to the protocol: a router by connecting to it, a headset by being its router.
+"""Test any program against the protocol: a router by connecting to it, a headset by being its router.
 
 Each check has a name and says what must hold; docs/conformance.md has them, and the bytes that they use. --level
 compatible asks for what existing programs rely on, strict (the default) also for what the existing ones do badly.

@@ -1,4 +1,4 @@
-"""A headset without the hardware: what a Unity headset does over TCP, from the command line.
+"""Act as a headset, without the hardware: what a Unity headset does over TCP, from the command line.
 
 Results are JSON lines on stdout, logs go to stderr. Exit code 0: done (also when Ctrl-C ends a verb that has no
 end of its own); 1: unreachable, timed out or fewer messages than asked for; 2: wrong usage; 130: Ctrl-C before

@@ -2,7 +2,7 @@
 
 SESSION is the Zenoh session: headsets that have the same one are behind the same gateway. STATE is what a robot
 answers when it is asked: whether it is stopped, and who has control of which topic. A ? means that it should
-answer and does not: it hangs, or access rules do not let you ask it ([operator] in the settings, or --as, say who
+answer but does not: it hangs, or access rules do not let you ask it ([operator] in the settings, or --as, say who
 you are). A headset is away when its gateway has heard nothing of it for 10 s: it was taken off, or is out of
 reach. If it stays away, the gateway closes its connection later (idle_timeout_s). The address of a gateway is
 where headsets connect.

@@ -1,4 +1,5 @@
-"""How long a robot takes to answer, through all that lies between: router, links, its agent. As `ping` does for hosts.
+"""Measure how long a robot takes to answer, through all that lies between: router, links, its agent. As `ping` does
+for hosts.
 
 Nothing is asked of ROS, and nothing moves. The robot's clock is compared with this host's on the way; how well that is
 known is half of the shortest round trip.

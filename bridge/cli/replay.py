@@ -1,6 +1,6 @@
 """Play a recording as robots: online with their ids, groups, topics and latched values, so that headsets and pages
-need not know. They do nothing: commands, services and actions are refused with the reason. Ctrl-C leaves nothing
-behind.
+need not know that it is one. These robots do nothing: commands, services and actions are refused with the reason.
+Ctrl-C leaves nothing behind.
 
 With --to ros the topics are behind /replay/robot_7, where no robot listens.
 

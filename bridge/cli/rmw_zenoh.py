@@ -1,4 +1,4 @@
-"""Robots that run ROS 2's own Zenoh middleware, on the mesh with nothing installed on them.
+"""Bring robots that run ROS 2's own Zenoh middleware onto the mesh, with nothing installed on them.
 
 Their nodes and ours share a router. Each robot is on the mesh while its nodes are there, and headsets use it as any
 other robot: topics, services and actions, by id and by group. It needs no ROS:

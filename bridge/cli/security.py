@@ -1,4 +1,4 @@
-"""Make a mesh secure from a policy, and see that it is.
+"""Make a mesh secure from a policy, and prove that it is.
 
 `generate` reads a policy (YAML: who exists, who may command, see, call or message whom) and writes a directory for
 each node: its certificate and key, a router's whole configuration, a client's settings. Run again, it keeps what is

@@ -1,4 +1,4 @@
-"""Make and end tokens: a headset shows one to be let in, and the token says what it may do then.
+"""Make and revoke tokens: a headset shows one to be let in, and the token says what it may do.
 
 A token is printed once, when it is made. The file keeps its hash, name, rights and end. Gateways
 follow the file without a restart: a token that is revoked ends within a second. Copy the file to

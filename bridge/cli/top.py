@@ -1,4 +1,4 @@
-"""A mesh, live, in a terminal: robots and who has control of them, who is stopped; topics with rates and ages;
+"""Show a mesh, live, in a terminal: robots and who has control of them, who is stopped; topics with rates and ages;
 headsets with address, token and age; gateways, routers and the links between them; what was lost; what changes.
 
 Keys: 1 to 6 choose what is shown, Tab goes on to the next; s sorts by the next column, r the other way; / filters,

@@ -1,6 +1,6 @@
-"""Where the time of a topic's messages goes, hop by hop: from the ROS node to the robot's agent, into Zenoh, to each
-router, to the gateway, through it, into headsets' sockets. With --commands the other way: from a headset's socket to
-the robot.
+"""Show where the time of a topic's messages goes, hop by hop: from the ROS node to the robot's agent, into Zenoh, to
+each router, to the gateway, through it, into headsets' sockets. With --commands the other way: from a headset's socket
+to the robot.
 
 While it runs, the robot marks one in --every messages, Zenoh and its routers stamp those, and gateways note them;
 nothing else changes, and afterwards nothing is marked. The topic is received here as well, so that there is something

@@ -1,4 +1,4 @@
-"""One line for each thing that changes on a mesh, as it happens, until Ctrl-C: who came and left, which robot was
+"""Print a line for each thing that changes on a mesh, as it happens, until Ctrl-C: who came and left, which robot was
 stopped and released and by whom, who has control, what was refused or lost, who failed over.
 
 It joins nothing and asks each robot at most once a second, so what lasts shorter is told late, or together. Who may
