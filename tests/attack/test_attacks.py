@@ -21,7 +21,7 @@ from tests.attack.scene import Scene, scene
 
 SECONDS = 2.0
 
-pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.asyncio(loop_scope="module")]
 
 
 class Stage:

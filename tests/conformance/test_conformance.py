@@ -174,7 +174,6 @@ async def test_the_command_fails_where_nobody_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not (shutil.which("mcs") and shutil.which("mono")), reason="needs mono-mcs")
-@pytest.mark.timeout(240)
 async def test_the_csharp_example_passes(tmp_path: Path) -> None:
     """The C# headset of examples/unity outlives everything, also what deafens the existing one."""
     program = tmp_path / "MacsHeadset.exe"

@@ -183,7 +183,7 @@ async def test_of_calls_that_no_gate_admits_so_many_wait_at_most(router: str) ->
 
         async def asks() -> bool:
             with suppress(MacsError):
-                return await client.query("macs/ping/here", b"x", timeout_s=5) == b"x"
+                return await client.query("macs/ping/here", b"x", timeout_s=PATIENCE_S) == b"x"
             return False
 
         await until(asks)

@@ -62,7 +62,6 @@ async def crowd(router: str) -> AsyncIterator[None]:
 
 
 @needs_browser
-@pytest.mark.timeout(240)
 async def test_a_large_mesh_is_still_usable(start_gateway: StartGateway, crowd: None) -> None:
     """With 200 robots, 1000 headsets and 500 topics each view takes a quarter of a core and 150 MB at most, and
     answers a click."""

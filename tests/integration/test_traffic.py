@@ -355,12 +355,15 @@ async def priorities(
     try:
         subscriber = session.declare_subscriber("macs/**", zenoh.handlers.Callback(arrived.append, indirect=False))
         found = []
-        for key, traffic in puts:
-            arrived.clear()
-            while not arrived:  # until the router has told the sender of the subscription
-                mesh.put(key, b"", traffic)
+        for number, (key, traffic) in enumerate(puts):
+            payload = b"%d" % number  # of what was put before more may come
+
+            def came(payload: bytes = payload) -> zenoh.Sample | None:
+                return next((sample for sample in list(arrived) if sample.payload.to_bytes() == payload), None)
+
+            while (sample := came()) is None:  # until the router has told the sender of the subscription
+                mesh.put(key, payload, traffic)
                 await asyncio.sleep(0.01)
-            sample = arrived[0]
             found.append((sample.priority, sample.congestion_control, sample.express))
         subscriber.undeclare()
     finally:

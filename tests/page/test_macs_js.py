@@ -86,7 +86,6 @@ def proven(verdicts: list[Verdict]) -> None:
 
 
 @needs_node
-@pytest.mark.timeout(240)
 async def test_it_conforms_in_node() -> None:
     """`macs conformance headset --web` against macs.js in node: every check, and none fails."""
     script = [*(node() or []), str(HERE / "headset.mjs"), str(STATIC), "ws://127.0.0.1:{port}/macs"]
@@ -94,7 +93,6 @@ async def test_it_conforms_in_node() -> None:
 
 
 @needs_browser
-@pytest.mark.timeout(240)
 @pytest.mark.parametrize("where", ["page", "worker"])
 async def test_it_conforms_in_chromium(where: str) -> None:
     """The same in a browser, in a page and in a worker."""

@@ -21,7 +21,7 @@ from tests.page.driving import GAMEPAD, heard_at, hold, key, pointer
 from tests.support.browser import AXE, OFFLINE, SCREENSHOTS, Watched, needs_browser
 from tests.support.waiting import until
 
-pytestmark = [needs_browser, pytest.mark.timeout(240)]
+pytestmark = needs_browser
 
 LOOK = "(() => { const c = document.querySelector('{}'); return c.toDataURL() })()"
 CAMERA = "#camera--camera-image-compressed canvas"

@@ -19,7 +19,7 @@ from tests.page.driving import GAMEPAD, Heard, heard_at, hold
 from tests.support.browser import Watched, needs_browser
 from tests.support.waiting import until
 
-pytestmark = [needs_browser, pytest.mark.timeout(240)]
+pytestmark = needs_browser
 
 AXES_FORWARD = f"navigator.getGamepads = () => [{GAMEPAD}]"
 NO_GAMEPAD = "navigator.getGamepads = () => []"

@@ -16,7 +16,7 @@ from tests.page.conftest import Site, says
 from tests.support.browser import Watched, needs_browser
 from tests.support.waiting import until
 
-pytestmark = [needs_browser, pytest.mark.timeout(240)]
+pytestmark = needs_browser
 
 SIZE = "document.querySelector('#trail canvas').dataset.map"
 OCCUPIED = """(() => {

@@ -16,7 +16,7 @@ from tests.support.programs import Program
 from tests.support.waiting import until
 
 pytest.importorskip("rclpy")
-pytestmark = [needs_browser, pytest.mark.timeout(240)]
+pytestmark = needs_browser
 
 
 def second_agent(site: Site) -> Program:

@@ -15,7 +15,7 @@ from tests.page.headsets import Headset, headset_at, needs_headset, with_webgl
 from tests.support.browser import OFFLINE, needs_browser
 from tests.support.waiting import until
 
-pytestmark = [needs_browser, needs_headset, pytest.mark.timeout(240)]
+pytestmark = [needs_browser, needs_headset]
 
 LINKS = """
 macsXr.told = [];

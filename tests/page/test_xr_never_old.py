@@ -19,7 +19,7 @@ from tests.page.headsets import PICTURES, Headset, Pictures, headset_at, needs_h
 from tests.support.browser import needs_browser
 from tests.support.waiting import until
 
-pytestmark = [needs_browser, needs_headset, pytest.mark.timeout(240)]
+pytestmark = [needs_browser, needs_headset]
 
 LOCKOUT_S = 0.3
 

@@ -22,7 +22,7 @@ from tests.support.browser import needs_browser
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
 
-pytestmark = [needs_browser, needs_headset, pytest.mark.timeout(240)]
+pytestmark = [needs_browser, needs_headset]
 
 POSES = {"head": "/xr/head", "right": "/xr/right", "rightHand": "/xr/right/hand", "joy": "/xr/joy"}
 

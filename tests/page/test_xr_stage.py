@@ -18,7 +18,7 @@ from tests.support.browser import browser, needs_browser
 from tests.support.programs import Program, free_port
 from tests.support.waiting import until
 
-pytestmark = [needs_browser, needs_headset, pytest.mark.timeout(120)]
+pytestmark = [needs_browser, needs_headset]
 
 FILL = """async ([topic, width, height, colours]) => {
   macsXr.telling.tell = () => {};
