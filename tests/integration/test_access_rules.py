@@ -205,8 +205,8 @@ async def test_an_observer_asks_robots_and_stops_none(as_user: Callable[[str], M
             robot.serve(verb, answer)
         while not heard:  # until the router knows who serves
             with suppress(Unreachable):
-                assert await nobody.ask(7, "status", timeout_s=1) == b"{}"
-        assert await nobody.ask(7, "offers", timeout_s=5) == b"{}"
+                assert await nobody.ask(7, "status", timeout_s=PATIENCE_S) == b"{}"
+        assert await nobody.ask(7, "offers", timeout_s=PATIENCE_S) == b"{}"
         for asker, verb in ((nobody, "stop"), (somebody, "stop"), (somebody, "status")):
             with pytest.raises(Unreachable):
                 await asker.ask(7, verb, timeout_s=0.5)

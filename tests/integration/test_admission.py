@@ -134,7 +134,7 @@ async def test_who_waits_for_an_id_may_speak_and_leave(
 
 async def test_when_there_are_no_ids_a_newcomer_is_closed(start_gateway: StartGateway) -> None:
     """A gateway whose blocks are used up closes who comes, and counts it; when somebody leaves, the next is let in."""
-    gateway: Gateway = await start_gateway(blocks=[5], handshake_timeout_s=2.0)
+    gateway: Gateway = await start_gateway(blocks=[5], handshake_timeout_s=10.0)
     async with crowd(gateway.port, 256) as agents:
         assert {agent.id for agent in agents} == set(range(5 * 256, 6 * 256))
         reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port)

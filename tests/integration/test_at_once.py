@@ -149,7 +149,7 @@ async def test_no_sample_goes_past_a_question(mesh: Mesh, sender: Mesh) -> None:
     mesh.serve(key, stop)
     while not receiver.numbers:
         with suppress(NotServed):
-            await sender.query(key, b"", timeout_s=1)
+            await sender.query(key, b"", timeout_s=PATIENCE_S)
     receiver.numbers.clear()
     asked = asyncio.create_task(sender.query(key, b"", timeout_s=PATIENCE_S))
     await asyncio.sleep(0)  # it is asked now

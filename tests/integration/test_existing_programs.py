@@ -427,7 +427,7 @@ async def test_a_python_agent_deafens_nobody(router: str, stage: tuple[Gateway, 
         node = AddNode(ROS, 900, 5, "nd__act", "/act", "std_msgs/String")
         key, frame = call((ROS, robot.id), "add_node", (ROS, 900), encode_data(node), Metadata(ROS, 900))
         with pytest.raises(Refused, match="no nodes of type 5"):
-            await agent.mesh.query(key, frame, timeout_s=5)
+            await agent.mesh.query(key, frame, timeout_s=PATIENCE_S)
         agent.send(b"{}", to="unity", ids=[headset.id], metadata=Metadata(message_manager="Finished"))
         await until(lambda: headset.deaf or headset.got[-1][0]["messageManager"] == "Finished", 60)
 

@@ -37,7 +37,7 @@ async def test_a_session_that_comes_late_is_closed(router: str, once: bool, monk
 
     monkeypatch.setattr(zenoh, "open", slow)
     settings = MeshSettings(connect=[router])
-    opening = asyncio.ensure_future(Mesh.open_once(settings, timeout_s=5) if once else Mesh.open(settings))
+    opening = asyncio.ensure_future(Mesh.open_once(settings, timeout_s=PATIENCE_S) if once else Mesh.open(settings))
     await asyncio.to_thread(began.wait, 10)
     opening.cancel()
     with pytest.raises(asyncio.CancelledError):

@@ -6,7 +6,7 @@ import asyncio
 import json
 import math
 import struct
-from contextlib import suppress
+from contextlib import AsyncExitStack, suppress
 
 import pytest
 
@@ -116,11 +116,14 @@ async def test_nothing_comes_before_the_first_message(start_gateway: StartGatewa
 async def test_silence_ends_a_connection(start_gateway: StartGateway, connect: Connect) -> None:
     """Who does not answer the handshake, or is silent afterwards, is disconnected; the others are told at once."""
     gateway = await start_gateway(handshake_timeout_s=1.0, idle_timeout_s=2.0)
-    async with socket(gateway) as mute, socket(gateway) as silent, socket(gateway) as watcher:
+    async with AsyncExitStack() as stack:
+        silent = await stack.enter_async_context(socket(gateway))
         silent.configure()
+        watcher = await stack.enter_async_context(socket(gateway))
         watcher.configure()
         heartbeat = encode_frame(management=b'{"messageManager":"HeartbeatHandler"}')
         beating = asyncio.create_task(_repeat(watcher.writer, heartbeat))
+        mute = await stack.enter_async_context(socket(gateway))
         with pytest.raises(ConnectionError):
             await mute.message()
         metadata, body = await watcher.message()

@@ -202,7 +202,7 @@ async def test_a_call_that_is_too_large_is_refused(router: str) -> None:
         for _ in range(10):
             assert await headset.call("ros", 7, "ask") == b"yes"
         with pytest.raises(OutOfRange, match=r"macs/call/ros/7/ask/unity/300 is 1\d\d\d, allowed is 0\.\.1000"):
-            await headset.call("ros", 7, "ask", bytes(1000), timeout_s=5)
+            await headset.call("ros", 7, "ask", bytes(1000), timeout_s=PATIENCE_S)
         assert headset.mesh.drops == {"over_size": 1}
 
 
