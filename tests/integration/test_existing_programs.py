@@ -493,7 +493,7 @@ async def test_what_its_own_robot_says_is_of_its_type(
             def heard(name: str = name) -> set[str]:
                 return {fields["dataExchangeType"] for fields, _ in headset.got if fields["nodeName"] == name}
 
-            await until(lambda right=right, heard=heard: headset.deaf or {*right} <= heard(), 10)
+            await until(lambda right=right, heard=heard: headset.deaf or {*right} <= heard())
             assert headset.deaf == ""
             assert heard() == {*right}
         assert connection.drops["other_type"] >= 3 * len(OTHER_TYPES)
