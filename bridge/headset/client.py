@@ -452,7 +452,10 @@ class Headset:
             raise Unreachable(self.target, self._why or "the connection is lost")
         if self._session is not None:
             self._session.say(frame, still_meant)
-        await connection.send(frame)
+        try:
+            await connection.send(frame)
+        except Unreachable as error:
+            raise Unreachable(self.target, self._not_let_in or error.why) from error
 
     async def set_group(self, group: int) -> None:
         """Move to another group: a second configuration reply on the same connection."""
@@ -621,6 +624,9 @@ class Headset:
             if self._not_let_in:
                 raise Refused(self._not_let_in) from None
             raise
+        except BaseException:
+            await self.abort()  # nobody else has it yet
+            raise
 
     def _take_id(self, metadata: Metadata, data: bytes) -> None:
         if metadata.message_manager != Welcome.manager:
@@ -653,10 +659,9 @@ class Headset:
             if self._connection is not None:
                 self._connection.abort()
             self._connection = None
+            why = self._not_let_in or why
             if self._session is None or not self._session.secret or self._not_let_in:
                 self._fail_open(Unreachable(self.target, why))
-            if self._not_let_in:
-                why = self._not_let_in
             if not self._options.reconnect or self._not_let_in:
                 self._finish(why)
                 return
@@ -753,7 +758,8 @@ class Headset:
             for robot in [refused.robot_id] if refused.robot_id else sorted(node.agents) or [0]:
                 node.refused(robot, refused.reason, final=_is_final(refused))
         else:
-            log.warning("robot %d refused %s: %s", refused.robot_id, refused.tos_name, refused.reason)
+            about = refused.tos_name or refused.node_name
+            log.warning("robot %d refused %s: %s", refused.robot_id, about, refused.reason)
 
     def _take_node_message(self, message: Incoming) -> Mailbox[Incoming] | None:
         node = self._nodes.get((message.metadata.node_type, message.metadata.node_name))

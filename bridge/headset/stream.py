@@ -86,7 +86,14 @@ class _TcpStream:
         self._writer = writer
 
     async def read(self) -> bytes:
-        return await self._reader.read(self.READ_BYTES)
+        try:
+            return await self._reader.read(self.READ_BYTES)
+        except OSError:
+            came = bytes(self._reader._buffer)  # type: ignore[attr-defined]
+            if not came:
+                raise
+            self._reader._buffer.clear()  # type: ignore[attr-defined]
+            return came  # before the connection was reset: why, perhaps
 
     def write(self, data: bytes) -> None:
         self._writer.write(data)
