@@ -90,13 +90,15 @@ class Door:
         on_ended: Callable[[Connection], None],
         on_look: Callable[[], None] = lambda: None,
         on_file: Callable[[str, str], None] = lambda event, name: None,
+        on_refused: Callable[[str, int], None] = lambda host, count: None,
     ) -> None:
         """``on_changed`` hears of connections whose token has other rights now, ``on_ended`` of those whose token
         holds no longer, ``on_look`` is called several times a second, ``on_file`` with what became of a token
-        in the file. Raises ConfigError: the file of tokens cannot be
-        used."""
+        in the file, ``on_refused`` of web requests with no valid token: from which address, and how often by now
+        when that is to be told, else 0. Raises ConfigError: the file of tokens cannot be used."""
         self._on_changed = on_changed
         self._on_ended = on_ended
+        self._on_refused = on_refused
         self._on_look = on_look
         self._on_file = on_file
         self._watch = Watch(path, self._look)
@@ -149,6 +151,10 @@ class Door:
             problem = "%s shows no %s at the %s port%s (counted as %s)"
             log.warning(problem, host, what, entrance.name, so_far, counted_as)
         return count
+
+    def refuse_request(self, entrance: Entrance, host: str) -> None:
+        """A web request showed no valid token, or no code of a pairing."""
+        self._on_refused(host, self.failed(entrance, host))
 
     def leave(self, connection: Connection) -> None:
         """A connection has ended."""

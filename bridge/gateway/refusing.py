@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 
 from macs_zenoh.protocol.messages import AccessRefused, DataRefused
 from macs_zenoh.protocol.recipient import to_agent
@@ -19,9 +20,10 @@ log = logging.getLogger("macs.gateway")
 class Refusing:
     """For the agents of one gateway."""
 
-    def __init__(self, door: Door, record: Record) -> None:
+    def __init__(self, door: Door, record: Record, drops: Counter[str]) -> None:
         self._door = door
         self._record = record
+        self._drops = drops
 
     def tell(self, connection: Connection, refused: AccessRefused) -> None:
         """In a message of its own."""
@@ -34,6 +36,13 @@ class Refusing:
             told = "no valid token" if count == 1 else f"no valid token, {count} times by now"
             self._record.address("refused", connection.address, "join", told)
         self.tell(connection, AccessRefused("no_token", "a valid token is wanted here"))
+
+    def request(self, host: str, count: int) -> None:
+        """Who showed the web port no valid token has no connection of an agent that would count it."""
+        self._drops["NotAdmitted"] += 1
+        if count:
+            told = "no valid token" if count == 1 else f"no valid token, {count} times by now"
+            self._record.address("refused", host, "web request", told)
 
     def not_resumed(self, connection: Connection) -> None:
         """Who came back as somebody did not show that one's secret."""
@@ -54,8 +63,9 @@ class Refusing:
         if not (about.node_name and connection.peer.extensions):
             self.tell(connection, AccessRefused(kind, event.reason, about.request_id))
             return
+        topic = connection.peer.topic_of(about.node_type, about.node_name)
         for robot in event.robots or (0,):
-            refused = DataRefused(robot, about.node_type, about.node_name, about.node_name, kind, event.reason)
+            refused = DataRefused(robot, about.node_type, about.node_name, topic, kind, event.reason)
             connection.send_call(to_agent(refused))
 
     def changed(self, connection: Connection, grant: Grant) -> list[Event]:

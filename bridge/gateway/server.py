@@ -131,12 +131,13 @@ class Gateway:
             on_ended=lambda connection: self._refusing.ended(connection),
             on_look=lambda: self.listeners.look(),
             on_file=record.token,
+            on_refused=lambda host, count: self._refusing.request(host, count),
         )
         self.listeners = Listeners(settings, entrances(settings), self._door, self._connection, self._drops, self)
         self.directory = self._presence.directory
         """Who is online."""
         self._robot_ids = RobotIds(settings.robots)
-        self._refusing = Refusing(self._door, record)
+        self._refusing = Refusing(self._door, record, self._drops)
         stead = Stead(mesh, self._layout)
         judged = JudgedFrames()
         self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged)

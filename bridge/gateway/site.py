@@ -94,7 +94,7 @@ class Site:
     def refuse(self, request: web.Request) -> None:
         """Who asks is not let in: count it, and log it, if he has shown a token."""
         if _shown(request) is not None:
-            self._door.failed(self._entrance, self._host_of(request))
+            self._door.refuse_request(self._entrance, self._host_of(request))
 
     def visitor(self, request: web.Request) -> Grant | None:
         """What who asks may do; None: a valid token is wanted, and none is shown."""

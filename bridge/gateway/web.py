@@ -15,11 +15,12 @@ import ssl
 import struct
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Generator, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
-from aiohttp import WSCloseCode, WSMsgType, web
+from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from bridge.settings import GatewaySettings
@@ -34,6 +35,7 @@ from .connection import Connection
 from .door import Door, Entrance
 from .listener import Listener
 from .site import COOKIE, WRONG, Site, add_routes
+from .writer import joined
 
 if TYPE_CHECKING:
     from . import Gateway
@@ -192,7 +194,7 @@ class WebPort:
         return web.json_response({"token": token})
 
     def _wrong(self, request: web.Request) -> web.Response:
-        self._door.failed(self._entrance, _outer_of(request).host)
+        self._door.refuse_request(self._entrance, _outer_of(request).host)
         return web.json_response(WRONG, status=401)
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
@@ -402,6 +404,9 @@ class WebSocketTransport(asyncio.Transport):
         self._encrypts = bool(below.get_extra_info("sslcontext"))
         """Then each piece would be encrypted for itself."""
         self._closing: asyncio.Task[bool] | None = None
+        self._space: memoryview | None = None
+        self._filled = 0
+        """How much of it."""
         self._may_read = asyncio.Event()
         self._may_read.set()
         self._spare = Credit(PINGS_PER_S, time.monotonic())
@@ -430,9 +435,17 @@ class WebSocketTransport(asyncio.Transport):
 
     async def read(self) -> None:
         """Give the connection what comes, until the end."""
+        try:
+            await self._read()
+        finally:
+            self._pass_on()
+
+    async def _read(self) -> None:
         while self._connection is not None:
             await self._may_read.wait()
-            message = await self._socket.receive()
+            message = await _AtOnce(self._socket.receive(), self._pass_on)
+            if message.type is not WSMsgType.BINARY:
+                self._pass_on()
             if message.type is WSMsgType.BINARY:
                 if not message.data and not self._spares():
                     return
@@ -453,17 +466,29 @@ class WebSocketTransport(asyncio.Transport):
                 return
 
     async def _feed(self, data: bytes) -> None:
+        """Put what a message carries where the connection's bytes belong: it looks at them when the next message has
+        not come yet, so that frames that came together go on together."""
         view = memoryview(data)
         while len(view) and self._connection is not None and not self.is_closing():
             if not self._may_read.is_set():
+                self._pass_on()
                 await self._may_read.wait()
                 continue
-            space = self._connection.get_buffer(-1)
-            size = min(len(space), len(view))
-            space[:size] = view[:size]
-            del space  # a view that is kept would keep a frame from growing
-            self._connection.buffer_updated(size)
+            if self._space is None:
+                self._space = self._connection.get_buffer(-1)
+            size = min(len(self._space) - self._filled, len(view))
+            self._space[self._filled : self._filled + size] = view[:size]
+            self._filled += size
             view = view[size:]
+            if self._filled == len(self._space):
+                self._pass_on()
+
+    def _pass_on(self) -> None:
+        """Let the connection look at what was put there."""
+        filled, self._filled = self._filled, 0
+        self._space = None  # a view that is kept would keep a frame from growing
+        if filled and self._connection is not None and not self.is_closing():
+            self._connection.buffer_updated(filled)
 
     def _spares(self) -> bool:
         """Whether it has not sent too much that says nothing; who has is gone."""
@@ -503,7 +528,7 @@ class WebSocketTransport(asyncio.Transport):
         """Whole WebSocket messages. aiohttp writes its own, which are pongs and the last one, whole as well."""
         if not self.is_closing():
             pieces = list(_messages(list_of_data))
-            self._below.writelines([b"".join(pieces)] if self._encrypts else pieces)
+            self._below.writelines(joined(pieces) if self._encrypts else pieces)
 
     def get_write_buffer_size(self) -> int:
         return self._below.get_write_buffer_size()
@@ -525,6 +550,31 @@ class WebSocketTransport(asyncio.Transport):
 
     def abort(self) -> None:
         self._below.abort()
+
+
+class _AtOnce:
+    """Awaits something, and does something else first if that is not there at once."""
+
+    def __init__(self, coroutine: Coroutine[Any, Any, WSMessage], otherwise: Callable[[], None]) -> None:
+        self._coroutine = coroutine
+        self._otherwise = otherwise
+
+    def __await__(self) -> Generator[Any, Any, WSMessage]:
+        steps = self._coroutine.__await__()
+        step: Callable[[], object] = partial(next, steps)
+        otherwise: Callable[[], None] = self._otherwise
+        while True:
+            try:
+                waits_for = step()
+            except StopIteration as done:
+                return cast(WSMessage, done.value)
+            otherwise()
+            try:
+                yield waits_for
+            except BaseException as error:  # noqa: BLE001 - the end of what it waited for, or that of its task
+                step = partial(steps.throw, error)
+            else:
+                step = partial(next, steps)
 
 
 Piece = bytes | bytearray | memoryview

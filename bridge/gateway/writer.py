@@ -22,6 +22,9 @@ from .listener import descriptors
 COPY_BYTES = 16 << 10
 """A piece of a sample that is no larger than this is kept as a copy, and not with all of the sample."""
 
+RECORD_BYTES = 16 << 10
+"""As much as TLS encrypts at once."""
+
 BUFFER_BYTES = 256 << 10
 """What the transport may hold before messages wait in the outbox, where a call can still overtake topic data."""
 
@@ -178,7 +181,7 @@ class Writer:
                 chunks = [rest, *chunks]
             if chunks and not self._transport.is_closing():
                 self.written_bytes += sum(map(len, chunks))
-                self._transport.writelines([b"".join(chunks)] if self._joins and len(chunks) > 1 else chunks)
+                self._transport.writelines(joined(chunks) if self._joins and len(chunks) > 1 else chunks)
 
     def pause(self) -> None:
         """The transport takes nothing more."""
@@ -215,6 +218,24 @@ class Writer:
             self.flush()
             self.write(self._outbox.take(self._outbox.bytes))
             self._transport.close()
+
+
+def joined(chunks: Sequence[Chunk]) -> list[Chunk]:
+    """Small pieces that follow each other as one: TLS encrypts each by itself. A large one takes several of TLS's
+    records anyway, and costs less than its copy."""
+    pieces: list[Chunk] = []
+    small: list[Chunk] = []
+    for chunk in chunks:
+        if len(chunk) < RECORD_BYTES:
+            small.append(chunk)
+            continue
+        if small:
+            pieces.append(b"".join(small))
+            small = []
+        pieces.append(chunk)
+    if small:
+        pieces.append(b"".join(small))
+    return pieces
 
 
 class _Ended(asyncio.Transport):

@@ -634,7 +634,7 @@ class TcpAgent:
         grant = self._admit(configuration.token)
         rights = grant.rights if grant is not None else None
         is_robot = configuration.agent_type != UNITY
-        if grant is None or (is_robot and rights is not None and not rights.has("robot")):
+        if grant is None or (rights is not None and is_robot != rights.has("robot")):
             self._reject(NotAdmitted(), 1, events)
             events += [NotLetIn(), self._leave("it has no valid token")]
             return False
@@ -682,8 +682,8 @@ class TcpAgent:
         self.grant, self._rights = grant, grant.rights
         self._permitted.clear()
         self._decoder.runs = not self._limits.frames_per_s and grant.credit is None
-        if self.agent_type != UNITY and grant.rights is not None and not grant.rights.has("robot"):
-            return [self._leave("its token does not give the right to be a robot any more")]
+        if grant.rights is not None and (self.agent_type != UNITY) != grant.rights.has("robot"):
+            return [self._leave(f"its token is for a {'robot' if grant.rights.has('robot') else 'headset'} now")]
         withdrawn: list[tuple[AddNode, str]] = []
         for key, registering in list(self._registered.items()):
             node, why = registering.node, None
@@ -771,15 +771,19 @@ class TcpAgent:
         if key in self._registered:
             self._refused_at.setdefault(key, set()).add(refused.robot_id)
 
+    def topic_of(self, node_type: int, node_name: str) -> str:
+        """The topic that an agent with a token has registered under this node's name; empty when it has none."""
+        registered = self._registered.get((node_type, node_name))
+        return registered.node.tos_name if registered is not None and isinstance(registered.node, AddNode) else ""
+
     def _permit(self, frame: Frames, metadata: Metadata, rights: Rights) -> None:
         """Whether a frame for others may go on: judged once for each destination and node. Raises NotPermitted."""
         about = frame.destination, metadata.node_type, metadata.node_name, metadata.message_manager
         try:
             why = self._permitted[about]
         except KeyError:
-            registered = self._registered.get((metadata.node_type, metadata.node_name))
-            name = registered.node.tos_name if registered and isinstance(registered.node, AddNode) else None
-            why = rights.of_frame(frame.header, metadata, name)
+            topic = self.topic_of(metadata.node_type, metadata.node_name)
+            why = rights.of_frame(frame.header, metadata, topic or None)
             if len(self._permitted) >= self.PERMITTED:
                 self._permitted.clear()
             self._permitted[about] = why

@@ -1107,6 +1107,24 @@ def test_a_robot_whose_token_makes_it_none_any_more_leaves() -> None:
     assert peer.state is State.GONE
 
 
+def test_what_is_told_of_a_node_names_its_topic() -> None:
+    """As it was registered, since two topics may share a node's name; of a node that was not there is none to name."""
+    peer = guarded(Rights(may=["command"], robots=[1]))
+    peer.receive(shown("good") + registered("/a/b", [1]), 0.0)
+    assert peer.topic_of(2, "nd__a_b") == "/a/b"
+    assert peer.topic_of(1, "nd__a_b") == ""
+    assert peer.topic_of(2, "nd__other") == ""
+
+
+def test_a_robots_token_makes_no_headset() -> None:
+    """Neither when it is shown nor when a headset's token becomes one."""
+    peer = guarded(Rights(may=["robot", "send"]))
+    assert errors(peer.receive(shown("good"), 0.0)) == [NotAdmitted]
+    headset = guarded(Rights(may=["see"]))
+    headset.receive(shown("good"), 0.0)
+    assert [type(event).__name__ for event in headset.rights_change(Grant("g", Rights(may=["robot"])))] == ["Left"]
+
+
 def test_a_group_of_others_is_not_to_be_chosen() -> None:
     """Who asks for a group that its token does not name is in none, and is told."""
     peer = guarded(Rights(groups=[3]))

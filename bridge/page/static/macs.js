@@ -477,7 +477,7 @@ export class Headset extends EventTarget {
     const whom = robot ? [robot] : [...(node?.robots ?? [])];
     const kind = said.kind ?? "refused";
     for (const each of whom) node?.refused(each, said.reason, kind);
-    this.#tell("refused", { robot, node: node ?? null, name: node?.name ?? said.tosName, kind, reason: said.reason });
+    this.#tell("refused", { robot, node: node ?? null, name: node?.name ?? (said.tosName || said.nodeName), kind, reason: said.reason });
   }
 
   /** The connection is gone, however it went: tell, and make another one. */
