@@ -1,4 +1,7 @@
-"""The ports of one gateway: TLS and WebSocket against plain TCP, and what an idle connection costs."""
+"""The ports of one gateway: TLS and WebSocket against plain TCP, and what an idle connection costs.
+
+A relay that does nothing but pass on, plain and over TLS with the same ends, says what TLS costs at the least.
+"""
 
 from __future__ import annotations
 
@@ -32,15 +35,18 @@ def ports(stage: Stage, plan: Plan) -> Iterator[Figure]:
         gateway = stage.programs[-1]
         at = {"plain": plain, "tls": tls, "websocket": web}
         pairs = {way: _connect(stage, way, port, str(authority.ca)) for way, port in at.items()}
+        pairs["relay"] = _connect(stage, "plain", stage.relay(), "")
+        pairs["tls relay"] = _connect(stage, "tls", stage.relay(certificate, key), str(authority.ca))
         for size, least in ((64, None), (KIB, None), (64 * KIB, {"tls": 0.8, "websocket": 0.7})):
             values = in_turn(plan.rounds, {way: stream(plan, pair, size) for way, pair in pairs.items()})
             for way in ("tls", "websocket"):
                 name = f"1 to 1, {way}, {size_text(size)}"
                 yield rate(name, size, values[way], values["plain"], "plain port", at_least=least and least[way])
+            yield rate(f"1 to 1, tls, {size_text(size)}", size, values["tls"], values["tls relay"], "relay over TLS")
+            name = f"1 to 1, relay over TLS, {size_text(size)}"
+            yield rate(name, size, values["tls relay"], values["relay"], "plain relay")
         count = max(200, int(1500 * plan.scale))
-        values = in_turn(
-            plan.rounds, {way: measured_round_trip(plan, pair, KIB, count) for way, pair in pairs.items()}
-        )
+        values = in_turn(plan.rounds, {way: measured_round_trip(plan, pairs[way], KIB, count) for way in at})
         for way in ("tls", "websocket"):  # a round trip is two ways through the gateway
             more = [one - other for one, other in zip(values[way], values["plain"], strict=True)]
             limit = [2 * MORE_US] * len(more)

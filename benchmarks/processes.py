@@ -176,9 +176,9 @@ class Stage:
         gateway = self._start("gateway", *under, *GATEWAY, "--port", "0", "-e", connect, *options)
         return _port_in(gateway.line())
 
-    def relay(self) -> int:
-        """Start the plain asyncio relay; returns its port on 127.0.0.1."""
-        return _port_in(self._start("relay", "-m", "benchmarks.relay").line())
+    def relay(self, *certificate_and_key: str) -> int:
+        """Start the plain asyncio relay, or with files for it one over TLS; returns its port on 127.0.0.1."""
+        return _port_in(self._start("relay", "-m", "benchmarks.relay", *certificate_and_key).line())
 
     def worker(self, module: str, *arguments: object) -> tuple[Program, Answer]:
         """Start a worker; returns it and what it said when it was ready."""

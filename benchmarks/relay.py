@@ -3,11 +3,14 @@
 It reads the same frames (39-byte header, then the sizes it declares), writes the message to the agents named by id,
 by group or all, and holds a sender back while one of its receivers is full. It takes any management data for the
 agent's configuration or a heartbeat.
+
+``python -m benchmarks.relay CERTIFICATE KEY`` does it over TLS: what that costs whoever relays with asyncio.
 """
 
 from __future__ import annotations
 
 import asyncio
+import ssl
 import struct
 import sys
 from typing import Any, cast
@@ -107,7 +110,11 @@ class Agent(asyncio.Protocol):
 async def main() -> None:
     """Relay until stopped."""
     agents: dict[int, Agent] = {}
-    server = await asyncio.get_running_loop().create_server(lambda: Agent(agents), "127.0.0.1", 0)
+    tls = None
+    if len(sys.argv) > 1:
+        tls = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        tls.load_cert_chain(*sys.argv[1:3])
+    server = await asyncio.get_running_loop().create_server(lambda: Agent(agents), "127.0.0.1", 0, ssl=tls)
     print(f"ready: relay on 127.0.0.1:{server.sockets[0].getsockname()[1]}", flush=True)
     ended = asyncio.Event()
     asyncio.get_running_loop().add_reader(sys.stdin.fileno(), ended.set)  # nothing is ever sent there: its end
