@@ -19,6 +19,7 @@ from .checks import Level, Verdict, Verdicts
 from .client_frames import ClientFrames, Kind, Node, Said
 from .headset_checks import CHECKS as CHECKS
 from .headset_checks import IGNORED, WELCOMES
+from .headset_sessions import Sessions, registered
 from .router import Client, Router, cdr_for
 from .vectors import Value
 
@@ -63,6 +64,7 @@ class Judge:
         self._request = 1000
         self._client: Client
         self._program = program
+        self._sessions = Sessions(router, frames, verdicts, patience_s)
 
     async def run(self, start_s: float) -> None:
         """All of it. Raises Gone when the headset is."""
@@ -82,6 +84,7 @@ class Judge:
         await self._heartbeats()
         if self._verdicts.asked("reconnect.after_end"):
             await self._reconnects()
+            self._client = await self._sessions.run(self._client)
         if not self._verdicts.failed("renumber.answers"):
             await self._bad_messages()
         if self._verdicts.asked("offline.says") and self._program is not None:
@@ -111,6 +114,8 @@ class Judge:
             welcome = self._welcome(agent_id)
             pieces = range(1, len(welcome)) if bytewise else ()
             answer = await self._asked(welcome, None, max(5.0, self._patience_s), pieces)
+            if answer is not None and answer.management.get("session"):  # it waits for what became of that
+                await self._client.send(vectors.fill("router_messages", "session_opened"))
             if answer is not None or not self._client.ended:
                 return answer
             other = await self._router.next(_SETTLE_S)
@@ -354,20 +359,15 @@ class Judge:
         had = set(self._frames.nodes)
         self._client.finish()
         await self._joins_again("reconnect.after_end", 21)
-        registered = await self._client.until(lambda: self._registered() >= had, max(3.0, self._patience_s))
+        came = await self._client.until(lambda: registered(self._client) >= had, max(3.0, self._patience_s))
         if had:
-            missing = sorted(name for _, name in had - self._registered())
-            self._verdicts.hold("reconnect.registers", registered, f"it did not register {', '.join(missing)}")
+            missing = sorted(name for _, name in had - registered(self._client))
+            self._verdicts.hold("reconnect.registers", came, f"it did not register {', '.join(missing)}")
         else:
             self._verdicts.skip("reconnect.registers", "it had registered nothing")
         self._client.abort()
         await self._joins_again("reconnect.after_reset", 22)
         await self._closed_at_once()
-
-    def _registered(self) -> set[tuple[int, str]]:
-        """What was registered on this connection."""
-        found = (said.management for said in self._client.said if said.kind is Kind.REGISTRATION)
-        return {(int(each.get("node_type", 0)), str(each.get("node_name"))) for each in found}
 
     async def _joins_again(self, name: str, agent_id: int) -> None:
         client = await self._router.next(_AGAIN_S)

@@ -76,5 +76,13 @@ CHECKS: tuple[Check, ...] = (
     Check("reconnect.new_id", "It takes the id that it gets there.", STRICT),
     Check("reconnect.registers", "It registers again what it had registered.", STRICT),
     Check("reconnect.pauses", "It does not try more than 50 times a second while its router closes at once.", STRICT),
+    Check("sessions.asks", "A headset that knows sessions asks for one by an empty text.", STRICT),
+    Check("sessions.shows", "When its connection has ended it comes back with the secret that it was told.", STRICT),
+    Check("sessions.received", "It says how many messages of the session it has.", STRICT),
+    Check("sessions.waits", "It says nothing more until it is told what became of its session.", STRICT),
+    Check("sessions.id", "It has the id that the session goes on with, and not that of the new greeting.", STRICT),
+    Check("sessions.says_again", "It registers again what its router says has not come.", STRICT),
+    Check("sessions.registers_nothing", "It registers nothing where all has come.", STRICT),
+    Check("sessions.forgotten", "Where its router does not know it any more it registers everything.", STRICT),
     Check("offline.says", "A program that takes SIGTERM says that it leaves.", STRICT),
 )

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 
 from macs_zenoh.errors import Unreachable
 from macs_zenoh.protocol.addresses import joined
-from macs_zenoh.protocol.decoders import FrameDecoder
+from macs_zenoh.protocol.decoders import FrameDecoder, MessageDecoder
 from macs_zenoh.protocol.wire import Run
 from macs_zenoh.timeouts import within
 
@@ -43,6 +43,9 @@ class Client:
         self.said: list[Said] = []
         self.ended = False
         self.reset = False
+        self.sent: int | None = None
+        """How many messages were sent to it since this was 0; None while nobody counts them, as where some are bad."""
+        self._counter = MessageDecoder()
         self._reader = reader
         self._writer = writer
         self._frames = frames
@@ -59,6 +62,8 @@ class Client:
             await self._send(data, pieces, pause_s)
 
     async def _send(self, data: bytes, pieces: Iterable[int], pause_s: float) -> None:
+        if self.sent is not None:
+            self.sent += len(self._counter.feed(data))
         start = 0
         with contextlib.suppress(OSError, asyncio.TimeoutError):
             for end in [*pieces, len(data)]:

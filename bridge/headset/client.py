@@ -782,6 +782,8 @@ class Headset:
         loop, heartbeat_s = asyncio.get_running_loop(), self._options.heartbeat_s
         while True:
             connection, session = self._connection, self._session
+            if session is not None and not session.secret:
+                session = None  # its gateway knows none, and need not be told what has come
             due_s = heartbeat_s if connection is None else connection.last_output + heartbeat_s - loop.time()
             if session is not None and session.received > session.told:
                 due_s = min(due_s, self._acknowledged_at + ACK_S - loop.time())

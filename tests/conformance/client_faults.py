@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+from bridge.conformance import vectors
 from macs_zenoh.protocol.wire import encode_message
 from tests.conformance.faults import Faults
 from tests.conformance.proxy import Link, changed, message_of, parts, said, with_management, with_message
@@ -189,3 +190,67 @@ def never_comes_back(frame: bytes, link: Link) -> list[bytes]:
     if is_configuration(frame):
         link.proxy.stop_listening()
     return [frame]
+
+
+def is_back(frame: bytes) -> bool:
+    """A configuration that shows a session's secret."""
+    return is_configuration(frame) and bool(said(frame).get("session"))
+
+
+def came_back(frame: bytes, link: Link) -> bool:
+    """Whether this connection began with one."""
+    link.notes.back = is_back(frame) or getattr(link.notes, "back", False)
+    return bool(link.notes.back)
+
+
+@frames("sessions.asks")
+def asks_with_a_secret_of_its_own(frame: bytes, link: Link) -> list[bytes]:
+    return [with_management(frame, session="mine")] if is_configuration(frame) and not is_back(frame) else [frame]
+
+
+@frames("sessions.shows")
+def forgets_its_secret(frame: bytes, link: Link) -> list[bytes]:
+    return [with_management(frame, session="")] if is_back(frame) else [frame]
+
+
+@frames("sessions.received")
+def counts_its_greeting(frame: bytes, link: Link) -> list[bytes]:
+    return [with_management(frame, received=said(frame)["received"] + 1)] if is_back(frame) else [frame]
+
+
+@frames("sessions.waits")
+def speaks_before_it_is_told(frame: bytes, link: Link) -> list[bytes]:
+    beat = vectors.fill("headset_frames", "heartbeat")
+    return [frame, beat] if is_back(frame) else [frame]
+
+
+@frames("sessions.id")
+def takes_the_new_id(frame: bytes, link: Link) -> list[bytes]:
+    if not came_back(frame, link) or is_configuration(frame) or not parts(message_of(frame))[0]:
+        return [frame]
+    return [with_message(frame, changed(message_of(frame), senderAgentId=41))]
+
+
+@frames("sessions.says_again")
+def says_nothing_again(frame: bytes, link: Link) -> list[bytes]:
+    return [] if came_back(frame, link) and is_registration(frame) else [frame]
+
+
+@messages("sessions.registers_nothing")
+def believes_that_nothing_has_come(message: bytes, link: Link) -> list[bytes]:
+    metadata, data = parts(message)
+    if (metadata or {}).get("messageManager") != "SessionResumed":
+        return [message]
+    nothing = json.dumps({**json.loads(data), "received": 0}).encode()
+    return [encode_message(json.dumps(metadata).encode(), nothing)]
+
+
+@messages("sessions.forgotten")
+def believes_that_it_is_known(message: bytes, link: Link) -> list[bytes]:
+    metadata, _ = parts(message)
+    if (metadata or {}).get("messageManager") != "SessionOpened":
+        return [message]
+    link.proxy.shared.opened = getattr(link.proxy.shared, "opened", 0) + 1
+    if link.proxy.shared.opened == 1:
+        return [message]
+    return [vectors.fill("router_messages", "session_resumed", id=31, heard=1_000_000)]

@@ -6,7 +6,7 @@ import json
 
 from macs_zenoh.protocol.wire import encode_message
 from tests.conformance.faults import Faults
-from tests.conformance.proxy import Link, changed, message_of, parts, said
+from tests.conformance.proxy import Link, changed, message_of, parts, said, with_management
 
 FAULTS = Faults()
 frames, messages = FAULTS.frames, FAULTS.messages
@@ -166,3 +166,71 @@ def lets_one_overtake(frame: bytes, link: Link) -> list[bytes]:
         return []
     late = vars(link.notes).pop("late", None)
     return [frame, late] if late else [frame]
+
+
+def resumed(message: bytes, **other: object) -> list[bytes]:
+    """A SessionResumed that says something else; what is none as it is."""
+    if named(message) != "SessionResumed":
+        return [message]
+    metadata, data = parts(message)
+    return [encode_message(json.dumps(metadata).encode(), json.dumps({**json.loads(data), **other}).encode())]
+
+
+@messages("sessions.opened")
+def tells_a_short_secret(message: bytes, link: Link) -> list[bytes]:
+    metadata, data = parts(message)
+    if named(message) != "SessionOpened":
+        return [message]
+    short = {**json.loads(data), "session": json.loads(data)["session"][:8]}
+    return [encode_message(json.dumps(metadata).encode(), json.dumps(short).encode())]
+
+
+@messages("sessions.not_asked")
+def opens_sessions_for_all(message: bytes, link: Link) -> list[bytes]:
+    opened = encode_message(json.dumps({"messageManager": "SessionOpened"}).encode(), b'{"session":"a","resumeS":1}')
+    return [opened, message] if is_from_agent(message) else [message]
+
+
+@messages("sessions.same")
+def gives_another_id(message: bytes, link: Link) -> list[bytes]:
+    own = json.loads(parts(message)[1])["agentId"] if named(message) == "SessionResumed" else 0
+    return resumed(message, agentId=own + 1)
+
+
+@messages("sessions.frames")
+def counts_the_configuration(message: bytes, link: Link) -> list[bytes]:
+    had = json.loads(parts(message)[1])["received"] if named(message) == "SessionResumed" else 0
+    return resumed(message, received=had + 1)
+
+
+@messages("sessions.missed")
+def says_what_was_missed_twice(message: bytes, link: Link) -> list[bytes]:
+    link.notes.back = named(message) == "SessionResumed" or getattr(link.notes, "back", False)
+    return [message, message] if link.notes.back and is_from_agent(message) else [message]
+
+
+@frames("sessions.again")
+def ignores_what_has_come(frame: bytes, link: Link) -> list[bytes]:
+    return [with_management(frame, received=0)] if said(frame).get("received") else [frame]
+
+
+@frames("sessions.over")
+def lets_come_back_who_has_left(frame: bytes, link: Link) -> list[bytes]:
+    return [] if said(frame).get("messageManager") == "UnityAgentclientRemover" else [frame]
+
+
+@frames("sessions.wrong_secret")
+def believes_any_secret(frame: bytes, link: Link) -> list[bytes]:
+    """Whoever shows one is who was told the last."""
+    known = getattr(link.proxy.shared, "secret", None)
+    return [with_management(frame, session=known)] if known and said(frame).get("session") else [frame]
+
+
+def note_secret(message: bytes, link: Link) -> list[bytes]:
+    """What `believes_any_secret` has heard."""
+    if named(message) == "SessionOpened":
+        link.proxy.shared.secret = json.loads(parts(message)[1])["session"]
+    return [message]
+
+
+FAULTS["believes_any_secret"] = FAULTS["believes_any_secret"]._replace(message=note_secret)
