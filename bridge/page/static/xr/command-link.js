@@ -40,6 +40,7 @@ export class CommandLink {
   #sentAt = -Infinity;
   /** When nothing waited here last. */
   #clearAt = 0;
+  #askedAt = -Infinity;
   #status = new Map();
   #timer = null;
   #refusal = "";
@@ -154,11 +155,10 @@ export class CommandLink {
   async #aimDrive() {
     const { topic, type, robots, groups } = this.#target;
     const node = this.headset.advertise(topic, type, { robots, groups });
-    const drive = { topic, robots, groups, node, shape: TWIST[type], type: null, zero: null, owes: 0 };
+    const drive = { topic, robots, groups, node, shape: TWIST[type], type: null, owes: 0 };
     this.#drive = drive;
     try {
       drive.type = await this.types.get(type, robots[0] ?? this.#target.seen);
-      drive.zero = drive.type.write(drive.shape({}, {}, 0));
     } catch (error) {
       this.#say("drive", error.message);
     }
@@ -174,7 +174,7 @@ export class CommandLink {
     let why = quiet;
     if (!why && !this.me.may.includes("command")) why = "this token may not drive";
     else if (!why && !this.#drive) why = "the robot takes no velocities";
-    else if (!why && !this.#drive.zero) why = "the type of its commands is asked for";
+    else if (!why && !this.#drive.type) why = "the type of its commands is asked for";
     else if (!why && holder) why = `${named(holder)} has control`;
     this.#hold.bar(why);
     if (was && !this.#hold.held) this.#ended();
@@ -236,7 +236,9 @@ export class CommandLink {
 
   /** Whether the gateway answers, and what was sent went. Poses and commands of one frame wait for each other a moment. */
   #fresh(now) {
-    if (this.headset.waitingBytes === 0) this.#clearAt = now;
+    const asked = now - this.#askedAt <= FRESH_MS;
+    if (this.headset.waitingBytes === 0 || !asked) this.#clearAt = now; // what is said once may wait at that moment
+    this.#askedAt = now;
     return this.headset.isFresh(FRESH_MS) && now - this.#clearAt <= FRESH_MS;
   }
 
@@ -252,7 +254,8 @@ export class CommandLink {
     const { robots, groups } = drive;
     this.speed = { linear: 0, angular: 0 };
     const zero = () => {
-      if (!this.#drives(drive)) drive.node.publish(drive.zero, { robots, groups });
+      const message = drive.type.write(drive.shape({}, {}, performance.timeOrigin + performance.now()));
+      if (!this.#drives(drive)) drive.node.publish(message, { robots, groups });
     };
     zero();
     for (const ms of ZEROS_MS) setTimeout(zero, ms);

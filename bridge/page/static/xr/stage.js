@@ -68,7 +68,9 @@ const FLOOR = {
 
 export class Stage {
   constructor(canvas) {
-    this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true, powerPreference: "high-performance" });
+    // where there are two processors, they draw
+    const antialias = (navigator.hardwareConcurrency ?? 8) > 2;
+    this.renderer = new WebGLRenderer({ canvas, antialias, alpha: true, powerPreference: "high-performance" });
     this.renderer.setPixelRatio(Math.min(2, devicePixelRatio || 1));
     this.renderer.xr.enabled = true;
     this.renderer.xr.setReferenceSpaceType("local-floor");
