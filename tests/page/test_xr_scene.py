@@ -60,7 +60,11 @@ async def test_it_sees_and_drives(site: Site) -> None:
     async with with_webgl(site), heard_at(site) as heard:
         headset = await headset_at(site)
         await headset.ready()
+        await until(lambda: headset.state("maxAgeS === 0.2"))  # its commands tell when they were made
+        await headset.page.set_viewport_size({"width": 1280, "height": 760})
+        await headset.frame(4)
         await headset.shot("screen")
+        await headset.page.set_viewport_size({"width": 640, "height": 420})
         await headset.enter()
         await headset.frame()
         before = await headset.pixels()

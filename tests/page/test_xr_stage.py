@@ -14,7 +14,7 @@ from bridge.page.routes import POLICY
 from macs_zenoh.protocol.rights import Rights
 from tests.page.conftest import with_token
 from tests.page.headsets import WEBGL, Gate, headset_at, needs_headset
-from tests.support.browser import browser, needs_browser
+from tests.support.browser import AXE, browser, needs_browser
 from tests.support.programs import Program, free_port
 from tests.support.waiting import until
 
@@ -86,6 +86,22 @@ async def test_each_eye_has_its_half_of_a_wide_picture(gate: Gate) -> None:
     assert like(await headset.pixels(0.25, 0.45), red)
     assert like(await headset.pixels(0.75, 0.45), blue)
     await headset.shot("stereo")
+
+
+async def test_its_screen_can_be_used_by_all(gate: Gate) -> None:
+    """What axe finds nothing wrong with: the scene, and its settings."""
+    headset = await headset_at(gate)
+    await until(lambda: headset.value("Boolean(window.macsXr)"))
+    await headset.value(AXE.read_text(encoding="utf-8") + ";0")
+    wrong = "axe.run().then((found) => found.violations.map((each) => [each.id, each.nodes.map((node) => node.html)]))"
+    assert await headset.value(wrong) == []
+    await headset.page.click("#open-settings")
+    assert await headset.value(wrong) == []
+    await headset.page.fill("#setting-forward", "100")
+    await headset.page.press("#setting-forward", "Tab")
+    assert await headset.page.get_attribute("#setting-forward", "aria-invalid") == "true"
+    assert await headset.value("macsXr.settings.get('forward')") == 0.5
+    await headset.shot("settings")
 
 
 async def test_hands_move_panels_and_press_buttons(gate: Gate) -> None:

@@ -32,7 +32,8 @@ class Scene {
     this.me = me;
     this.settings = new Settings();
     this.canvas = h("canvas", { class: "xr-scene", id: "scene", tabindex: "0", "aria-label": "The robot and its pictures in a room" });
-    document.body.replaceChildren(this.canvas);
+    const heading = h("h1", { class: "visually-hidden" }, "Headset");
+    document.body.replaceChildren(h("main", {}, heading, this.canvas));
     this.stage = new Stage(this.canvas);
     this.links = new Links(me);
     this.room = new Room(this.stage, this.settings);

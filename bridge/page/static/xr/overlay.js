@@ -61,15 +61,14 @@ export class Overlay {
     this.stopStatus = h("p", { class: "stop-status", id: "stop-status", role: "status", "aria-live": "assertive" });
     this.stopBar = h("div", { class: "stop-bar" }, this.stopStatus, this.release, this.stop);
     show(this.stop, me.may.includes("stop"));
-    this.event = h("p", { class: "xr-event", id: "event", role: "log" });
+    this.event = h("footer", { class: "xr-event", id: "event" });
     this.dialog = this.#settingsDialog();
     const open = button("open-settings", "small", "Settings", () => this.dialog.showModal());
     show(open, true);
     const head = h("header", { class: "xr-top" },
       h("a", { class: "brand", href: "/" }, "macs"), this.targets, this.link, this.control, this.take, this.give, this.back,
       h("span", { class: "xr-space" }), ...Object.values(this.enter), this.none, open, this.stopBar);
-    const heading = h("h1", { class: "visually-hidden" }, "Headset");
-    this.root = h("div", { class: "xr-overlay" }, head, heading, this.pad.element, this.event, this.dialog);
+    this.root = h("div", { class: "xr-overlay" }, head, this.pad.element, this.event, this.dialog);
   }
 
   /** Which ways into XR there are: names of modes. */
