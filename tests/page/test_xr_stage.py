@@ -21,7 +21,7 @@ from tests.support.waiting import until
 pytestmark = [needs_browser, needs_headset]
 
 FILL = """async ([topic, width, height, colours]) => {
-  macsXr.telling.tell = () => {};
+  macsXr.telling.tell = macsXr.telling.tick = () => {};
   macsXr.room.setPanels([topic]);
   const canvas = new OffscreenCanvas(width, height);
   const context = canvas.getContext('2d');

@@ -65,7 +65,7 @@ class Scene {
     this.immersion.look();
     this.stage.renderer.setAnimationLoop((time, frame) => this.#frame(time, frame ?? null));
     setInterval(() => this.#askOffers(), OFFERS_MS);
-    setInterval(() => this.telling.tell(), 250);
+    setInterval(() => this.telling.tick(), 250);
   }
 
   choose(id) {

@@ -377,7 +377,7 @@ export class CommandLink {
   /** Who has control, and whether it is stopped, as each robot says it itself. */
   async #askStatus() {
     const target = this.#target;
-    if (!target || !this.headset.connected || this.#away === "hidden") return;
+    if (!target || !this.headset.connected || this.#away) return;
     for (const robot of target.robots.length ? target.robots : [target.seen].filter(Boolean)) {
       const answer = await get(`/view/robots/${robot}/status`);
       if (target !== this.#target) return;

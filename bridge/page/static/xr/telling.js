@@ -69,13 +69,28 @@ export class Telling {
 
   /** All of it, as it is now. */
   tell() {
-    const { scene, state, stop } = this;
-    const now = performance.now();
-    scene.room.tellPictures(scene.links.rates, scene.wishes, state.blind, now);
-    scene.overlay.setState(state, scene.sample ?? {});
-    scene.overlay.setStop(stop, scene.sure);
-    this.#tellStatus(now);
+    this.#tellScreen();
+    this.#tellPictures();
+    this.#tellStatus(performance.now());
     this.#tellMenu();
+  }
+
+  /** Four times a second: of what has to be drawn and uploaded each part once, so that no frame has it all. */
+  tick() {
+    this.turn = ((this.turn ?? 0) + 1) % 4;
+    this.#tellScreen();
+    if (this.turn === 0) this.#tellStatus(performance.now());
+    else if (this.turn === 2) this.#tellPictures();
+  }
+
+  #tellScreen() {
+    this.scene.overlay.setState(this.state, this.scene.sample ?? {});
+    this.scene.overlay.setStop(this.stop, this.scene.sure);
+  }
+
+  #tellPictures() {
+    const { room, links, wishes } = this.scene;
+    room.tellPictures(links.rates, wishes, this.state.blind, performance.now());
   }
 
   #take(state) {

@@ -1,0 +1,104 @@
+"""What robots publish besides pictures, from a ROS node to the table of the scene for headsets."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from geometry_msgs.msg import TransformStamped
+from sensor_msgs.msg import JointState, LaserScan, PointCloud2, PointField
+from std_msgs.msg import Float32
+from tf2_msgs.msg import TFMessage
+
+from tests.page.conftest import Site
+from tests.page.headsets import headset_at, needs_headset, with_webgl
+from tests.support.browser import needs_browser
+from tests.support.ros_peer import Peer
+from tests.support.waiting import until
+
+pytestmark = [needs_browser, needs_headset, pytest.mark.timeout(200)]
+
+POINTS = 50_000
+
+
+def scan() -> Any:
+    message = LaserScan(angle_min=-math.pi, angle_increment=math.pi / 90, range_min=0.1, range_max=30.0)
+    message.header.frame_id = "laser"
+    message.ranges = [2.0] * 180
+    return message
+
+
+def cloud() -> Any:
+    message = PointCloud2(height=1, width=POINTS, point_step=12, row_step=12 * POINTS, is_dense=True)
+    message.header.frame_id = "nobody_tells_of_it"
+    message.fields = [
+        PointField(name=name, offset=4 * at, datatype=PointField.FLOAT32, count=1) for at, name in enumerate("xyz")
+    ]
+    message.data = b"".join(struct.pack("<3f", 1 + at / POINTS, 0.0, 0.5) for at in range(POINTS))
+    return message
+
+
+def frames() -> Any:
+    transform = TransformStamped()
+    transform.header.frame_id, transform.child_frame_id = "map", "laser"
+    transform.transform.translation.x, transform.transform.translation.y = 1.0, 2.0
+    transform.transform.rotation.w = 1.0
+    return TFMessage(transforms=[transform])
+
+
+MESSAGES: dict[str, Callable[[], Any]] = {
+    "/scan": scan,
+    "/points": cloud,
+    "/tf": frames,
+    "/joint_states": lambda: JointState(name=["arm", "hand"], position=[0.5, -1.0]),
+    "/level": lambda: Float32(data=0.625),
+}
+
+
+async def test_what_a_robot_publishes_is_on_the_table(site: Site) -> None:
+    """A scan where its frame is, a cloud of few of its points on the robot, frames, joints, the map, its battery, and
+    a value as text."""
+    peer = Peer(site.domain)
+    publishing = None
+    try:
+        messages = {topic: make() for topic, make in MESSAGES.items()}
+        publishers = {topic: await peer.publisher(type(message), topic) for topic, message in messages.items()}
+
+        async def publish() -> None:
+            while True:
+                for topic, message in messages.items():
+                    await peer.session.run(lambda topic=topic, message=message: publishers[topic].publish(message))
+                await asyncio.sleep(0.3)
+
+        publishing = asyncio.create_task(publish())
+        async with with_webgl(site):
+            headset = await headset_at(site, settings={"cameras": [], "values": ["/level"], "points": 1000})
+            await headset.ready(pictures=False)
+            for layer in ("scan", "cloud", "frames"):
+                await until(lambda layer=layer: headset.value(f"macsXr.room.model.{layer}.visible"))
+            model = "macsXr.room.model"
+            await until(lambda: headset.value(f"{model}.scan.parent === {model}.world"))
+            place = await headset.value(f"(({{ x, y, z }}) => [x, y, z])({model}.scan.position)")
+            assert place == [-2, 0, -1], "1 m ahead and 2 m to the left of the map's origin"
+            assert await headset.value(f"{model}.cloud.parent === {model}.atRobot")
+            drawn = await headset.value(f"{model}.cloud.geometry.drawRange.count")
+            assert 500 < drawn <= 1000, "few of its points"
+            await until(lambda: headset.value(f"{model}.joints.group.children.length === 2"))
+            await until(lambda: headset.value("macsXr.telling.battery?.text.includes('V')"))
+            await until(lambda: headset.value("macsXr.telling.texts.get('/level')?.[0] === 'level: data 0.625'"))
+            await until(lambda: headset.value(f"Boolean({model}.map?.visible)"))
+            await headset.shot("world")
+            await headset.value("macsXr.settings.set('layers', ['scan'])")
+            await until(lambda: headset.value(f"!{model}.cloud.visible && {model}.scan.visible"))
+    finally:
+        if publishing is not None:
+            publishing.cancel()
+            await asyncio.gather(publishing, return_exceptions=True)
+        peer.session.close()
