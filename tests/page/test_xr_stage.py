@@ -140,6 +140,10 @@ async def test_hands_move_panels_and_press_buttons(gate: Gate) -> None:
     assert await headset.value("macsXr.settings.get('curve')") == 0, "pressed once"
     await headset.trigger("left", held=False)
     await headset.shot("moved")
+    await headset.leave()
+    assert await headset.value("macsXr.stage.room.visible")
+    await headset.enter("immersive-ar")
+    assert not await headset.value("macsXr.stage.room.visible"), "the real room is to be seen"
 
 
 BUTTON = """(id) => {

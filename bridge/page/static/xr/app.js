@@ -109,7 +109,7 @@ class Scene {
     this.pointing.update(sources, dt);
     this.looking.free(sources, this.pointing.panelUnder("mouse"));
     this.#stopIfPressed(sources);
-    const sample = this.immersion.attended ? this.input.drive(sources, this.stage.head().facing) : null;
+    const sample = this.immersion.attended ? this.input.drive(sources, this.stage.head().facing, immersive) : null;
     const poses = immersive && this.wanted.size ? this.input.poses(frame, space, sources, this.wanted) : null;
     this.sample = sample;
     this.#send(sample, poses, began);

@@ -18,6 +18,10 @@ export class Links extends EventTarget {
     this.sightUp = { connected: false, id: 0, badMessages: 0 };
     /** How long the last pictures took until they were shown: since the socket, and since their stamp by whose clock it is, ms. */
     this.pictureMs = [];
+    for (const [name, worker] of [["commands", this.commands], ["pictures", this.sight]]) {
+      const text = `the worker of ${name} failed`;
+      worker.onerror = ({ message }) => this.dispatchEvent(new CustomEvent("event", { detail: { text: `${text}: ${message}` } }));
+    }
     this.commands.onmessage = ({ data }) => this.#take(data);
     this.sight.onmessage = ({ data }) => this.#see(data);
     this.commands.postMessage({ op: "begin", url, me, kept: readKept(), sight: port1 }, [port1]);

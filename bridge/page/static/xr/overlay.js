@@ -13,7 +13,7 @@ const FIELDS = [
     ["lockoutS", "No driving with a picture older than, s (0: never)", "number"],
   ]],
   ["Pictures", [
-    ["cameras", "Topics, the first one guards driving (empty: the first two)", "list"],
+    ["cameras", "Topics, the first one guards driving (empty: the first two; or none)", "list"],
     ["stereo", "Two eyes in one picture", ["auto", "off", "side-by-side"]],
     ["rightEye", "Topic of the right eye, for the first panel", "topic"],
     ["curve", "Curve of panels, 0 to 1", "number"],
@@ -123,18 +123,24 @@ export class Overlay {
     if (Array.isArray(kind)) {
       input = h("select", { id }, ...kind.map((each) => h("option", { value: each, selected: each === value }, each)));
     } else {
-      const text = kind === "list" ? (value ?? []).join(" ") : String(value);
+      const text = kind === "list" ? listed(value) : String(value);
       const type = kind === "number" ? "number" : "text";
       input = h("input", { id, type, step: "any", value: text, spellcheck: "false", autocomplete: "off" });
     }
     input.addEventListener("change", () => {
       const words = input.value.trim();
-      const list = words ? words.split(/[\s,]+/) : name === "cameras" ? null : [];
+      const none = name === "cameras" ? null : [];
+      const list = words === "none" ? [] : words ? words.split(/[\s,]+/) : none;
       const taken = this.settings.set(name, kind === "number" ? input.valueAsNumber : kind === "list" ? list : words);
       input.setAttribute("aria-invalid", String(!taken));
     });
     return h("label", { for: id }, h("span", {}, label), input);
   }
+}
+
+function listed(value) {
+  if (value === null) return "";
+  return value.length ? value.join(" ") : "none";
 }
 
 /** A button that is hidden at first. */
