@@ -29,7 +29,7 @@ from tests.support.processes import Process
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
 
-pytestmark = [needs_browser, needs_headset, pytest.mark.timeout(280)]
+pytestmark = [needs_browser, needs_headset, pytest.mark.alone, pytest.mark.soak, pytest.mark.timeout(280)]
 
 MEASURED_S = 8.0
 DRIVEN = "/test/drive"
