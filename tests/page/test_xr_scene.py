@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import time
 from functools import partial
 from typing import Any
 
@@ -150,7 +151,7 @@ async def test_poses_come_in_ros_axes(site: Site) -> None:
             assert abs(right.pose.position.y + 0.25) < 0.1
             assert right.pose.orientation.z < -0.4  # to the right
             await by_stick(headset, "right", 1.0, -0.5)
-            joy = await newest(joys, lambda message: message.buttons[7])
+            joy = await newest(joys, lambda message: message.buttons[7] and message.axes[2])
             assert [round(axis, 3) for axis in joy.axes] == [0, 0, -1.0, 0.5, 0, 0, 0, 1.0]
             await released(headset, "right")
             await headset.value("device.primaryInputMode = 'hand'")
@@ -158,7 +159,6 @@ async def test_poses_come_in_ros_axes(site: Site) -> None:
             hand = await newest(hands, lambda message: abs(message.poses[0].position.z - 1.25) < 0.15)
             assert len(hand.poses) == 25
             assert all(abs(pose.position.x - 0.5) < 0.3 for pose in hand.poses)
-            stamps = [head.header.stamp.sec, hand.header.stamp.sec]
-            assert all(abs(stamp - head.header.stamp.sec) < 200 for stamp in stamps)
+            assert head.header.stamp.sec <= hand.header.stamp.sec <= time.time() + 1
     finally:
         peer.session.close()
