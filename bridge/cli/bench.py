@@ -24,7 +24,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from bridge.cli import named, options, output, robots, running, terminal
-from macs_zenoh.errors import MacsError, UsageError
+from macs_zenoh.errors import MacsError, NotServed, Unreachable, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -78,7 +78,10 @@ async def _measure(settings: Settings, args: argparse.Namespace, load: Load, tel
         caller = robots.chosen_caller(args, settings.operator)
         async with robots.operator(settings.mesh, caller, timeout_s=args.wait) as operator:
             robot = args.robot[0]
-            await operator.ask(robot, "ping", timeout_s=args.wait)  # where it is not there, that is said at once
+            try:  # where it is not there, that is said at once
+                await operator.ask(robot, "ping", timeout_s=args.wait)
+            except NotServed:
+                raise Unreachable(f"robot {robot}", operator.not_answered) from None
             return await probes.round_trips(
                 lambda data: operator.ask(robot, "ping", data, timeout_s=args.wait), load, tell
             )

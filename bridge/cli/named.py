@@ -101,7 +101,7 @@ def list_found(args: argparse.Namespace, kind: str, find: Callable[[Any], list[N
     """List what robots have of a kind, as ``--json`` and ``--show-types`` say."""
 
     async def work(site: Looking) -> int:
-        found = find(await site.offers(site.must_be_online()))
+        found = find(await site.must_offer(site.must_be_online()))
         if args.json:
             output.say(json.dumps([each.facts(kind) for each in found]))
         for each in () if args.json else found:

@@ -26,7 +26,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from bridge.cli import named, options, output, robots, running
-from macs_zenoh.errors import CallTimeout, MacsError, Unreachable
+from macs_zenoh.errors import CallTimeout, MacsError, NotServed, Unreachable
 from macs_zenoh.protocol.messages import ROS
 
 if TYPE_CHECKING:
@@ -101,6 +101,9 @@ async def _ping(operator: Operator, args: argparse.Namespace) -> int:
             except CallTimeout as error:
                 problem = str(error)
                 _say(args, f"no answer from robot {args.robot}: seq={number}")
+            except NotServed:
+                problem = operator.not_answered
+                break
             except MacsError as error:
                 problem = str(error)
                 break

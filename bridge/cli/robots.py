@@ -62,6 +62,11 @@ class Operator:
         self._timeout_s = timeout_s
         self._layout = Layout(mesh.settings.id_slots, mesh.settings.group_slots)
 
+    @property
+    def not_answered(self) -> str:
+        """Why a robot that is online may not answer a call."""
+        return f"it does not answer {self._caller}; access rules may not allow it (--as, docs/security.md)"
+
     async def online(self) -> list[AgentInfo]:
         """Everybody on the mesh, by type and id; who has an id that another session has as well is listed, too."""
         directory = Directory()

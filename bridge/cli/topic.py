@@ -190,7 +190,7 @@ def _list(args: argparse.Namespace) -> int:
     from bridge.graph.site import named as named_robots
 
     async def work(site: Looking) -> int:
-        topics = lists.topics(await site.offers(site.must_be_online()))
+        topics = lists.topics(await site.must_offer(site.must_be_online()))
         if args.json:
             output.say(json.dumps([topic.facts() for topic in topics]))
         elif args.count_topics:
@@ -216,7 +216,7 @@ def _info(args: argparse.Namespace) -> int:
 
     async def work(site: Looking) -> int:
         robots = site.must_be_online()
-        offers, name = await site.offers(robots), absolute(args.topic)
+        offers, name = await site.must_offer(robots), absolute(args.topic)
         about = lists.about_topic(name, offers, await site.states(robots) if args.details or args.json else {})
         if not about["robots"]:
             near = closest(name, [topic.name for topic in lists.topics(offers)])

@@ -72,7 +72,7 @@ class Publication:
         """Publish; the exit code, 1 where a robot refused. Raises Unreachable, UsageError, Refused, CallTimeout and
         what `Types.serialize` raises."""
         robots = self._site.only()
-        offers = await self._site.offers(robots)
+        offers = await (self._site.offers if self._type else self._site.must_offer)(robots)
         of_type = self._type or type_of(self._topic, NodeType.PUBLISHER, offers)
         types = Types()
         cdr = types.serialize(of_type, self._value)
@@ -163,7 +163,7 @@ async def call_service(
     Raises Unreachable, UsageError, and what `Types.serialize` raises.
     """
     service, robots = absolute(service), site.only()
-    of_type = of_type or type_of(service, NodeType.CLIENT, await site.offers(robots))
+    of_type = of_type or type_of(service, NodeType.CLIENT, await site.must_offer(robots))
     Types().serialize(request_of(of_type), value)  # before any robot does it
     code = 0
 
@@ -268,7 +268,7 @@ async def send_goal(
     action, robots = absolute(action), site.only()
     if len(robots) > 1:
         raise Unreachable(f"one robot for {action}", f"{named(robots)} are meant, and a goal is for one")
-    of_type = short_type(of_type or type_of_action(action, await site.offers(robots)))
+    of_type = short_type(of_type or type_of_action(action, await site.must_offer(robots)))
     types = Types()
     cdr = types.serialize(part_of_action(of_type, "Goal"), wish.value)
     client = MeshAction(site.agent, action, of_type)

@@ -74,7 +74,7 @@ async def subscribed(site: Site, topic: str, of_type: str | None) -> AsyncIterat
     topic = absolute(topic)
     robots = site.must_be_online()
     if of_type is None or not site.chosen:
-        offers = await site.offers(robots)
+        offers = await (site.offers if of_type else site.must_offer)(robots)
         of_type = of_type or type_of(topic, NodeType.SUBSCRIBER, offers)
         publishing = [robot for robot, offered in offers.items() if topic in offered.publishers]
         robots = publishing or robots
@@ -223,6 +223,9 @@ async def watch(
             for robot, window in sorted(measured.of.items()):
                 _tell(subscription.topic, robot, window, len(measured.of) > 1, form, say, emit)
 
+    types = Types()
+    if isinstance(take_in, Delay):  # before anything comes: to load them takes longer than messages do
+        types.serialize("std_msgs/msg/Header", {})
     async with subscribed(site, topic, of_type) as subscription:
 
         async def take() -> None:
@@ -239,7 +242,7 @@ async def watch(
                 tell(subscription)
 
         if isinstance(take_in, Delay):
-            must_have_header(Types(), subscription.type)
+            must_have_header(types, subscription.type)
         reporting = asyncio.get_running_loop().create_task(report())
         try:
             with contextlib.suppress(asyncio.TimeoutError):

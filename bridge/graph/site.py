@@ -95,6 +95,14 @@ class Looking:
         """What these robots have; those that do not tell are left out, and logged."""
         return await self._told(robots, "offers", Offered)
 
+    async def must_offer(self, robots: Collection[int]) -> dict[int, Offered]:
+        """The same. Raises Unreachable where none of them tells."""
+        told = await self.offers(robots)
+        if robots and not told:
+            why = "nobody tells what it has; access rules may not let you ask (--as, docs/security.md)"
+            raise Unreachable(named(robots), why)
+        return told
+
     async def states(self, robots: Collection[int]) -> dict[int, RobotStatus]:
         """How these robots are, likewise."""
         return await self._told(robots, "status", RobotStatus)
