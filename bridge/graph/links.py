@@ -28,16 +28,17 @@ class Routers:
 
     async def look(self) -> list[Router]:
         """All that let themselves be seen, or at least those that we are linked with, each timed."""
-        found = {zid: Router(zid) for zid in self._mesh.routers}
+        told: dict[str, Router] = {}
         if not self._mesh.settings.namespace:
             with suppress(MacsError):
                 for _, answer in await self._mesh.ask_all(keyexpr.ROUTERS, timeout_s=ANSWER_S):
                     with suppress(msgspec.MsgspecError):
                         router = msgspec.json.decode(answer, type=Router)
-                        found[router.zid] = router
-            self.trips.keep(found)
-            for zid in sorted(found)[:TIMED]:  # one after the other: they would wait for each other
-                await self._time(zid)
+                        told[router.zid] = router
+        self.trips.keep(told)
+        for zid in sorted(told)[:TIMED]:  # one after the other: they would wait for each other
+            await self._time(zid)
+        found = {zid: Router(zid) for zid in self._mesh.routers} | told
         return sorted(found.values(), key=lambda router: router.zid)
 
     async def _time(self, zid: str) -> None:

@@ -127,7 +127,7 @@ export class LatencyView {
   #clear() {
     this.looks = [];
     this.hops = [];
-    this.lookedAt = null;
+    this.lookedAt = performance.now();
     this.keyed.set([]);
     show(this.clocks, false);
     say(this.state, this.#commands ? "Waiting for commands: somebody has to drive." : "Waiting for messages.");
@@ -172,9 +172,10 @@ export class LatencyView {
     const [look] = told.ways;
     const now = performance.now();
     if (!look) {
-      if (now - (this.lookedAt ?? now) < SILENT_MS) return;
+      if (now - this.lookedAt < SILENT_MS) return;
       const what = this.#commands ? "command has been sent" : `message of ${this.topicChoice.value} has come`;
-      say(this.state, `no ${what} for ${Math.round((now - this.lookedAt) / 1000)} s that was traced`);
+      const silent = `no ${what} for ${Math.round((now - this.lookedAt) / 1000)} s that was traced`;
+      say(this.state, `${silent}. Access rules may forbid this gateway to trace.`);
       return;
     }
     this.lookedAt = now;
