@@ -209,9 +209,9 @@ class Picture:
         """The router that a session is behind, and the round trip of the link to it; None: nobody tells."""
         for row in self.programs.values():
             if zid in row.behind:
-                if round_trip_s is None or row.round_trip_s is None:
-                    return row.zid, None
-                return row.zid, max(0.0, round_trip_s - row.round_trip_s)
+                if round_trip_s is None or row.round_trip_s is None or round_trip_s < row.round_trip_s:
+                    return row.zid, None  # the last: both are too uncertain
+                return row.zid, round_trip_s - row.round_trip_s
         return None
 
     def _programs(self, kind: str, rows: Mapping[str, ProgramRow], at_s: float) -> list[Event]:

@@ -83,6 +83,8 @@ def between(
     for here, linked in routers.items():
         for other in linked:
             near, far = trips.of(here), trips.of(other)
-            if near is not None and far is not None and steps.get(other, 0) == steps.get(here, 0) + 1:
-                found[here, other] = found[other, here] = max(0.0, far - near)
+            if near is None or far is None or far < near:  # the last: both are too uncertain
+                continue
+            if steps.get(other, 0) == steps.get(here, 0) + 1:
+                found[here, other] = found[other, here] = far - near
     return found

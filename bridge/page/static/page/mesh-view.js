@@ -182,8 +182,9 @@ export class MeshView {
 /** What a link of the session behind a router takes there and back, and carries. */
 function ofLink({ roundTripMs: toRouter }, { roundTripMs, bytesPerS } = {}) {
   if (roundTripMs === undefined) return { bytesPerS };
-  // where nobody could ask the router it is known of the whole way only
-  return toRouter === null ? { most: roundTripMs, bytesPerS } : { trip: Math.max(0, roundTripMs - toRouter), bytesPerS };
+  // where nobody could ask the router, or both are too uncertain, it is known of the whole way only
+  if (toRouter === null || toRouter > roundTripMs) return { most: roundTripMs, bytesPerS };
+  return { trip: roundTripMs - toRouter, bytesPerS };
 }
 
 /** The same of this gateway's own. */
