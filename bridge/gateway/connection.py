@@ -29,6 +29,7 @@ from .backpressure import Backpressure
 from .door import OPEN_TO_ALL, Entrance
 from .memory import Memory
 from .owner import Owner
+from .shares import TURN_S, Share
 from .tcp import is_gone, tune, waiting_bytes
 from .writer import BUFFER_BYTES, ENDED, NOBODY, Writer
 
@@ -59,10 +60,6 @@ READ_S = 0.02
 READ_WITHIN_S = 5.0
 """So long at most, while it is read from at all: TLS and WebSocket make less of what has come, so nobody can count how
 much of it is left."""
-
-TURN_S = 0.003
-"""Work for one agent that takes longer lets all others have their turn before it goes on: an event loop may read from
-one socket many times before it looks at the next."""
 
 MOST_READ_BYTES = FrameDecoder.SPACE_BYTES
 FIRST_READ_BYTES = 64 << 10
@@ -116,7 +113,7 @@ class Connection(asyncio.BufferedProtocol):
         """When it sent a robot a command last."""
         self._refused = False
         self._pauses = 0
-        self._spent_s = 0.0
+        self._share = Share()
         self.received_bytes = 0
         self._unfinished = 0
         """What is counted for it of a frame that has begun."""
@@ -204,15 +201,14 @@ class Connection(asyncio.BufferedProtocol):
         if unfinished != self._unfinished and (unfinished > UNFINISHED_FREE_BYTES or self._unfinished):
             self._note_unfinished(unfinished)
         took_s = time.monotonic() - began
-        self._spent_s += took_s
         if took_s > TURN_S:
             self._read_bytes = max(LEAST_READ_BYTES, int(self._read_bytes * TURN_S / took_s))
         elif took_s < TURN_S / 2 and self._read_bytes < MOST_READ_BYTES:
             self._read_bytes *= 2
-        if self._spent_s > TURN_S and not self._transport.is_closing():
-            self._spent_s = 0.0
+        rounds = self._memory.rounds
+        if (turn_s := rounds.spend(self.host, self._share, took_s)) and not self._transport.is_closing():
             self.pause()
-            self._loop.call_soon(self.resume)
+            rounds.enter(self.host, self.resume, turn_s)
 
     def _note_unfinished(self, unfinished: int) -> None:
         self._unfinished = unfinished if unfinished > UNFINISHED_FREE_BYTES else 0
@@ -521,6 +517,7 @@ class Connection(asyncio.BufferedProtocol):
         self.asleep = False
         self.peer, self.recipient = newcomer.peer, newcomer.peer.recipient
         self.entrance, self.host, self.address = newcomer.entrance, newcomer.host, newcomer.address
+        newcomer.pace.has_left(self.pace)
         self.greeted_at, self.pace = newcomer.greeted_at, newcomer.pace
         self.drops.update(newcomer.drops)
         self._transport = transport

@@ -12,7 +12,7 @@ import resource
 import socket
 import ssl
 import sys
-from collections import Counter
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
 from typing import Any
 
@@ -30,6 +30,10 @@ PAUSE_S = 0.2
 GREETING = 512
 GREETING_PER_ADDRESS = 128
 """So many may be in the middle of TLS's greeting: they are no connections yet, which others count."""
+
+GREETED_AT_ONCE = 16
+"""Of these, so many of one address, and the others behind them, milliseconds apart: each takes about one."""
+GREETING_EVERY_S = 0.003
 
 SHUTDOWN_S = 2.0
 """How long the other end has to answer TLS's goodbye."""
@@ -61,6 +65,12 @@ class Listener:
         self._context = context
         self._handshake_s = handshake_s
         self._greeting: Counter[str] = Counter()
+        """Who is to be greeted, or is being so, by address."""
+        self._greeted: Counter[str] = Counter()
+        """Who is being greeted."""
+        self._to_greet: OrderedDict[str, deque[tuple[socket.socket, float]]] = OrderedDict()
+        """Who waits for that, and since when; of addresses the one whose turn it is comes first."""
+        self._greets: asyncio.TimerHandle | None = None
         self._listening = listening
         self._protocol = protocol
         self._drops = drops
@@ -73,8 +83,13 @@ class Listener:
 
     def close(self) -> None:
         """Accept nobody any more."""
-        if self._again is not None:
-            self._again.cancel()
+        for timer in (self._again, self._greets):
+            if timer is not None:
+                timer.cancel()
+        for waiting in self._to_greet.values():
+            for accepted, _ in waiting:
+                accepted.close()
+        self._to_greet.clear()
         if self._listening.fileno() >= 0:
             self._loop.remove_reader(self._listening.fileno())
         self._listening.close()
@@ -106,9 +121,38 @@ class Listener:
                 continue
             self._greeting[host] += 1
             accepted.setblocking(False)
-            task: asyncio.Task[object] = self._loop.create_task(self._connected(accepted, host))
-            self._accepting.add(task)
-            task.add_done_callback(self._accepting.discard)
+            if self._context is None:
+                self._connect(accepted, host)
+            else:
+                self._to_greet.setdefault(host, deque()).append((accepted, self._loop.time()))
+                if self._greets is None:
+                    self._greets = self._loop.call_later(0, self._greet_next)
+
+    def _connect(self, accepted: socket.socket, host: str) -> None:
+        self._greeted[host] += 1
+        task: asyncio.Task[object] = self._loop.create_task(self._connected(accepted, host))
+        self._accepting.add(task)
+        task.add_done_callback(self._accepting.discard)
+
+    def _greet_next(self) -> None:
+        """Begin TLS's greeting with the next whose turn it is."""
+        self._greets = None
+        if not self._to_greet:
+            return
+        self._greets = self._loop.call_later(GREETING_EVERY_S, self._greet_next)
+        host = next((host for host in self._to_greet if self._greeted[host] < GREETED_AT_ONCE), None)
+        if host is None:
+            return  # until one of these has ended
+        waiting = self._to_greet.pop(host)
+        accepted, since = waiting.popleft()
+        if waiting:
+            self._to_greet[host] = waiting  # to the back
+        if self._loop.time() - since < self._handshake_s:
+            self._connect(accepted, host)
+        else:
+            accepted.close()
+            self._drops.once("too_many_greetings", "%s: turned away, for its greeting would not begin in time", host)
+            self._has_left(host)
 
     def _turned_away(self, whom: str) -> None:
         """There was no descriptor for a connection."""
@@ -130,6 +174,12 @@ class Listener:
             log.debug("a connection ended at once: %s", error)
             accepted.close()
         finally:
-            self._greeting[host] -= 1
-            if self._greeting[host] <= 0:
-                del self._greeting[host]
+            self._greeted[host] -= 1
+            if self._greeted[host] <= 0:
+                del self._greeted[host]
+            self._has_left(host)
+
+    def _has_left(self, host: str) -> None:
+        self._greeting[host] -= 1
+        if self._greeting[host] <= 0:
+            del self._greeting[host]

@@ -11,7 +11,6 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 
@@ -34,7 +33,6 @@ from macs_zenoh.protocol.messages import (
     UNITY,
     AccessRefused,
 )
-from macs_zenoh.protocol.ping import GatewayAgent, encode_told
 from macs_zenoh.protocol.rate_limit import TOGETHER, Pace
 from macs_zenoh.protocol.recipient import Recipient, to_agent
 from macs_zenoh.protocol.registrations import AgentKey
@@ -82,9 +80,11 @@ from .refusing import Refusing
 from .renumbering import Renumbering
 from .robot_ids import RobotIds
 from .roll import Roll
+from .shares import Rounds
 from .sleepers import Sleepers
 from .stead import Stead
 from .subscriptions import Subscriptions
+from .told import Told
 from .waiting import NAMED_S
 
 log = logging.getLogger("macs.gateway")
@@ -180,6 +180,11 @@ class Gateway:
         )
 
     @property
+    def rounds(self) -> Rounds:
+        """Who waits for his turn to be read from."""
+        return self._memory.rounds
+
+    @property
     def blocks(self) -> list[int]:
         """The blocks of ids that this gateway gives out."""
         return self._leases.blocks
@@ -213,7 +218,8 @@ class Gateway:
         Raises ConfigError when the block is somebody else's, Unreachable when the port cannot be had.
         """
         self._record.open(self.settings, f"gateway {joined(for_others(self.settings.host), self.settings.port)}")
-        self.mesh.tells, self.mesh.away, self.mesh.told = self._now, self._away, self._told
+        self.mesh.tells, self.mesh.away = self._now, self._away
+        self.mesh.told = Told(self.agents, lambda: self.drops).now
         link_bytes.tell_of(self.mesh)
         await self._presence.start()
         self.mesh.on_link(lambda up: self._registry.robots.repeat_all() if up else None)
@@ -236,19 +242,6 @@ class Gateway:
         """Agents of which nothing was heard for a while."""
         now = time.monotonic()
         return sorted(connection.key for connection in self.agents.online() if connection.is_away(now))
-
-    def _told(self) -> bytes:
-        """Its agents and what was lost, for who asks by a ping."""
-        lost = self.drops
-        for connection in self.agents.connections():
-            lost.update(connection.all_drops())
-        return encode_told(self._agents(), lost)
-
-    def _agents(self) -> Iterator[GatewayAgent]:
-        now = time.monotonic()
-        for connection in self.agents.online():
-            age_s = round(now - connection.greeted_at, 1)
-            yield GatewayAgent(*connection.key, connection.address, connection.peer.grant.name, age_s)
 
     def _now(self) -> dict[str, int]:
         """What `macs doctor` is told besides losses."""

@@ -14,7 +14,6 @@ Bearer`` or as the cookie of a login; what the token permits is the visitor's `G
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING
 
@@ -52,7 +51,6 @@ class Site:
         self._entrance = entrance
         self._door = door
         self._host_of = host_of
-        self._turn = asyncio.Lock()
         self._at_end: list[Callable[[], None]] = []
 
     def on_close(self, callback: Callable[[], None]) -> None:
@@ -68,7 +66,6 @@ class Site:
         """Answer this path, written as for aiohttp, to who shows a valid token where one is wanted."""
 
         async def judged(request: web.Request) -> web.StreamResponse:
-            await self._its_turn()
             visitor = self.visitor(request)
             if visitor is None:
                 self.refuse(request)
@@ -79,17 +76,7 @@ class Site:
 
     def get_for_all(self, path: str, answer: AnswerAll) -> None:
         """Answer this path to everybody whom the port lets in at all, as a page has to be that asks for the token."""
-
-        async def answered(request: web.Request) -> web.StreamResponse:
-            await self._its_turn()
-            return await answer(request)
-
-        self._router.add_get(path, answered)
-
-    async def _its_turn(self) -> None:
-        """Between two requests the loop does everything else that is due, frames above all."""
-        async with self._turn:
-            await asyncio.sleep(0)
+        self._router.add_get(path, answer)
 
     def refuse(self, request: web.Request) -> None:
         """Who asks is not let in: count it, and log it, if he has shown a token."""

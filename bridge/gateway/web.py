@@ -29,11 +29,13 @@ from macs_zenoh.protocol.addresses import of_peer
 from macs_zenoh.protocol.credit import Credit
 from macs_zenoh.protocol.origins import host_problem, origin_problem
 from macs_zenoh.protocol.websocket import MESSAGE_BYTES, SUBPROTOCOL, TOKEN_SUBPROTOCOL, WEBSOCKET_PATH
+from macs_zenoh.protocol.wire import MACS
 
 from .admission import is_in, networks
 from .connection import Connection
 from .door import Door, Entrance
 from .listener import Listener
+from .shares import TURN_S, Rounds, Share
 from .site import COOKIE, WRONG, Site, add_routes
 from .writer import joined
 
@@ -48,11 +50,16 @@ BODY_BYTES = 4 << 10
 HTTP_IN_ALL = 512
 HTTP_PER_ADDRESS = 128
 """Connections that are no WebSocket, or not yet one."""
+PIPELINED = 8
+"""So many requests of one connection may wait to be answered; some releases of aiohttp know no limit."""
 PINGS_PER_S = 10.0
 """Pings and empty messages; who sends more is closed."""
+CRUMB_BYTES = MACS.header_bytes
+CRUMBS_PER_S = 500.0
+"""Messages shorter than a frame's header: each costs as much as a frame. Who sends more is closed as well."""
 CLOSE_S = 2.0
-TURN_S = 0.003
-"""Work for one socket that takes longer lets others have their turn, as with agents' own sockets."""
+MESSAGE_S = 1e-5
+"""What a message costs besides what its bytes do: they may be one by one."""
 LEAST_READ_BYTES = 4 << 10
 MOST_READ_BYTES = 256 << 10
 COOKIE_S = 30 * 24 * 3600
@@ -82,6 +89,7 @@ class WebPort:
         self._allow = networks(settings.allow)
         own = socket.gethostname().lower()
         self._names = frozenset({*(name.lower() for name in settings.web_names), own, f"{own}.local"})
+        self.rounds = gateway.rounds
         self._at_http: Counter[str] = Counter()
         self._listeners: list[Listener] = []
         self.scratch = memoryview(bytearray(MOST_READ_BYTES))
@@ -155,6 +163,7 @@ class WebPort:
             if problem is not None:
                 self.drops.once("other_page", "%s: a web request is refused: %s", outer.host, problem)
                 return web.json_response({"error": problem}, status=403)
+            await self.rounds.turn(outer.host)  # one request, and then all else that is due
             try:
                 response = await handler(request)
             finally:
@@ -217,7 +226,7 @@ class WebPort:
         outer = _outer_of(request)
         connection = self._connect(self._entrance)
         connection.shown_token = shown
-        stream = WebSocketTransport(socket, outer.transport, connection)
+        stream = WebSocketTransport(socket, outer.transport, connection, self.rounds)
         outer.upgraded(stream)
         stream.begin()
         try:
@@ -272,7 +281,9 @@ class _Outer(asyncio.BufferedProtocol):
         self._counted = False
         self._timer: asyncio.TimerHandle | None = None
         self._read_bytes = LEAST_READ_BYTES
-        self._spent_s = 0.0
+        self._share = Share()
+        self._full = False
+        """Whether it is not read from, since so many of its requests wait."""
         self._shared: _SharedTransport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -288,7 +299,8 @@ class _Outer(asyncio.BufferedProtocol):
         self._inner.connection_made(cast(asyncio.BaseTransport, self._shared))
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        return self._port.scratch[: self._read_bytes]
+        most = LEAST_READ_BYTES if self._stream is None else self._read_bytes
+        return self._port.scratch[:most]
 
     def buffer_updated(self, nbytes: int) -> None:
         if not self._counted and self._stream is None:
@@ -300,11 +312,13 @@ class _Outer(asyncio.BufferedProtocol):
             self._read_bytes = max(LEAST_READ_BYTES, self._read_bytes // 2)
         elif took_s < TURN_S / 2 and nbytes == self._read_bytes:
             self._read_bytes = min(len(self._port.scratch), 2 * self._read_bytes)
-        self._spent_s += took_s
-        if self._spent_s > TURN_S and not self.transport.is_closing():  # others have their turn
-            self._spent_s = 0.0
+        if self._stream is None and not self._full and self._has_many():
+            self._full = True
             self._shared.hold()
-            asyncio.get_running_loop().call_soon(self._shared.let_go)
+        rounds = self._port.rounds
+        if (turn_s := rounds.spend(self.host, self._share, took_s)) and not self.transport.is_closing():
+            self._shared.hold()
+            rounds.enter(self.host, self._shared.let_go, turn_s)
 
     def eof_received(self) -> bool | None:
         return self._inner.eof_received() if self._counted or self._stream is not None else None
@@ -331,6 +345,9 @@ class _Outer(asyncio.BufferedProtocol):
     def wait(self) -> None:
         """For a whole request and its answer, from now on."""
         self._stop_waiting()
+        if self._full and not self._has_many():
+            self._full = False
+            self._shared.let_go()
         if self._stream is None and not self.transport.is_closing():
             self._timer = asyncio.get_running_loop().call_later(REQUEST_S, self._late)
 
@@ -339,6 +356,12 @@ class _Outer(asyncio.BufferedProtocol):
         self._stream = stream
         self._stop_waiting()
         self._leave()
+        if self._full:
+            self._full = False
+            self._shared.let_go()
+
+    def _has_many(self) -> bool:
+        return len(getattr(self._inner, "_messages", ())) > PIPELINED
 
     def _stop_waiting(self) -> None:
         if self._timer is not None:
@@ -360,30 +383,31 @@ class _SharedTransport:
 
     def __init__(self, transport: asyncio.Transport) -> None:
         self._transport = transport
-        self._paused = self._held = False
+        self._paused = False
+        self._holds = 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._transport, name)
 
     def pause_reading(self) -> None:
         """aiohttp's."""
-        self._set(paused=True, held=self._held)
+        self._set(paused=True, holds=self._holds)
 
     def resume_reading(self) -> None:
         """Likewise."""
-        self._set(paused=False, held=self._held)
+        self._set(paused=False, holds=self._holds)
 
     def hold(self) -> None:
-        """Ours."""
-        self._set(paused=self._paused, held=True)
+        """Ours, until as many `let_go` as `hold` were called."""
+        self._set(paused=self._paused, holds=self._holds + 1)
 
     def let_go(self) -> None:
         """Likewise."""
-        self._set(paused=self._paused, held=False)
+        self._set(paused=self._paused, holds=self._holds - 1)
 
-    def _set(self, *, paused: bool, held: bool) -> None:
-        before, self._paused, self._held = self._paused or self._held, paused, held
-        now = paused or held
+    def _set(self, *, paused: bool, holds: int) -> None:
+        before, self._paused, self._holds = self._paused or self._holds > 0, paused, holds
+        now = paused or holds > 0
         if now == before or self._transport.is_closing():
             return
         if now:
@@ -395,8 +419,12 @@ class _SharedTransport:
 class WebSocketTransport(asyncio.Transport):
     """A WebSocket as a `Connection` sees it: a transport of bytes."""
 
-    def __init__(self, socket: web.WebSocketResponse, below: asyncio.Transport, connection: Connection) -> None:
+    def __init__(
+        self, socket: web.WebSocketResponse, below: asyncio.Transport, connection: Connection, rounds: Rounds
+    ) -> None:
         super().__init__()
+        self._rounds = rounds
+        self._share = Share()
         self._connection: Connection | None = connection
         """None when it has ended: two that know each other are kept until Python looks for circles."""
         self._socket = socket
@@ -410,6 +438,7 @@ class WebSocketTransport(asyncio.Transport):
         self._may_read = asyncio.Event()
         self._may_read.set()
         self._spare = Credit(PINGS_PER_S, time.monotonic())
+        self._crumbs = Credit(CRUMBS_PER_S, time.monotonic())
 
     def begin(self) -> None:
         """The connection is there."""
@@ -446,8 +475,15 @@ class WebSocketTransport(asyncio.Transport):
             message = await _AtOnce(self._socket.receive(), self._pass_on)
             if message.type is not WSMsgType.BINARY:
                 self._pass_on()
+            if (read := self._connection) is None:
+                return
+            if turn_s := self._rounds.spend(read.host, self._share, MESSAGE_S):
+                self._pass_on()  # meanwhile others have the place where it was put
+                await self._rounds.turn(read.host, turn_s)
             if message.type is WSMsgType.BINARY:
                 if not message.data and not self._spares():
+                    return
+                if len(message.data) < CRUMB_BYTES and not self._takes_crumb():
                     return
                 await self._feed(message.data)
             elif message.type in (WSMsgType.PING, WSMsgType.PONG):
@@ -495,6 +531,15 @@ class WebSocketTransport(asyncio.Transport):
         if self._spare.take(1, time.monotonic()):
             return True
         self._complain("too_many_pings", f"more than {PINGS_PER_S:g} pings or empty messages a second")
+        self.abort()
+        return False
+
+    def _takes_crumb(self) -> bool:
+        """Likewise of messages that are only a few bytes of a frame."""
+        if self._crumbs.take(1, time.monotonic()):
+            return True
+        what = f"more than {CRUMBS_PER_S:g} messages a second that are shorter than a frame's header"
+        self._complain("too_many_pings", what)
         self.abort()
         return False
 

@@ -147,6 +147,10 @@ class Pace:
         """For how long commands have come that may be old."""
         self._answers_count = True
 
+    def has_left(self, former: Pace) -> None:
+        """It goes on for an agent that comes back, which has earned nothing by that: it has what it had left."""
+        self._commands, self._requests, self._halts = former._commands, former._requests, former._halts
+
     def request(self, count: int, now: float) -> Passing:
         """Of so many messages that are no commands."""
         if not self._requests.take(count, now):
