@@ -11,7 +11,7 @@ import msgspec
 import zenoh
 
 from macs_zenoh.errors import CallTimeout, HeldByAnother, MacsError, NotServed, OutOfRange, Refused, Unreachable
-from macs_zenoh.protocol.guard import Gate
+from macs_zenoh.protocol.guard import Admits
 from macs_zenoh.protocol.limits import REASON_CHARACTERS, REQUEST_BYTES
 
 from .arrivals import Arrivals, now_s
@@ -147,7 +147,7 @@ class Calls:
         *,
         stand_in: bool,
         first: Callable[[str, bytes], None] | None,
-        gate: Gate | None,
+        gate: Admits | None,
     ) -> Subscription:
         """`Mesh.serve`."""
 

@@ -18,12 +18,12 @@ from macs_zenoh.handles import Callbacks, Handle
 from macs_zenoh.losses import Losses
 from macs_zenoh.protocol import ping, trace
 from macs_zenoh.protocol.directory import published
-from macs_zenoh.protocol.guard import Gate
+from macs_zenoh.protocol.guard import Admits, Gate
 from macs_zenoh.protocol.keyexpr import PING
 from macs_zenoh.protocol.policing import Policer
 from macs_zenoh.versions import installed
 
-from .arrivals import Arrivals
+from .arrivals import Arrivals, now_s
 from .calls import Calls, OnAnswer
 from .declared import AtOnce, Handler, OnAged, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
 from .leaving import leave
@@ -394,7 +394,7 @@ class Mesh:
         *,
         stand_in: bool = False,
         first: Callable[[str, bytes], None] | None = None,
-        gate: Gate | None = None,
+        gate: Admits | None = None,
     ) -> Subscription:
         """Answer queries on ``key`` with ``await handler(key, payload)``; raise Refused in it to refuse.
 
@@ -427,7 +427,9 @@ class Mesh:
                 payload = self.told()
             return ping.encode(said, payload)
 
-        return self.serve(PING.of(zid=self.zid), answer)
+        key = PING.of(zid=self.zid)
+        gate = ping.PingGate(now_s(), lambda: self.drops.note("flooded", key, "more pings than are answered"))
+        return self.serve(key, answer, gate=gate)
 
     # -- presence ------------------------------------------------------------------------------------------------
 

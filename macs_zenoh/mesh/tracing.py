@@ -19,6 +19,7 @@ import zenoh
 
 from macs_zenoh.errors import WireError
 from macs_zenoh.protocol import trace
+from macs_zenoh.protocol.credit import Credit
 from macs_zenoh.protocol.directory import published
 from macs_zenoh.protocol.guard import Gate
 from macs_zenoh.protocol.keyexpr import STREAM
@@ -30,6 +31,10 @@ log = logging.getLogger("macs.mesh")
 
 MOST_WANTED = 64
 """Beginnings of keys that are marked at one time."""
+MARKS_PER_S = 2000
+"""So many messages are marked, and so many that come marked are noted: who asks for traces slows nobody down."""
+ANSWERS_PER_S = 50
+"""So often it is told what was noted."""
 KNOWN = 4096
 """Keys that are remembered as looked up."""
 STALE_NS = 1_000_000_000
@@ -74,6 +79,9 @@ class Tracing:
         self._always = always_every
         self._reports: deque[Report] = deque(maxlen=trace.MOST_REPORTS)
         self._number = 0
+        now = time.monotonic()
+        self._marks, self._notes = Credit(MARKS_PER_S, now), Credit(MARKS_PER_S, now)
+        self._answers = Credit(ANSWERS_PER_S, now)
         self._noted = threading.local()
         self._lock = threading.Lock()
         if always_every:
@@ -94,7 +102,10 @@ class Tracing:
         except WireError as error:
             log.debug("a request for traces cannot be used: %s", error)
             return trace.encode_answer(TraceAnswer())
-        self._want(request, time.monotonic())
+        now = time.monotonic()
+        if not self._answers.take(1, now):
+            return trace.encode_answer(TraceAnswer())
+        self._want(request, now)
         with self._lock:
             reports = [report for report in self._reports if report.number > request.after]
             missed = max(0, self._number - request.after - len(reports)) if request.after else 0
@@ -153,6 +164,8 @@ class Tracing:
         if wanted.until_s < now:
             self.end(now)
             return None
+        if not self._marks.take(1, now):
+            return None
         number, now_ns = int.from_bytes(os.urandom(8), "little"), time.time_ns()
         if points and now_ns - points[-1][1] > STALE_NS:
             points = ()  # of another message, which was not marked
@@ -166,8 +179,11 @@ class Tracing:
     def begin(self, sample: zenoh.Sample) -> Trace | None:
         """A sample has come; what to tell when it was handled, None if it is not marked."""
         came_ns = time.time_ns()
-        if time.monotonic() > self._until_s and not self._always:
+        now = time.monotonic()
+        if now > self._until_s and not self._always:
             self.looks.clear()
+            return None
+        if not self._notes.take(1, now):
             return None
         attached = sample.attachment
         read = trace.decode_mark(attached.to_bytes()) if attached is not None else None

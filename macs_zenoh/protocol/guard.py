@@ -254,11 +254,15 @@ class OnDropped(Protocol):
         """The name of a loss, whose it was, why, and how much it was."""
 
 
-class Gate(Protocol):
-    """What samples have to pass; called in Zenoh's threads."""
+class Admits(Protocol):
+    """What calls have to pass; called in Zenoh's threads."""
 
     def admits(self, key: str, size: int, urgent: bool, now: float) -> bool:
-        """Whether a sample may be looked at."""
+        """Whether it may be looked at."""
+
+
+class Gate(Admits, Protocol):
+    """What samples have to pass; likewise."""
 
     def age(self, key: str, clock: Hashable, stamp: float, now: float) -> float:
         """How long a sample has waited on its way, by the stamp it bears."""

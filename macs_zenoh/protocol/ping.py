@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import threading
+from collections.abc import Callable, Iterable, Mapping
 from itertools import islice
 
 import msgspec
 
 from ..config import MeshSettings
 from ..errors import BadJson, TooLong
+from .credit import Credit
 from .limits import REQUEST_BYTES
 from .wire import Buffer, encode_message, split_message
 
@@ -20,6 +22,29 @@ AGENTS = b"macs: which agents are yours?"
 """Sent with a ping it is answered by a gateway with its agents, in the place of the same bytes."""
 MOST_AGENTS = 2000
 AGENTS_BYTES = 512 << 10
+
+
+PINGS_PER_S = 100
+PING_BYTES_PER_S = 32 << 20
+"""So many pings a program answers, with so much to send back. Who asks is not in the key: all have it together."""
+
+
+class PingGate:
+    """What pings have to pass. From any thread."""
+
+    def __init__(self, now: float, on_dropped: Callable[[], object]) -> None:
+        self._on_dropped = on_dropped
+        self._pings = Credit(PINGS_PER_S, now)
+        self._bytes = Credit(PING_BYTES_PER_S, now)
+        self._lock = threading.Lock()
+
+    def admits(self, key: str, size: int, urgent: bool, now: float) -> bool:
+        """Whether a ping is answered."""
+        with self._lock:
+            admitted = self._pings.take(1, now) and self._bytes.take(size, now)
+        if not admitted:
+            self._on_dropped()
+        return admitted
 
 
 class GatewayAgent(msgspec.Struct, frozen=True, array_like=True):
