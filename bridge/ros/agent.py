@@ -20,13 +20,13 @@ from bridge.audit import open_audit, who
 from bridge.metrics.endpoint import watched_at
 from bridge.ros.checked import CheckedSettings
 from bridge.ros.command_clocks import ClockQuestions
-from bridge.ros.definitions import Definitions, offered_types
+from bridge.ros.definitions import Definitions, Telling, offered_types
 from bridge.ros.figures import watched
 from bridge.ros.graph import Offers
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.mirrors import Mirrors
 from bridge.ros.nodes import InterfaceNodes
-from bridge.ros.requests import control, status
+from bridge.ros.requests import Told, control, status
 from bridge.ros.rules import Rules
 from bridge.ros.safety import EmergencyStop
 from bridge.ros.side import NamesAndTypes, Side
@@ -124,7 +124,7 @@ class RobotAgent:
         self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
         self.checked = CheckedSettings(session, robot.rules, robot.drops)
         self.offers = Offers(robot, self.streams.publish, self._graph_changed)
-        self._definitions = Definitions(session.definition)
+        self._definitions = Telling(Definitions(session.definition))
         self._clocks = ClockQuestions(robot, guard, self.nodes.rights.check)
         self._answering: dict[asyncio.Task[None], Registrant] = {}
         self._sessions: dict[Registrant, tuple[str, int]] = {}
@@ -132,6 +132,7 @@ class RobotAgent:
         self.stop_line: StopLine | None = None
         self._stop_later: asyncio.Task[None] | None = None
         self._last_words: Handle | None = None
+        self._told = Told(lambda: status(self.nodes, session.full_name, agent.drops + agent.mesh.drops))
         self._mirrors: Mirrors | None = None
 
     def _graph_changed(self, topics: NamesAndTypes, services: NamesAndTypes) -> None:
@@ -278,7 +279,7 @@ class RobotAgent:
 
     def state(self) -> bytes:
         """All about the robot as JSON (`RobotStatus`)."""
-        return status(self.nodes, self.session.full_name, self.agent.drops + self.agent.mesh.drops)
+        return self._told.now(time.monotonic())
 
     def _controlled(self, sender: Registrant, data: bytes) -> ControlReply:
         try:
@@ -331,7 +332,7 @@ class RobotAgent:
     async def _tell_definitions(self, call: Call) -> bytes:
         request = decode_data(DefinitionsRequest, call.data) if call.data else DefinitionsRequest()
         types = request.types or offered_types(await self.offers.now())
-        return encode_data(await asyncio.to_thread(self._definitions.tell, types))
+        return encode_data(await self._definitions.tell((call.sender_type, call.sender_id), types))
 
     async def _status(self, _call: Call) -> bytes:
         return self.state()

@@ -6,14 +6,18 @@ Only files of installed interface packages are read, by names that the ament ind
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
-from collections.abc import Callable, Iterable
+import time
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable
 from pathlib import Path
 from typing import Any
 
 from bridge.ros.types import InterfaceName, interface_file, resolve
 from macs_zenoh.errors import Refused
+from macs_zenoh.protocol.budget import may_have_one_more
 from macs_zenoh.protocol.robot_state import Offered
 from macs_zenoh.protocol.schemas import (
     TELL_BYTES,
@@ -29,6 +33,41 @@ ENTRY_BYTES = 256
 
 _IDL_TYPES = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}
 _IDL_FIELD = re.compile(r"sequence<(?P<item>.+?)(?:, (?P<most>\d+))?>|(?P<array>.+)\[(?P<size>\d+)\]")
+
+
+class Telling:
+    """Tells of one robot's, beside the loop and to one who asks after the other, with pauses: reading files for many
+    at once would take the time that a stop needs. Belongs to the loop."""
+
+    EACH, TOTAL = 8, 64
+    """So many questions of one sender, and of all, may wait."""
+    PAUSE = 3.0
+    """So many times as long as it took to tell, nothing is told."""
+
+    def __init__(self, definitions: Definitions) -> None:
+        self._definitions = definitions
+        self._asking: Counter[Hashable] = Counter()
+        self._turn = asyncio.Lock()
+        self._next_at = 0.0
+
+    async def tell(self, sender: Hashable, names: Iterable[str]) -> DefinitionsReply:
+        """`Definitions.tell`. Raises Refused: too many ask."""
+        mine = self._asking[sender]
+        if not may_have_one_more(self._asking.total(), mine, each=self.EACH, total=self.TOTAL):
+            raise Refused("so many ask for definitions that this one has no place; ask again")
+        self._asking[sender] += 1
+        try:
+            async with self._turn:
+                await asyncio.sleep(self._next_at - time.monotonic())
+                began = time.monotonic()
+                told = await asyncio.to_thread(self._definitions.tell, names)
+                now = time.monotonic()
+                self._next_at = now + self.PAUSE * (now - began)
+            return told
+        finally:
+            self._asking[sender] -= 1
+            if not self._asking[sender]:
+                del self._asking[sender]
 
 
 class Definitions:

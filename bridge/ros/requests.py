@@ -6,8 +6,9 @@ and empty manager and node name, as answers to plain requests have. On the mesh 
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import msgspec
 from msgspec import UNSET
@@ -17,8 +18,13 @@ from bridge.ros.interface import Registrant, full_name
 from bridge.ros.nodes import InterfaceNodes
 from bridge.ros.topics import PublisherNode
 from macs_zenoh.errors import Refused
+from macs_zenoh.protocol.credit import Credit
 from macs_zenoh.protocol.messages import NodeType
 from macs_zenoh.protocol.robot_state import ControlReply, ControlRequest, RobotStatus, StopStatus
+
+FRESH_PER_S = 100.0
+GOOD_S = 0.05
+"""So often somebody is told the state as it is; who asks besides is told what it was, so long ago at most."""
 
 _NOTES = {"take": "control_taken", "release": "control_released", "give": "control_given"}
 
@@ -71,3 +77,18 @@ def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int])
         drops={**lost_before, **nodes.drops},
     )
     return msgspec.json.encode(state)
+
+
+class Told:
+    """What is told to all who ask, and not put together anew for each of a flood of them."""
+
+    def __init__(self, make: Callable[[], bytes]) -> None:
+        self._make = make
+        self._fresh = Credit(FRESH_PER_S, -math.inf)
+        self._last = (-math.inf, b"")
+
+    def now(self, now: float) -> bytes:
+        """It, as it is or was a moment ago."""
+        if self._fresh.take(1, now) or now - self._last[0] > GOOD_S:
+            self._last = now, self._make()
+        return self._last[1]
