@@ -31,6 +31,8 @@ log = logging.getLogger("macs.ros")
 
 AGAIN_S = 1.0
 """Pause before another robot is asked again for what it does not have yet, or refuses."""
+ROBOTS = 64
+"""So many robots are mirrored at one time: whoever is in a group is asked again and again, and a group is open."""
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 
@@ -53,7 +55,12 @@ class Mirrors:
         if other.type != ROS or other.id == self._robot.agent_id:
             return
         self._end(other.id)
-        if online:
+        if not online or not any(rule.means(other.id, other.group) for rule in self._robot.rules.settings.mirror):
+            return
+        if len(self._of) >= ROBOTS:
+            why = f"{ROBOTS} robots are mirrored already"
+            self._robot.drops.note("not_mirrored", str(AgentId(ROS, other.id)), why)
+        else:
             begun = self._of[other.id] = []
             for rule in self._robot.rules.settings.mirror:
                 if rule.means(other.id, other.group):
