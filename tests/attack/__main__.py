@@ -18,19 +18,23 @@ from pathlib import Path
 
 from tests.attack import judge, table
 from tests.attack.scene import scene
-from tests.attack.ways import WAYS
+from tests.attack.ways import WAYS, Way
 
 
 async def run(rows: list[table.Attack], options: argparse.Namespace) -> list[judge.Report]:
     """Each attack, in one scene as long as everything is as before after it, and it is one of the kind."""
     reports: list[judge.Report] = []
-    waiting = sorted(rows, key=lambda row: row.certified)
+
+    def kind(row: table.Attack) -> tuple[bool, Way]:
+        return row.certified, row.way or options.way
+
+    waiting = sorted(rows, key=kind)
     while waiting:
         with tempfile.TemporaryDirectory() as directory:
-            certified = waiting[0].certified
-            made = scene(Path(directory), random.randint(1, 100), certified=certified, way=options.way)
+            certified, way = wanted = kind(waiting[0])
+            made = scene(Path(directory), random.randint(1, 100), certified=certified, way=way)
             async with made as stage:
-                while waiting and waiting[0].certified == certified:
+                while waiting and kind(waiting[0]) == wanted:
                     row = waiting.pop(0)
                     began = time.monotonic()
                     try:

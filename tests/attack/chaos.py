@@ -222,7 +222,8 @@ class Site:
 
     async def flood(self) -> str:
         """One of the attacks, for a moment."""
-        row = self.random.choice([row for row in table.every().values() if row.by in ("headset", "tcp robot")])
+        rows = [row for row in table.every().values() if row.by in ("headset", "tcp robot") and row.way is None]
+        row = self.random.choice(rows)
         port, seconds = self.random.choice(self.ports), self.random.choice((0.3, 1.0, 2.0))
         words = (row.name, str(port), self.router.endpoint, str(seconds))
         attacker = await asyncio.create_subprocess_exec(

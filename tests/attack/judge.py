@@ -147,6 +147,7 @@ HEADINGS = (
     "longest",
     "stop p50 p99 max",
     "dead-man +max",
+    "benign stop, dead-man",
     "memory",
     "",
 )
@@ -167,6 +168,7 @@ def row(report: Report) -> tuple[str, ...]:
         ms(under.longest),
         f"{stops} ({len(under.stops)})",
         f"{ms(max(under.deadman, default=0.0))} ({len(under.deadman)})",
+        f"{ms(max(report.benign.stops, default=0.0))}, {ms(max(report.benign.deadman, default=0.0))}",
         grown,
         "holds" if not report.strictly() else "FAILS",
     )

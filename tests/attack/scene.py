@@ -55,6 +55,7 @@ TALK_EVERY_S = 0.01
 DRIVE_EVERY_S = 0.02
 NO_EFFECT_S = 4.0
 """A stop or a dead-man that has done nothing by then counts as none."""
+STOPS_TO_A_LETTING_GO = 5
 HOLDS_S = 0.15
 """How long after each stop the driver is watched driving in vain."""
 RECOVERY_S = 60.0
@@ -307,7 +308,11 @@ class Scene:
         window = Window()
         begin = time.monotonic()
         while time.monotonic() - begin < seconds if stops is None else len(window.stops) < stops:
-            if not await self._stop_once(window) or not await self._let_go_once(window):
+            if not await self._stop_once(window):
+                break
+            if stops is not None and len(window.stops) % STOPS_TO_A_LETTING_GO:
+                continue  # it is the stops that are to be many
+            if not await self._let_go_once(window):
                 break
         end = time.monotonic()
         await until(lambda: not self.pair.missing(begin, end), NO_EFFECT_S, quietly=True)

@@ -7,6 +7,7 @@ they have an agent who is allowed that much could do the same.
 from __future__ import annotations
 
 import json
+import struct
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -280,6 +281,13 @@ def add_node_queries(target: Target) -> None:
 
 
 @attack(3, "mesh")
+def definitions_queries(target: Target) -> None:
+    """The verb ``definitions`` at full rate, for 256 types that there are not in packages that there are."""
+    names = [f"sensor_msgs/msg/A{number}" for number in range(256)]
+    queries(target, "definitions", json.dumps({"types": names}).encode())
+
+
+@attack(3, "mesh")
 def bad_queries(target: Target) -> None:
     """Queries at full rate without a frame in them."""
     queries(target, "status", payload=b"x")
@@ -408,5 +416,29 @@ def pings_of_every_program(target: Target) -> None:
         while target.running():
             mesh.get("macs/ping/**", count, payload=bytes(1024), priority=URGENT, timeout=1.0)
             sent += 1
+            if sent - answered[0] > OPEN_QUERIES:
+                target.rest(0.001)
+
+
+@attack(3, "mesh")
+def traces_of_everything(target: Target) -> None:
+    """Every program is asked to mark all that it puts and to note all that is marked, is sent marked messages, and is
+    asked at full rate for all that it has noted."""
+    wanted = [{"put": put, "every": 1, "look": True, "seconds": 60} for put in ("", "m", "macs/to/", "macs/from/")]
+    asked = [b"macs: trace " + json.dumps(each).encode() for each in wanted]
+    mark = struct.pack("<4sQB", b"mtr1", 7, 0)
+    said = _to_headset(metadata(message_manager="Hello"), b"x")
+    with session(target) as mesh:
+        answered, sent = [0], 0
+
+        def count(_reply: object) -> None:
+            answered[0] += 1
+
+        while target.running():
+            for question in asked:
+                mesh.get("macs/ping/**", count, payload=question, priority=URGENT, timeout=1.0)
+            for key in _everybody(target):
+                mesh.put(key, said, attachment=mark)
+            sent += len(asked)
             if sent - answered[0] > OPEN_QUERIES:
                 target.rest(0.001)

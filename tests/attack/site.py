@@ -27,6 +27,9 @@ MEMORY_LIMITS = {
 """What an attack may cost our programs at most. The router is Zenoh's, and its queues are per link."""
 
 SETTINGS = f"""
+[gateway]
+resume_s = 5
+
 [[robot.rules]]
 match = "/cmd_vel"
 exclusive = true

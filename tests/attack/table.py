@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tests.attack.ways import Way
+
 By = Literal["headset", "tcp robot", "mesh", "operator", "certificate"]
 """Who attacks: a TCP agent of either type, a Zenoh session without any right but the router's address, one that calls
 itself an operator, or one with a certificate, on a site that lets in nobody else."""
@@ -56,6 +58,8 @@ class Attack:
     run: Callable[[Target], None]
     addressed: bool = False
     """Whether it sends to the neighbours themselves, who take it as well as they can."""
+    way: Way | None = None
+    """The only way in that has what it attacks; None: whichever."""
 
     @property
     def certified(self) -> bool:
@@ -72,14 +76,14 @@ ATTACKS: dict[str, Attack] = {}
 
 
 def attack(
-    section: int, by: By, *, single: bool = False, seen: bool = False
+    section: int, by: By, *, single: bool = False, seen: bool = False, way: Way | None = None
 ) -> Callable[[Callable[[Target], None]], Attack]:
     """Put a function into the table. ``section`` is the class of faults that it looks for:
 
     1 size and cost before parsing, 2 budgets, 3 the way of the stop, 4 other people's values, 5 rights.
     """
 
-    return lambda run: enter(run, section, by, single=single, seen=seen)
+    return lambda run: enter(run, section, by, single=single, seen=seen, way=way)
 
 
 def enter(
@@ -90,9 +94,10 @@ def enter(
     single: bool = False,
     seen: bool = False,
     addressed: bool = False,
+    way: Way | None = None,
 ) -> Attack:
     """Put a function into the table, under its name."""
-    row = Attack(run.__name__, section, by, single, seen, run, addressed)
+    row = Attack(run.__name__, section, by, single, seen, run, addressed, way)
     assert row.says, f"{row.name} does not say what it sends"
     assert ATTACKS.setdefault(row.name, row) is row, f"two attacks are called {row.name}"
     return row
@@ -100,6 +105,6 @@ def enter(
 
 def every() -> dict[str, Attack]:
     """All rows, by name."""
-    from tests.attack import floods, inputs, insiders, sessions  # noqa: F401 - they fill the table
+    from tests.attack import floods, inputs, insiders, returning, sessions, web  # noqa: F401 - they fill the table
 
     return ATTACKS

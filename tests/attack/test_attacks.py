@@ -18,6 +18,7 @@ pytest.importorskip("rclpy", reason="the robot that is driven needs ROS")
 
 from tests.attack import judge, table
 from tests.attack.scene import Scene, scene
+from tests.attack.ways import Way
 
 SECONDS = 2.0
 
@@ -31,15 +32,16 @@ class Stage:
         self._directory = directory
         self._stack = AsyncExitStack()
         self._scene: Scene | None = None
-        self._certified = False
+        self._kind: tuple[bool, Way] = (False, "tcp")
 
-    async def scene(self, *, certified: bool) -> Scene:
+    async def scene(self, row: table.Attack) -> Scene:
         """A scene in which everything is as it should be, and of the kind that is wanted."""
-        if self._scene is not None and self._certified is not certified:
+        kind = _kind(row)
+        if self._scene is not None and self._kind != kind:
             await self.clear()
         if self._scene is None:
-            domain, self._certified = 1 + os.getpid() % 100, certified
-            made = scene(self._directory, domain, certified=certified)
+            domain, self._kind = 1 + os.getpid() % 100, kind
+            made = scene(self._directory, domain, certified=row.certified, way=kind[1])
             self._scene = await self._stack.enter_async_context(made)
         return self._scene
 
@@ -56,9 +58,13 @@ async def stage(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Stage
     await stage.clear()
 
 
+def _kind(row: table.Attack) -> tuple[bool, Way]:
+    return row.certified, row.way or "tcp"
+
+
 def rows() -> list[object]:
     """The table, those that are kin marked so."""
-    every = sorted(table.every().values(), key=lambda row: row.certified)  # few changes of scene
+    every = sorted(table.every().values(), key=_kind)  # few changes of scene
     return [pytest.param(row, id=row.name, marks=[] if row.seen else [pytest.mark.kin]) for row in every]
 
 
@@ -67,7 +73,7 @@ async def test_it_costs_nobody_but_the_attacker(row: table.Attack, stage: Stage)
     """Neighbours are served, the robot is driven, stops and the dead-man work, and afterwards all is as before."""
     report = None
     try:
-        report = await (await stage.scene(certified=row.certified)).suffer(row, seconds=SECONDS)
+        report = await (await stage.scene(row)).suffer(row, seconds=SECONDS)
         print(f"\n{row.says}")
         for heading, figure in zip(judge.HEADINGS, judge.row(report), strict=True):
             print(f"  {heading:18} {figure}")
