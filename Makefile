@@ -5,6 +5,7 @@
 # make attacks    every attack on a running site, as a table;  make chaos   an hour of kills, floods and cuts
 # make page   the libraries of the live page, from npm; make install does it too
 # make docs   the pages as a site, in build/docs;  make docs-links   and whether the links out of it still lead somewhere
+# make hiroz  ROS nodes of others that robots without ROS are tried with, built by cargo (minutes, once)
 # make zenohd the router that the tests of networks and deployments run against, built by cargo (minutes, once)
 #
 # Needs python3 (3.10 or newer) with venv, and network access the first time. Everything goes into .venv.
@@ -34,7 +35,7 @@ INTERFACES := $(if $(findstring ros,$(EXTRAS)),$(VENV)/.interfaces)
 PAGE := bridge/page/static/vendor/made-of.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help run install page check test test-all lint format bench attacks chaos docs docs-links zenohd clean
+.PHONY: help run install page check test test-all lint format bench attacks chaos docs docs-links zenohd hiroz clean
 
 help:
 	@sed -n '/^$$/q; s/^# \{0,1\}//p' Makefile
@@ -126,6 +127,9 @@ zenohd: install
 	  echo "zenohd $$version is not here and there is no cargo to build it (https://rustup.rs); nothing done"; exit 0; fi; \
 	echo "building zenohd $$version with cargo; this takes some minutes, once"; \
 	cargo install zenohd --version "$$version" --locked --debug --quiet
+
+hiroz: install
+	@$(BIN)/python -m tests.support.hiroz
 
 clean:
 	rm -rf $(VENV) build dist docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -453,6 +453,10 @@ class Agent:
         for callback in self._on_id:
             _contained(f"handling the new id of {self.type}/{new}", callback, old, new)
 
+    def show(self, there: bool) -> None:
+        """Be offline to others, or online again, with all that is registered and served here."""
+        (self._identity.show if there else self._identity.hide)()
+
     # -- life ----------------------------------------------------------------------------------------------------
 
     async def _join(self, wanted_id: int | None) -> None:

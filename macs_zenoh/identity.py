@@ -77,6 +77,17 @@ class Identity:
         self.contested(self._presence.contested())
         return self._claim.id
 
+    def hide(self) -> None:
+        """Be offline until `show`. The inbox stays, as when the link is lost."""
+        if self._claim is not None:
+            self._claim.declared[0].close()
+
+    def show(self) -> None:
+        """Be online again."""
+        if self._claim is not None:
+            token = self._presence.declare(self._type, self._claim.id, self._group)
+            self._claim = self._claim._replace(declared=(token, *self._claim.declared[1:]))
+
     def close(self) -> None:
         """Be offline."""
         self._disputes.close()

@@ -8,17 +8,21 @@ examples:
   macs rmw-zenoh --id 7 --group 3 -e tcp/192.168.1.10:7447
   macs rmw-zenoh --id 7 --domain 5 --node-namespace /robot7
   macs rmw-zenoh --settings robots.toml
+  macs rmw-zenoh --id 7 --mode router -e tcp/MESH:7447   the robot's own router, in place of rmw_zenohd
+  macs rmw-zenoh --all
   macs rmw-zenoh --all --dry-run
 
 what it prints:
   ready: robot 7 (domain 0)
 
-With --all there is one robot for each ROS domain, or for each namespace that ends in a number where nodes are in such;
---dry-run only lists them. docs/rmw-zenoh.md says what a program beside a robot can do for its safety, and what not."""
+With --all there is one robot for each ROS domain, or for each namespace that ends in a number where nodes are in such,
+as they come and go; --dry-run lists those that are there. docs/rmw-zenoh.md says what a program beside a robot can do
+for its safety, and what not."""
 
 from __future__ import annotations
 
 import argparse
+import logging
 
 from bridge import memory
 from bridge.cli import options, output, running
@@ -26,9 +30,9 @@ from bridge.settings import RmwZenohRobot, Settings
 from macs_zenoh.errors import UsageError
 from macs_zenoh.sections import changed
 
-SUMMARY = "robots that run rmw_zenoh, with nothing installed on them"
+log = logging.getLogger("macs.ros")
 
-LOOK_S = 2.0
+SUMMARY = "robots that run rmw_zenoh, with nothing installed on them"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,9 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--session-namespace", default="", metavar="NAME", help="namespace of its Zenoh sessions, as robot7"
     )
-    parser.add_argument("--all", action="store_true", help="every robot that is seen when this starts, ids by rule")
+    parser.add_argument("--all", action="store_true", help="every robot that is seen, also later; ids by rule")
     parser.add_argument("--dry-run", action="store_true", help="only list the robots")
-    options.add_mesh_options(parser)
+    options.add_mesh_options(parser, modes=("client", "router"))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,19 +69,21 @@ def run(args: argparse.Namespace) -> int:
 async def _serve(settings: Settings, *, look: bool, dry_run: bool) -> int:
     from bridge.doctor.first import told_while_waiting
     from bridge.rmw_zenoh import program
+    from bridge.router import KEPT_IN, open_to_anybody
 
     memory.give_back()
-    if look:
-        robots = await program.look(settings, within_s=LOOK_S)
-        settings = changed(settings, rmw_zenoh=changed(settings.rmw_zenoh, robots=robots))
-    robots = settings.rmw_zenoh.robots
-    if dry_run or not robots:
+    if dry_run:
+        robots = await program.look(settings) if look else settings.rmw_zenoh.robots
         for line in program.shown(robots) or ["no robots: there are no ROS nodes on the router"]:
             output.say(line)
         return 0 if robots else 1
-    await program.run(
-        settings,
-        on_waiting=told_while_waiting(settings.mesh),
-        on_ready=lambda robots: running.say_ready(", ".join(f"robot {robot.id} ({robot.place})" for robot in robots)),
-    )
+
+    if settings.mesh.mode == "router":
+        for endpoint in open_to_anybody(settings.mesh):
+            log.warning("%s is open: whoever reaches it sees all and drives robots; %s", endpoint, KEPT_IN)
+
+    def ready(robots: list[RmwZenohRobot]) -> None:
+        running.say_ready(", ".join(f"robot {robot.id} ({robot.place})" for robot in robots) or "no robots yet")
+
+    await program.run(settings, follow=look, on_waiting=told_while_waiting(settings.mesh), on_ready=ready)
     return 0

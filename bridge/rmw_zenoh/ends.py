@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from bridge.ros.side import Events, MessageType, OnRaw, first_line
+from bridge.ros.side import CutOff, Events, MessageType, OnRaw, first_line
 from macs_zenoh.mesh.ros_network import CALL_S, Request, RosClient, RosPublisher, RosService, RosSubscription
 from macs_zenoh.protocol.rmw_zenoh.attachment import Attachment
 from macs_zenoh.protocol.rmw_zenoh.keyexpr import NO_HASH, Endpoint, Kind
@@ -156,6 +156,8 @@ class ZenohPublisher(Held):
         latched = qos.durability is Durability.TRANSIENT_LOCAL
         self._held: deque[bytes] | None = deque(maxlen=max(1, qos.depth)) if latched else None
         """What nodes hear that come later."""
+        self._waits = False
+        """Whether nodes that took this were cut off, and none is back."""
         super().__init__(session, topic, of.name)
         self._tell()
 
@@ -163,8 +165,10 @@ class ZenohPublisher(Held):
         return self.session.node.publisher(self.topic, self.type, type_hash, self._qos)
 
     def publish(self, cdr: bytes) -> None:
-        """`Publisher.publish`."""
+        """`Publisher.publish`. What is latched waits for nodes that are cut off, nothing else does."""
         if self._held is None:
+            if self._waits or not self.session.network.linked:
+                raise CutOff("the way to the router of its nodes is lost")
             self.use(lambda entity: entity.publish(cdr))
             return
         with self._lock:  # what is latched is told in its order, by whichever entity
@@ -178,6 +182,8 @@ class ZenohPublisher(Held):
     def changed(self, found: Endpoint, alive: bool) -> None:
         super().changed(found, alive)
         if found.kind is Kind.SUBSCRIPTION:
+            if found.node.zid != self.session.graph.own:
+                self._waits = not alive and (self._waits or not self.session.network.linked)
             self._tell()
 
     def _tell(self) -> None:

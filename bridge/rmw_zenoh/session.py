@@ -140,13 +140,13 @@ class ZenohSession:
         with self._lock:
             self._hurried.discard(future)
 
-    def later(self, delay_s: float, job: Callable[[], object]) -> None:
-        """`Side.later`."""
+    def later(self, delay_s: float, job: Callable[[], object], *, hurry: bool = False) -> None:
+        """`Side.later`; ``hurry``: also while the ROS thread waits."""
 
         def do() -> None:
             job()
 
-        self._work.at(time.monotonic() + delay_s, do)
+        (self._urgent if hurry else self._work).at(time.monotonic() + delay_s, do)
 
     async def run(self, job: Callable[[], T]) -> T:
         """`Side.run`."""

@@ -136,8 +136,9 @@ def _shape(types: Types, description: Any) -> Shape:
     if kind.name == "ARRAY":
         return Array(_shape(types, detail[0]), int(detail[1]))
     if kind.name == "SEQUENCE":
-        return Items(_shape(types, detail[0]))
+        return Items(_shape(types, detail[0]), int(detail[1] or 0))
     if kind.name == "NAME":
-        return Text(wide=True) if definitions.WIDE.fullmatch(detail) else shape_of(types, detail)
+        wide = definitions.WIDE.fullmatch(detail)
+        return Text(wide=True, most=int(wide["limit"] or 0)) if wide else shape_of(types, detail)
     base = detail[0]
-    return Text() if base == "string" else Number(_SIZES[base], base in _BOXED)
+    return Text(most=int(detail[1] or 0)) if base == "string" else Number(_SIZES[base], base in _BOXED)

@@ -5,16 +5,17 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 
-import macs_zenoh
 from bridge import link_bytes
 from bridge.ros.agent import STOP_MESSAGES_S, RobotAgent
 from bridge.ros.safety import EmergencyStop
 from bridge.ros.side import Side
 from bridge.settings import Settings
-from macs_zenoh import managers
+from macs_zenoh import joining, managers
+from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.guard import Guard, Limits
+from macs_zenoh.protocol.keyexpr import type_number
 from macs_zenoh.protocol.wire import Layout
 
 log = logging.getLogger("macs.ros")
@@ -27,8 +28,11 @@ async def joined(
     *,
     on_waiting: Callable[[str], None] | None = None,
     emergency_stop: EmergencyStop | None = None,
+    mesh: Mesh | None = None,
 ) -> AsyncIterator[RobotAgent]:
     """Join the mesh as the robot whose ROS graph this is, and serve until the end of the block.
+
+    ``mesh``: over this one, which is open already.
 
     Raises ConfigError; what `macs_zenoh.join` raises.
     """
@@ -43,15 +47,13 @@ async def joined(
         ),
         Layout(settings.mesh.id_slots, settings.mesh.group_slots),
     )
-    async with macs_zenoh.join(
-        "ros",
-        id=robot.id,
-        group=robot.group,
-        settings=settings.mesh,
-        traffic=settings.traffic,
-        guard=guard,
-        on_waiting=on_waiting,
-    ) as agent:
+    kind = type_number("ros")
+    async with AsyncExitStack() as stack:
+        if mesh is None:
+            opened = await Mesh.open(settings.mesh, traffic=settings.traffic, on_waiting=on_waiting)
+            mesh = await stack.enter_async_context(opened)
+        as_robot = joining.joined(mesh, kind, id=robot.id, group=robot.group, guard=guard)
+        agent = await stack.enter_async_context(as_robot)
         link_bytes.tell_of(agent.mesh)
         ros_agent = RobotAgent(agent, session, robot, own, guard, emergency_stop)
         await ros_agent.start()

@@ -16,9 +16,10 @@ class Number:
 
 @dataclass(frozen=True)
 class Text:
-    """A string, or a wstring."""
+    """A string, or a wstring; with ``most``, of so many letters at most."""
 
     wide: bool = False
+    most: int = 0
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,10 @@ class Array:
 
 @dataclass(frozen=True)
 class Sequence:
-    """Any number of items, behind their number."""
+    """Any number of items, behind their number; with ``most``, so many at most."""
 
     item: Shape
+    most: int = 0
 
 
 Shape = Number | Text | Structure | Array | Sequence

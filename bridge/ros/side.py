@@ -126,11 +126,15 @@ class Closable(Protocol):
         """End it; messages that are being taken may still come."""
 
 
+class CutOff(Exception):
+    """Nothing reaches the robot's nodes now, since the way to them is lost."""
+
+
 class Publisher(Closable, Protocol):
     """Ours, on a topic."""
 
     def publish(self, cdr: bytes) -> None:
-        """From any thread. Raises whatever the middleware does."""
+        """From any thread. Raises CutOff, and whatever the middleware does."""
 
 
 class Client(Closable, Protocol):

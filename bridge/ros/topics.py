@@ -23,7 +23,7 @@ from bridge.ros.carried import Carried
 from bridge.ros.interface import InterfaceNode, Registrant, Robot
 from bridge.ros.rules import DEFAULT_HOLD_S
 from bridge.ros.safety import Control, DeadMan
-from bridge.ros.side import MessageType, Other, Publisher, Side
+from bridge.ros.side import CutOff, MessageType, Other, Publisher, Side
 from bridge.ros.stream import cdr_problem
 from bridge.ros.types import InterfaceName
 from bridge.ros.unity_cdr import TooManyParts, to_ros
@@ -41,6 +41,8 @@ STOP_AGAIN_S = 0.05
 """After so long a stop message that ROS did not take is published again."""
 STOP_TIMES = 15
 """As long as a publisher that is not needed any more is kept for it."""
+CUT_OFF_S = 60.0
+"""As long as that it is published again where the way to the robot's nodes is lost: they may be moving still."""
 
 
 class TopicNode(InterfaceNode):
@@ -140,10 +142,12 @@ class PublisherNode(TopicNode):
     def close(self) -> None:
         with self.lock:  # somebody may be publishing its stop message
             publisher, self._publisher = self._publisher, None
-        if publisher is None:
-            return
+        if publisher is not None:
+            self._end(publisher)
+
+    def _end(self, publisher: Publisher) -> None:
         if self._stopped_at + self.LINGER_S > time.monotonic():
-            self.robot.session.later(self.LINGER_S, publisher.close)
+            self.robot.session.later(self.LINGER_S, lambda: self._end(publisher))
         else:
             publisher.close()
 
@@ -158,7 +162,7 @@ class PublisherNode(TopicNode):
         with self.lock:
             refusal = self._refusal(message, problem)
             if refusal is None:
-                if self._publish(cdr, self._publisher):
+                if self._publish(cdr, self._publisher) is None:
                     self.carried.count(len(cdr))
                     if self.deadman is not None:
                         self.deadman.command(Registrant.of(message), time.monotonic() - message.age_s)
@@ -187,14 +191,16 @@ class PublisherNode(TopicNode):
             return "not_in_control", f"{self.control.holder(time.monotonic())} has control"
         return None
 
-    def _publish(self, cdr: bytes, publisher: Publisher | None) -> bool:
+    def _publish(self, cdr: bytes, publisher: Publisher | None, *, again: bool = False) -> Exception | None:
+        """What failed, counted unless it is tried ``again``."""
         try:
             assert publisher is not None
             publisher.publish(cdr)
         except Exception as error:  # noqa: BLE001 - the middleware's, whatever it is
-            self.robot.drops.note("failed", self.topic, f"ROS did not publish: {error}")
-            return False
-        return True
+            if not again:
+                self.robot.drops.note("failed", self.topic, f"ROS did not publish: {error}")
+            return error
+        return None
 
     # -- safety, from any thread ---------------------------------------------------------------------------------
 
@@ -242,21 +248,22 @@ class PublisherNode(TopicNode):
         if self._publisher is not None:
             self._say_stop(self._publisher, why, level)
 
-    def _say_stop(self, publisher: Publisher, why: str, level: int, times: int = 1) -> None:
+    def _say_stop(self, publisher: Publisher, why: str, level: int, times: int = 1, until: float = 0.0) -> None:
         """Again when ROS does not take it, also while the publisher is closing: nothing else would."""
         if times > 1 and self.deadman is not None and self.deadman.commander is not None:
             return  # it is commanded anew
-        self._stopped_at = time.monotonic()
-        if self._publish(self._stop_cdr, publisher):
+        self._stopped_at = now = time.monotonic()
+        failed = self._publish(self._stop_cdr, publisher, again=times > 1)
+        until = until or now + CUT_OFF_S
+        if failed is None:
             log.log(level, "%s: %s; published the stop message", self.topic, why)
-        elif times < STOP_TIMES:
-            again = self._stopped_at + STOP_AGAIN_S
+        elif times < STOP_TIMES or (isinstance(failed, CutOff) and now < until):
 
             def say() -> None:
                 with self.lock:
-                    self._say_stop(publisher, why, level, times + 1)
+                    self._say_stop(publisher, why, level, times + 1, until)
 
-            self.robot.alarms.at(again, say)
+            self.robot.alarms.at(now + STOP_AGAIN_S, say)
 
     def status(self) -> NodeStatus:
         return structs.replace(super().status(), control=self._control_status(), deadman=self._deadman_status())

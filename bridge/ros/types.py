@@ -154,6 +154,8 @@ def _shape(slot: Any) -> Shape:
         return shape_of(getattr(importlib.import_module(".".join(slot.namespaces)), slot.name))
     if isinstance(slot, idl.Array):
         return Array(_shape(slot.value_type), int(slot.size))
+    bounded = isinstance(slot, idl.BoundedSequence | idl.BoundedString | idl.BoundedWString)
+    most = int(slot.maximum_size) if bounded else 0
     if isinstance(slot, idl.AbstractSequence):
-        return Sequence(_shape(slot.value_type))
-    return Text(wide=isinstance(slot, idl.AbstractWString))
+        return Sequence(_shape(slot.value_type), most)
+    return Text(isinstance(slot, idl.AbstractWString), most)

@@ -15,6 +15,7 @@ MOST = 1 << 18
 """Items of more than fixed size, such as texts, in one message: about 0.1 s."""
 _LARGEST = 8
 """No number is aligned to more."""
+_LENGTH_BYTES = 4
 _WIDE_BYTES = 4
 """What a letter of a wstring takes."""
 
@@ -43,7 +44,7 @@ _TooLong."""
 
 
 class _TooLong(Exception):
-    """It has more items than are looked at."""
+    """It has more items than are looked at, or than its type allows."""
 
 
 class Whole:
@@ -67,8 +68,8 @@ class Whole:
                 at = step(walk, at)
         except struct.error:
             return f"it is cut off: it has {len(cdr)} bytes, and what it consists of does not end there"
-        except _TooLong:
-            return f"it has more than {MOST} parts"
+        except _TooLong as error:
+            return str(error)
         if at > walk.end:
             return f"it is cut off: it has {len(cdr)} bytes, and what it consists of takes {at}"
         return None
@@ -109,12 +110,14 @@ def _steps(shape: Shape) -> list[_Run | _Step]:
         fields = [step for field in shape.fields for step in _steps(field)]
         return fields or [_number(1)]  # ROS writes a byte for a structure without fields
     if isinstance(shape, Text):
-        return [_wide_text if shape.wide else _text]
+        text = _wide_text if shape.wide else _text
+        return [_bounded(text, shape.most, wide=shape.wide) if shape.most else text]
     inner = _merged(_steps(shape.item))
     (run,) = inner if len(inner) == 1 and isinstance(inner[0], tuple) else (None,)
     if isinstance(shape, Array):
         return [_times(run, shape.count)] if isinstance(run, tuple) else [_items(inner, shape.count)]
-    return [_sequence_of_runs(run)] if isinstance(run, tuple) else [_items(inner, None)]
+    items = _sequence_of_runs(run) if isinstance(run, tuple) else _items(inner, None)
+    return [_few(items, shape.most) if shape.most else items]
 
 
 def _merged(steps: list[_Run | _Step]) -> list[_Run | _Step]:
@@ -145,6 +148,34 @@ def _wide_text(walk: _Walk, at: int) -> int:
     return at + 4 + _WIDE_BYTES * walk.read(walk.cdr, at)[0]
 
 
+def _bounded(text: _Step, most: int, *, wide: bool) -> _Step:
+    """A text of so many letters at most."""
+
+    def take(walk: _Walk, at: int) -> int:
+        begin = ((at + 3) & -4) + _LENGTH_BYTES
+        end = text(walk, at)
+        letters = (end - begin) // _WIDE_BYTES if wide else end - begin - 1
+        if letters > most and not wide:  # bytes, of which a letter may have several
+            letters = sum(byte & 0xC0 != 0x80 for byte in walk.cdr[begin : end - 1])
+        if letters > most:
+            raise _TooLong(f"a text of {letters} letters is in it, where its type has {most} at most")
+        return end
+
+    return take
+
+
+def _few(items: _Step, most: int) -> _Step:
+    """A sequence of so many items at most."""
+
+    def take(walk: _Walk, at: int) -> int:
+        count = walk.read(walk.cdr, (at + 3) & -4)[0]
+        if count > most:
+            raise _TooLong(f"a sequence of {count} items is in it, where its type has {most} at most")
+        return items(walk, at)
+
+    return take
+
+
 def _sequence_of_runs(run: _Run) -> _Step:
     def take(walk: _Walk, at: int) -> int:
         at = (at + 3) & -4
@@ -170,7 +201,7 @@ def _items(inner: list[_Run | _Step], fixed: int | None) -> _Step:
         for _ in range(count):  # ends soon when there are not so many: each has a length to be read
             walk.items += 1
             if walk.items > MOST:
-                raise _TooLong
+                raise _TooLong(f"it has more than {MOST} parts")
             for step in steps:
                 at = step(walk, at)
         return at

@@ -96,6 +96,14 @@ class RosNetwork:
         self._graphs: dict[int, Graph] = {}
         self._watching: dict[int, Subscription] = {}
         self._on_change: Callbacks[OnChange] = Callbacks()
+        self.linked = True
+        """Whether a router is connected now. Set in Zenoh's thread, before the tokens behind it are taken for gone."""
+        self.losses = 0
+        """How often the only router was lost."""
+        self.is_router = settings.mode == "router"
+        self._links: set[str] = set()
+        followed = zenoh.handlers.Callback(self._link, indirect=False)
+        self._following = session.info.declare_link_events_listener(followed, history=True)
 
     @classmethod
     async def open(cls, settings: MeshSettings, *, on_waiting: Callable[[str], None] | None = None) -> RosNetwork:
@@ -117,6 +125,14 @@ class RosNetwork:
     async def close(self) -> None:
         """Leave; tokens end. A process must not exit without it."""
         await leave(self.session.close)
+
+    def _link(self, event: zenoh.LinkEvent) -> None:
+        keep_attached()
+        with self._lock:
+            name = f"{event.link.zid} {event.link.dst}"
+            (self._links.add if event.kind == zenoh.SampleKind.PUT else self._links.discard)(name)
+            before, self.linked = self.linked, bool(self._links) or self.is_router
+            self.losses += before and not self.linked
 
     # -- the graph -----------------------------------------------------------------------------------------------
 

@@ -63,8 +63,12 @@ class Mesh:
         settings: MeshSettings,
         traffic: Sequence[TrafficRule] = (),
         backlog_bytes: int = 64 << 20,
+        *,
+        shared: bool = False,
     ) -> None:
+        """``shared``: the session is somebody else's, and stays open; what was declared here is closed before."""
         self.settings = settings
+        self._is_shared = shared
         self.drops = Losses(log)
         self.policer = Policer(traffic, self.drops)
         own = str(session.zid())
@@ -200,7 +204,8 @@ class Mesh:
 
     def _close(self) -> None:
         self._outgoing.close(timeout_s=1.0)
-        self._session.close()  # type: ignore[no-untyped-call]
+        if not self._is_shared:
+            self._session.close()  # type: ignore[no-untyped-call]
         if self.drops:
             log.info("lost in all: %s", ", ".join(f"{name} {count}" for name, count in sorted(self.drops.items())))
         for line in self.policer.report():

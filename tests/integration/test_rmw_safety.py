@@ -151,3 +151,18 @@ async def test_whatever_is_killed_registrations_come_back(site: Site) -> None:
     await site.router.start()
     await site.there()
     await site.driven(drive, 0.125)
+
+
+async def test_a_stop_that_the_robot_could_not_hear(site: Site) -> None:
+    """When the router goes the robot may be moving: it gets the dead-man's message once it can be reached again."""
+    await site.there()
+    drive = await site.agent.advertise(TOPIC, robot=7)
+    await site.driven(drive, 0.5)
+    await site.router.stop(signal.SIGKILL)
+    await until(lambda: any("out of sight" in line for line in site.program.log), PATIENCE_S)
+    assert site.speeds[-1] == 0.5
+    await site.router.start()
+    await until(lambda: site.speeds[-1] == 0.0, PATIENCE_S)
+    await site.there()
+    await site.driven(drive, 0.25)
+    assert site.speeds.count(0.0) == 1

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bridge.rmw_zenoh.goals import ENDED, statuses
 from macs_zenoh.protocol.rmw_zenoh import keyexpr
 from macs_zenoh.protocol.rmw_zenoh.attachment import ATTACHMENT_BYTES, encode_attachment, gid_of, parse_attachment
 from macs_zenoh.protocol.rmw_zenoh.cdr import looks_like_cdr, read_text, written_text
@@ -309,3 +310,21 @@ def test_a_graph_knows_whose_endpoints_are_whose() -> None:
     assert len(graph.clear()) == before
     assert len(graph) == 0
     assert graph.on("/robot1/latched") == []
+
+
+def test_how_goals_stand_as_recorded() -> None:
+    """The real server's status messages name its goals, each until it has ended; what is cut short says no more."""
+    recorded = [
+        bytes.fromhex(row["payload_hex"])
+        for row in rows("wire_action_server")
+        if row["kind"] == "put" and "GoalStatusArray" in row["key"] and "@adv" not in row["key"]
+    ]
+    found = [dict(statuses(cdr)) for cdr in recorded]
+    assert recorded
+    assert all(found)
+    assert {status for each in found for status in each.values()} <= set(range(1, 7))
+    assert any(status >= ENDED for each in found for status in each.values())
+    for cdr in recorded:
+        for end in range(len(cdr)):
+            assert len(list(statuses(cdr[:end]))) <= len(found[recorded.index(cdr)])
+    assert list(statuses(b"\0\1\0\0\xff\xff\xff\xff")) == []
