@@ -116,6 +116,13 @@ class Outgoing:
         """Send what is queued, for at most so long."""
         self._sender.close(timeout_s)
 
+    def undeclare(self) -> None:
+        """Have no publishers any more, on a session that goes on."""
+        with self._outlets_lock:
+            for outlets in self._outlets.values():
+                outlets.clear()
+            self._apart.clear()
+
     def put(self, key: str, payload: Payload, traffic: Traffic) -> None:
         """`Mesh.put`."""
         publisher, shape, kept = self._outlets[traffic].get(key) or self._declare(key, traffic)

@@ -204,7 +204,10 @@ class Mesh:
 
     def _close(self) -> None:
         self._outgoing.close(timeout_s=1.0)
-        if not self._is_shared:
+        if self._is_shared:
+            Subscription(*([self._pulse] if self._pulse is not None else []), self._links).close()
+            self._outgoing.undeclare()
+        else:
             self._session.close()  # type: ignore[no-untyped-call]
         if self.drops:
             log.info("lost in all: %s", ", ".join(f"{name} {count}" for name, count in sorted(self.drops.items())))
