@@ -104,7 +104,7 @@ class ZenohRobot:
 
     def _mesh(self) -> Mesh:
         """The mesh over the session of a router, which is the nodes' as well: nothing in between."""
-        return Mesh(unwatched(self.network.session), self._settings.mesh, self._settings.traffic, shared=True)
+        return Mesh.over(unwatched(self.network.session), self._settings.mesh, self._settings.traffic)
 
     async def _join(self, as_robot: AbstractAsyncContextManager[RobotAgent]) -> None:
         async with as_robot as agent:

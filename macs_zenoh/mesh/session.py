@@ -57,18 +57,17 @@ class Mesh:
     PUBLISHERS = Outgoing.PUBLISHERS
     LARGE_BYTES = Outgoing.LARGE_BYTES
 
+    _is_shared = False
+    """Whether the session is somebody else's."""
+
     def __init__(
         self,
         session: zenoh.Session,
         settings: MeshSettings,
         traffic: Sequence[TrafficRule] = (),
         backlog_bytes: int = 64 << 20,
-        *,
-        shared: bool = False,
     ) -> None:
-        """``shared``: the session is somebody else's, and stays open; what was declared here is closed before."""
         self.settings = settings
-        self._is_shared = shared
         self.drops = Losses(log)
         self.policer = Policer(traffic, self.drops)
         own = str(session.zid())
@@ -136,6 +135,13 @@ class Mesh:
         router cannot listen.
         """
         return cls(await open_session(settings, on_waiting=on_waiting, quiet=quiet), settings, traffic)
+
+    @classmethod
+    def over(cls, session: zenoh.Session, settings: MeshSettings, traffic: Sequence[TrafficRule] = ()) -> Mesh:
+        """On a session that is somebody else's, and goes on when this has been closed."""
+        mesh = cls(session, settings, traffic)
+        mesh._is_shared = True
+        return mesh
 
     @classmethod
     async def open_once(cls, settings: MeshSettings, *, timeout_s: float) -> Mesh:
