@@ -7,6 +7,7 @@ result, which begins behind a byte and is aligned anew.
 from __future__ import annotations
 
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -34,6 +35,8 @@ ENDED = 4
 """This status of a goal, and those above it, are the last."""
 SILENT_S = 2.0
 """A server that has said nothing of a goal's status for so long is asked for its result at once."""
+ANYWAY_S = 60.0
+"""After so long it is asked in any case: that the goal has ended may have been lost."""
 KEPT = 1024
 """Goals whose feedback is passed on; of more, the latest."""
 
@@ -143,12 +146,12 @@ class ZenohGoals:
             part.close()
 
     def _when_ended(self, goal_id: bytes, ask: Callable[[], object]) -> None:
-        losses = self._session.network.losses
+        losses, until = self._session.network.losses, time.monotonic() + ANYWAY_S
 
         def anyway() -> None:
             with self._lock:
                 silent = goal_id not in self._status or self._session.network.losses != losses
-            if silent:
+            if silent or time.monotonic() > until:
                 self._ask(goal_id)
             elif goal_id in self._waiting:
                 self._session.later(SILENT_S, anyway, hurry=True)
