@@ -65,9 +65,9 @@ async def test_a_robot_s_own_router(linked: bool) -> None:
         program = await enter(Program("rmw-zenoh", "--id", "7", "--mode", "router", "-l", own, *link))
         assert program.ready == "robot 7 (domain 0)"
         gateway = await enter(Program("gateway", "--port", "0", "-e", mesh))
-        headset = await enter(await Headset.connect("127.0.0.1", gateway.port))
         for _ in range(2):
-            await used(headset, own)
+            async with await Headset.connect("127.0.0.1", gateway.port) as headset:
+                await used(headset, own)
 
 
 async def test_one_session_has_no_namespaces() -> None:

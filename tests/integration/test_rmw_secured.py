@@ -40,7 +40,8 @@ async def test_the_check_holds_certificates_to_their_namespaces(tmp_path: Path) 
     found.file().write_text(loosened, encoding="utf-8")
     async with Router(found.file()):
         wrong = [one.what for one in await found.wrong()]
-    assert any(what.startswith("robot-8 puts to its ROS nodes as robot-7") for what in wrong), wrong
+    assert "robot-7 puts to its ROS nodes, heard by robot-8" in wrong
+    assert any(what.startswith("robot-8 puts as robot-7 to its ROS nodes") for what in wrong), wrong
 
 
 async def test_a_robot_is_its_own_nodes_only(tmp_path: Path) -> None:

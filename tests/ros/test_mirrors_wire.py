@@ -1,4 +1,4 @@
-"""Mirrors on the wire: what robots that mirror each other send, what a latched map and transforms become."""
+"""Mirrors on the wire: what robots that mirror each other send, and what becomes of a latched map."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import asyncio
 from contextlib import AsyncExitStack
 
 import pytest
-from geometry_msgs.msg import TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
-from tf2_msgs.msg import TFMessage
 
 from bridge.ros.agent import RobotAgent, open_robot
 from bridge.settings import RobotSettings, Settings
@@ -106,33 +104,3 @@ async def test_a_map_reaches_a_robot_that_joins_later(router: str, domain: int) 
             maps = await own.subscription(String, "/robot1/map", LATCHED)
             assert (await get(maps)).data == "hall"
         assert first.agent.id == 3
-
-
-async def test_transforms_get_a_prefix(router: str, domain: int) -> None:
-    """Each frame of another robot's transforms has the name that the rule says, and nothing else is changed."""
-    there, here = domain, domain + 100
-    rule = MirrorRule(source="ros/1", topics=["/tf", "/pose"], tf_prefix="robot{robot}/")
-    async with AsyncExitStack() as stack:
-        other, own = peer(stack, there), peer(stack, here)
-        await robot(stack, router, 1, there)
-        await robot(stack, router, 2, here, rule)
-        says, poses = await other.publisher(TFMessage, "/tf"), await other.publisher(String, "/pose")
-        transforms = await own.subscription(TFMessage, "/robot1/tf")
-        plain = await own.subscription(String, "/robot1/pose")
-        said = TFMessage(transforms=[TransformStamped(child_frame_id="base"), TransformStamped(child_frame_id="/arm")])
-        said.transforms[0].header.frame_id = "odom"
-        said.transforms[0].transform.translation.x = 2.5
-        said.transforms[1].header.frame_id = "/base"
-
-        def comes() -> bool:
-            says.publish(said)
-            poses.publish(String(data="odom"))
-            return not (transforms.empty() or plain.empty())
-
-        await until(comes, PATIENCE_S, every_s=0.05)
-        found = transforms.get_nowait().transforms
-        frames = [(each.header.frame_id, each.child_frame_id) for each in found]
-        assert frames == [("robot1/odom", "robot1/base"), ("robot1/base", "robot1/arm")]
-        assert found[0].transform.translation.x == 2.5
-        assert found[0].transform.rotation.w == said.transforms[0].transform.rotation.w
-        assert plain.get_nowait().data == "odom"
