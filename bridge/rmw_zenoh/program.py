@@ -126,10 +126,10 @@ class ZenohRobot:
             await asyncio.sleep(GONE_S)
             if self.is_there:
                 continue
+            agent.show(False)  # whatever it takes to leave
             if self.network.linked and self.network.losses == losses:
                 return
             log.warning("robot %d is out of sight: the way to the router of its nodes is lost", self.robot.id)
-            agent.show(False)
             with suppress(asyncio.TimeoutError):
                 await within(self._until(lambda: self.is_there), HIDDEN_S)
             others = {each.zid for each in agent.directory.claimants(ROS, agent.id)} - {agent.mesh.zid}
