@@ -20,7 +20,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from . import awareness, cases, crowd, differing, door, peers, ports, recording, robot_speed, scale, traces
+from . import awareness, cases, crowd, differing, door, peers, ports, recording, rmw, robot_speed, scale, traces
 from .figures import Figure, markdown, table
 from .peer_ends import KINDS
 from .plan import Plan
@@ -36,6 +36,7 @@ WITHOUT_ROS = {
     **door.CASES,
     **recording.CASES,
     **traces.CASES,
+    **rmw.CASES,
 }
 CASES = {**WITHOUT_ROS, **WITH_ROS}
 ONLY_ASKED_FOR = ("mixed", "peers", "recording")
