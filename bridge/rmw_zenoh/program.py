@@ -22,7 +22,7 @@ from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, MacsError
 from macs_zenoh.locked_out import locked_out
-from macs_zenoh.mesh import Mesh
+from macs_zenoh.mesh import Mesh, Subscription
 from macs_zenoh.mesh.panics import unwatched
 from macs_zenoh.mesh.ros_network import RosNetwork
 from macs_zenoh.protocol.messages import ROS
@@ -38,8 +38,8 @@ GONE_S = 0.3
 """A robot without a node for so long has left. Nodes that start again, and a router, take less."""
 HIDDEN_S = 60.0
 """So long a robot that is out of sight, since the way to its router was lost, has what agents registered on it."""
-LOOK_S = 2.0
-"""So long all nodes that are there have to be seen."""
+LOOK_S = 5.0
+"""How long the router may take to tell which nodes are there."""
 SETTLE_S = 0.2
 """Nodes that start together are seen together: in which namespaces they are says which robots there are."""
 AGAIN_S = 2.0
@@ -174,9 +174,8 @@ async def run(
         presented = await stack.enter_async_context(_Presented(settings, networks))
         presented.are(robots)
         if follow:
-            following = _Following(settings.rmw_zenoh, networks[""])
+            following = await _Following.begin(settings.rmw_zenoh, networks[""])
             stack.callback(following.close)
-            await asyncio.sleep(LOOK_S)
             presented.are(robots := following.robots())
         if on_ready is not None:
             on_ready(robots)
@@ -244,18 +243,30 @@ class _Presented:
 class _Following:
     """Robots by rule, as far as their nodes are seen."""
 
-    def __init__(self, settings: RmwZenohSettings, network: RosNetwork) -> None:
+    def __init__(self, settings: RmwZenohSettings) -> None:
         self._robots = Robots(settings)
         self._nodes: dict[str, Node] = {}
         self._lock = threading.Lock()
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
         self._told: set[Place] = set()
-        self._watching = network.watch_tokens(None, self._token)
+        self._watching: Subscription | None = None
+
+    @classmethod
+    async def begin(cls, settings: RmwZenohSettings, network: RosNetwork) -> _Following:
+        """Follow; who is there now is known. It asks first: while a watcher's first news are on their way, answers may
+        leave some out."""
+        following = cls(settings)
+        for token in await network.tokens(None, timeout_s=LOOK_S):
+            following._token(token, True)
+        following._watching = network.watch_tokens(None, following._token)
+        await asyncio.sleep(SETTLE_S)
+        return following
 
     def close(self) -> None:
         """Follow no more."""
-        self._watching.close()
+        if self._watching is not None:
+            self._watching.close()
 
     def robots(self) -> list[RmwZenohRobot]:
         """Those that there are, or were."""
@@ -290,11 +301,8 @@ class _Following:
 async def look(settings: Settings) -> list[RmwZenohRobot]:
     """The robots of the settings, and those by rule as far as their nodes are seen now. Raises ConfigError."""
     async with await RosNetwork.open(ros_settings(settings)) as network:
-        following = _Following(settings.rmw_zenoh, network)
-        try:
-            await asyncio.sleep(LOOK_S)
-        finally:
-            following.close()
+        following = await _Following.begin(settings.rmw_zenoh, network)
+        following.close()
         return following.robots()
 
 

@@ -149,12 +149,18 @@ class RosNetwork:
 
     async def known(self, domain: int, *, timeout_s: float = 2.0) -> None:
         """Wait until the tokens of a domain that exist now are in its graph."""
-        loop, ended = asyncio.get_running_loop(), asyncio.Event()
         graph = self.graph(domain)
+        for token in await self.tokens(domain, timeout_s=timeout_s):
+            self._token(graph, token, True)
+
+    async def tokens(self, domain: int | None, *, timeout_s: float = 2.0) -> list[str]:
+        """The tokens of a domain, or of all, that exist now."""
+        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+        found: list[str] = []
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                self._token(graph, str(reply.ok.key_expr), True)
+                found.append(str(reply.ok.key_expr))
 
         def on_end() -> None:
             with suppress(RuntimeError):  # the loop has ended
@@ -163,6 +169,7 @@ class RosNetwork:
         callback = zenoh.handlers.Callback(on_reply, on_end, indirect=False)
         self.session.liveliness().get(every_token(domain), callback, timeout=timeout_s)
         await ended.wait()
+        return found
 
     def watch_tokens(self, domain: int | None, receive: Callable[[str, bool], None]) -> Subscription:
         """Call ``receive(token, alive)`` for each token of a domain, or of all."""
