@@ -9,6 +9,7 @@ the end.
 
 examples:
   macs bag info monday.mcap
+  macs bag events monday.mcap                             who stopped, what was refused and lost, and when
   macs bag check monday.mcap
   macs bag repair monday.mcap                             writes monday.repaired.mcap
   macs bag merge site.mcap robot.mcap -o both.mcap
@@ -43,6 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     verbs = parser.add_subparsers(dest="bag_verb", metavar="VERB", required=True, title="verbs")
     info = _verb(verbs, "info", "what is in a file: channels, types, time, losses", many=True)
     info.add_argument("--json", action="store_true", help="for programs: one object per file and line")
+    events = _verb(verbs, "events", "what happened: stops, dead-men, refusals, losses, control")
+    events.add_argument("--json", action="store_true", help="for programs: one object per line")
     check = _verb(verbs, "check", "read all of a file and say what is wrong with it", many=True)
     check.add_argument("--json", action="store_true", help="for programs: one object per file and line")
     repair = _verb(verbs, "repair", "write a whole file of one that has no end or is damaged")
@@ -88,6 +91,7 @@ def run(args: argparse.Namespace) -> int:
     need_mcap()
     return {
         "info": _info,
+        "events": _events,
         "check": _check,
         "repair": _repair,
         "merge": _merge,
@@ -155,6 +159,20 @@ def _show(told: dict[str, Any]) -> None:
         f"{told['messages']} messages on {len(rows)} channels, lost: {lost}",
         *([terminal.Columns(rows, right=(0,), indent=2)] if rows else []),
     )
+
+
+def _events(args: argparse.Namespace) -> int:
+    from bridge.recording.bag import Bag
+    from bridge.recording.happened import happened
+
+    with Bag(args.file) as bag:
+        for each in happened(bag):
+            if args.json:
+                output.say(output.as_json(each._asdict()))
+            else:
+                who = f"robot {each.robot}: " if each.robot else ""
+                output.say(plain(f"{amounts.in_time(max(0.0, each.at_s)):>11}  {each.kind:8} {who}{each.text}"))
+    return 0
 
 
 def _check(args: argparse.Namespace) -> int:

@@ -93,6 +93,16 @@ def add_mesh_options(
     zenoh.add_argument("--namespace", metavar="KEY", help="put before every key: several meshes on one router")
 
 
+def mesh_words(args: argparse.Namespace) -> list[str]:
+    """What `add_mesh_options` and `add_as_option` were told, for a program that joins in the same way."""
+    words = [word for file in args.settings or () for word in ("--settings", file)]
+    for option in ("config", "mode", "connect", "listen", "cfg", "namespace"):
+        said = getattr(args, option, None)
+        for each in said if isinstance(said, list) else [] if said is None else [said]:
+            words += [f"--{option}", each]
+    return words + (["--verbose"] if args.verbose else [])
+
+
 def settings_file(args: argparse.Namespace) -> Settings:
     """What the settings files say, all defaults without one. Raises `ConfigError`."""
     return load(*args.settings or ())

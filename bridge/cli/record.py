@@ -8,6 +8,9 @@ or when the disk is full; after a crash `macs bag repair` keeps all that was on 
 --ring keeps the last minute in memory and writes it when asked (kill -USR1, or its agent's verb `record` for those
 whom [record] allow names), and by itself at a stop or when a dead-man acts (--on).
 
+--serve FOLDER is a recorder that a gateway's page asks ([gateway] recordings = "FOLDER"): start, stop, write the ring,
+list, download, replay. It says nothing by itself and records what it is asked to, but for the ring of --ring.
+
 Exit code 0: recorded; 1: no router, or the disk is full; 2: wrong usage.
 
 examples:
@@ -15,6 +18,7 @@ examples:
   macs record --robot 7 --topics '/camera/**' --commands -o monday.mcap
   macs record --max-size 1GB --split --compress zstd -o long.mcap
   macs record --ring 60s --on stop --on deadman -o incident.mcap
+  macs record --serve recordings --ring 60s --on stop --commands
 
 what it prints:
   ready: recording as unity/3 to monday.mcap
@@ -23,6 +27,7 @@ what it prints:
 from __future__ import annotations
 
 import argparse
+import asyncio
 import os
 import time
 from pathlib import Path
@@ -31,7 +36,7 @@ from typing import TYPE_CHECKING
 from bridge.cli import amounts, options, output, running
 from bridge.cli.amounts import pattern, seconds, size
 from bridge.settings import Settings
-from macs_zenoh.errors import UsageError
+from macs_zenoh.errors import MissingExtra, UsageError
 from macs_zenoh.plain import plain
 
 if TYPE_CHECKING:
@@ -58,7 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ring.add_argument("--ring", type=seconds, metavar="TIME", help="keep this in memory, and write it when asked")
     ring.add_argument("--ring-size", type=size, metavar="SIZE", help="and no more than this (default: 512MiB)")
     ring.add_argument("--on", action="append", choices=("stop", "deadman"), help="write it by itself then; repeat")
+    where.add_argument("--serve", type=Path, metavar="FOLDER", help="record what a gateway's page asks for, into it")
     parser.add_argument("--json", action="store_true", help="for programs: the lines on stdout as JSON")
+    parser.add_argument("--progress", action="store_true", help="with --json: a line each second")
     options.add_as_option(parser)
     options.add_mesh_options(parser)
 
@@ -76,8 +83,44 @@ def run(args: argparse.Namespace) -> int:
     if args.principal is not None and not args.principal.joins:
         raise UsageError("a recording is online: --as unity/5, or another agent with an id")
     settings = options.settings(args)
+    if args.serve is not None:
+        return _serve(args, settings)
     os.nice(settings.record.nice)  # before there are threads: each has its own
     return running.until_stopped(lambda: _record(args, settings))
+
+
+def _serve(args: argparse.Namespace, settings: Settings) -> int:
+    if args.output or args.split or args.max_size or args.max_duration:
+        raise UsageError("--serve chooses names and sizes itself: [record] folder_bytes is how much it may keep")
+    try:
+        from bridge.recording.serving.server import Recorder, Service
+    except ModuleNotFoundError as error:
+        raise MissingExtra("a recorder for a page", "aiohttp", "web") from error
+    if args.ring is not None and args.principal is not None:
+        raise UsageError("two recordings cannot be one agent: --serve with --as has no --ring")
+    mesh, said = options.mesh_words(args), settings.record
+    what = [word for robot in args.robot for word in ("--robot", str(robot))]
+    what += [word for topic in args.topics for word in ("--topics", topic)]
+    what += [f"--{name}" for name in ("commands", "headsets") if getattr(args, name)]
+    what += ["--compress", args.compress] if args.compress else []
+    what += ["--as", str(args.principal)] if args.principal is not None else []
+    ring = []
+    if args.ring is not None:
+        ring = [*what, "--ring", f"{args.ring}s", *(word for on in args.on or () for word in ("--on", on))]
+        ring += ["--ring-size", str(args.ring_size)] if args.ring_size else []
+    service = Service(args.serve, mesh, what, ring, said.folder_bytes, said.replay_first_id)
+
+    async def serve() -> int:
+        recorder = Recorder(service)
+        try:
+            await recorder.open()
+            running.say_ready(f"recorder of {args.serve}")
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.shield(recorder.close())
+        return 0
+
+    return running.until_stopped(serve)
 
 
 async def _record(args: argparse.Namespace, settings: Settings) -> int:
@@ -110,6 +153,8 @@ async def _record(args: argparse.Namespace, settings: Settings) -> int:
                 f"{report.messages} messages  {amounts.in_bytes(report.rate)}/s  {amounts.in_bytes(report.bytes)}  "
                 f"lost {sum(report.lost.values())}  {amounts.in_bytes(report.free_bytes)} free"
             )
+            if args.json and args.progress:
+                output.say_if_possible(output.as_json({"progress": _progress(report)}))
 
         return await record(
             order,
@@ -119,6 +164,18 @@ async def _record(args: argparse.Namespace, settings: Settings) -> int:
             on_progress=tell,
             on_file=lambda report: output.say_if_possible(_told(report, args.json)),
         )
+
+
+def _progress(report: Report) -> dict[str, object]:
+    return {
+        "seconds": round(report.seconds, 1),
+        "messages": report.messages,
+        "bytes": report.bytes,
+        "bytes_per_s": round(report.rate),
+        "robots": report.robots,
+        "topics": report.topics,
+        "lost": dict(report.lost),
+    }
 
 
 def _told(report: Report, as_json: bool) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 
 from bridge.audit import NO_AUDIT, Audit, open_audit, who
 from bridge.settings import GatewaySettings
@@ -37,6 +38,10 @@ class Record:
     def token(self, event: str, name: str) -> None:
         """A token has changed."""
         self._audit.record(event, who(token=name))
+
+    def note(self, event: str, by: Mapping[str, str], what: str, result: str) -> None:
+        """Something else was done, or not: by whom, and what of it."""
+        self._audit.record(event, by, what, result)
 
     def troubles(self) -> dict[str, int]:
         """What `macs doctor` shall find."""

@@ -44,13 +44,16 @@ class Site:
         entrance: Entrance,
         door: Door,
         host_of: Callable[[web.Request], str],
+        goes_on: Callable[[web.Request], None],
     ) -> None:
-        """``host_of`` tells the address that a request comes from."""
+        """``host_of`` tells the address that a request comes from; ``goes_on`` gives its answer more time."""
         self.gateway = gateway
         self._router = router
         self._entrance = entrance
         self._door = door
-        self._host_of = host_of
+        self.host_of = host_of
+        self.goes_on = goes_on
+        """An answer that takes long has to say so at least every few seconds, or its connection is ended."""
         self._at_end: list[Callable[[], None]] = []
 
     def on_close(self, callback: Callable[[], None]) -> None:
@@ -64,7 +67,13 @@ class Site:
 
     def get(self, path: str, answer: Answer) -> None:
         """Answer this path, written as for aiohttp, to who shows a valid token where one is wanted."""
+        self._router.add_get(path, self._judged(answer))
 
+    def post(self, path: str, answer: Answer) -> None:
+        """The same for what changes something. Pages from elsewhere were refused before, by their origin."""
+        self._router.add_post(path, self._judged(answer))
+
+    def _judged(self, answer: Answer) -> AnswerAll:
         async def judged(request: web.Request) -> web.StreamResponse:
             visitor = self.visitor(request)
             if visitor is None:
@@ -72,7 +81,7 @@ class Site:
                 return web.json_response(WRONG, status=401, headers={"WWW-Authenticate": "Bearer"})
             return await answer(request, visitor)
 
-        self._router.add_get(path, judged)
+        return judged
 
     def get_for_all(self, path: str, answer: AnswerAll) -> None:
         """Answer this path to everybody whom the port lets in at all, as a page has to be that asks for the token."""
@@ -81,7 +90,7 @@ class Site:
     def refuse(self, request: web.Request) -> None:
         """Who asks is not let in: count it, and log it, if he has shown a token."""
         if _shown(request) is not None:
-            self._door.refuse_request(self._entrance, self._host_of(request))
+            self._door.refuse_request(self._entrance, self.host_of(request))
 
     def visitor(self, request: web.Request) -> Grant | None:
         """What who asks may do; None: a valid token is wanted, and none is shown."""
@@ -89,7 +98,7 @@ class Site:
         token = None if shown is None else self._door.find(shown)
         if token is not None:
             return Grant(token.name, token.rights)
-        if self._entrance.wants_token(self._host_of(request)) or "Authorization" in request.headers:
+        if self._entrance.wants_token(self.host_of(request)) or "Authorization" in request.headers:
             return None
         return OPEN  # a cookie that is left over from another time counts for nothing
 
@@ -103,9 +112,11 @@ def _shown(request: web.Request) -> str | None:
 
 def add_routes(site: Site) -> None:
     """Let each module that has something to show add it."""
+    from bridge.page.recordings import add_recordings
     from bridge.page.routes import add_page
 
     from .figures import add_figures  # they take a `Site`
 
     add_figures(site)
     add_page(site)
+    add_recordings(site)

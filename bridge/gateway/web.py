@@ -98,7 +98,14 @@ class WebPort:
         app.router.add_get(WEBSOCKET_PATH, self._websocket)
         app.router.add_post("/login", self._login)
         app.router.add_post("/pair", self._pair)
-        self._site = Site(gateway, app.router, entrance, door, lambda request: _outer_of(request).host)
+        self._site = Site(
+            gateway,
+            app.router,
+            entrance,
+            door,
+            lambda request: _outer_of(request).host,
+            lambda request: _outer_of(request).wait(),
+        )
         add_routes(self._site)
         self._runner = web.AppRunner(
             app,

@@ -22,6 +22,7 @@ from . import files
 from .definitions import Definitions
 from .files import File
 from .mesh import Picture
+from .recordings import may_record
 from .robots import Robots, may_see, problem_of
 from .traces import Traces
 
@@ -106,6 +107,7 @@ class Page:
                 "groups": "any" if rights is None else rights.groups,
                 "topics": ["/**"] if rights is None else rights.topics,
                 "version": installed("macs-zenoh"),
+                "recordings": self._site.gateway.settings.recordings is not None and may_record(visitor),
             }
         )
 

@@ -13,6 +13,7 @@ import msgspec
 
 from bridge.recording.conditions import Condition, Event, stop_topic
 from bridge.recording.disk import Entry, Sink, now_ns
+from bridge.recording.doors import Doors
 from bridge.recording.follower import RobotFollower
 from bridge.recording.schema_source import Schemas
 from bridge.recording.sent import SentCommands
@@ -80,7 +81,8 @@ class Recorder:
         self._on_trigger = on_trigger
         self.schemas = Schemas(agent)
         self._json: dict[str, Channel] = {}
-        self._commands = SentCommands(sink, self.schemas, self.robots)
+        self._doors = Doors(agent, self._put)
+        self._commands = SentCommands(sink, self.schemas, self.robots, self._doors.token)
         self._watching: dict[int, asyncio.Task[None]] = {}
         self._asked: dict[int, asyncio.Event] = {}
         self._subscribed: list[Any] = []
@@ -105,6 +107,7 @@ class Recorder:
         for task in self._watching.values():
             task.cancel()
         self._commands.close()
+        self._doors.close()
         for subscription in self._subscribed:
             subscription.close()
         for follower in self.robots.values():
@@ -145,6 +148,7 @@ class Recorder:
         if is_me:
             about["recorder"] = True
         self._put(Event(PRESENCE, about, keep=f"{PRESENCE} {agent.key}"))
+        (self._doors.came if online else self._doors.left)(agent)
         for follower in self.robots.values():
             follower.presence(agent, online)
         if agent.type != ROS or not self._wanted.robot(agent.id):

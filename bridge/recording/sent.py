@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import msgspec
 
@@ -40,12 +40,19 @@ Kind = tuple[str, str, str, str]
 
 
 class SentCommands:
-    """Puts commands into a sink. ``robots``: those that are followed."""
+    """Puts commands into a sink. ``robots``: those that are followed; ``token(sender)`` names whose token it has."""
 
-    def __init__(self, sink: Sink, schemas: Schemas, robots: Mapping[int, RobotFollower]) -> None:
+    def __init__(
+        self,
+        sink: Sink,
+        schemas: Schemas,
+        robots: Mapping[int, RobotFollower],
+        token: Callable[[str], str] = lambda sender: "",
+    ) -> None:
         self._sink = sink
         self._schemas = schemas
         self._robots = robots
+        self._token = token
         self._channels: dict[Kind, Channel] = {}
         self._early: dict[Kind, list[tuple[Sent, int]]] = {}
         self._early_count = 0
@@ -117,6 +124,8 @@ class SentCommands:
         robots = [meant] if meant is not None else list(self._robots.values())[:ASKED]
         topic = robots[0].topic_of(sent.node) if robots else "/" + sent.node.removeprefix("nd_").removeprefix("_")
         metadata = {"robot": sent.to, "sender": sent.sender, "as": "sent", "topic": topic, "node": sent.node}
+        if token := self._token(sent.sender):
+            metadata["token"] = token
         name, of_type = command_topic(sent.sender, sent.to, topic), full_type(sent.type)
         for follower in robots:
             asked = (follower.robot, of_type)

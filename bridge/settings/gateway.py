@@ -104,6 +104,9 @@ class GatewaySettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=
     """A new file is begun when it has so much; the older one is called ``….000001`` and so on."""
     audit_files: Annotated[int, Meta(ge=1, le=100_000)] = 20
     """So many older files are kept."""
+    recordings: str | None = None
+    """Folder of a recorder on this machine (``macs record --serve``): whoever has the right to ``record`` finds it on
+    the web port's page. Unset: none."""
     reuse_port: bool = False
     """Share the port with other gateway processes (SO_REUSEPORT); set by ``--workers``."""
 

@@ -46,7 +46,7 @@ async def test_every_command_on_the_page(peer: Peer, domain: int, tmp_path: Path
     ):
         for command in COMMANDS:
             words = shlex.split(command.replace(ROUTER, router.endpoint))[1:]
-            words = [str(tmp_path / word) if word.endswith((".mcap", "_ros")) else word for word in words]
+            words = [str(tmp_path / w) if w.endswith((".mcap", "_ros", "recordings")) else w for w in words]
             if words[0] in SERVE and "-e" not in words:
                 words += ["-e", router.endpoint]
             if words[0] == "foxglove":

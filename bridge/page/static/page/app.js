@@ -6,6 +6,7 @@ import { digits, h, say, show } from "./dom.js";
 import { LatencyView } from "./latency-view.js";
 import { asked, login } from "./login.js";
 import { MeshView } from "./mesh-view.js";
+import { RecordView } from "./record-view.js";
 import { RobotView } from "./robot-view.js";
 import { Stop } from "./stop.js";
 import { Topics } from "./topics.js";
@@ -31,6 +32,7 @@ class Page {
     this.robotView = new RobotView(this);
     this.meshView = new MeshView(this);
     this.latencyView = new LatencyView(this);
+    this.recordView = me.recordings ? new RecordView(this) : null;
     this.#build();
     this.#listen();
   }
@@ -73,6 +75,7 @@ class Page {
       ["robot", "Robot", this.robotView],
       ["mesh", "Mesh", this.meshView],
       ["latency", "Latency", this.latencyView],
+      ...(this.recordView === null ? [] : [["recordings", "Recordings", this.recordView]]),
     ].map(([name, title, view]) => {
       const tab = h("a", { href: `#${name}`, class: "tab" }, title);
       return { name, view, tab };

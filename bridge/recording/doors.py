@@ -1,0 +1,83 @@
+"""Who came by which token, as gateways tell: so that a recording says whose hand a headset was. Asyncio."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from bridge.recording.conditions import Event
+from bridge.recording.streams import TOKENS
+from macs_zenoh.agent import Agent
+from macs_zenoh.errors import MacsError
+from macs_zenoh.protocol import ping
+from macs_zenoh.protocol.agent_id import AgentId
+from macs_zenoh.protocol.directory import AgentInfo
+from macs_zenoh.protocol.keyexpr import PING
+from macs_zenoh.protocol.messages import ROS
+
+log = logging.getLogger("macs.record")
+
+ANSWER_S = 2.0
+PAUSE_S = 0.5
+"""Many that come at once are asked for once."""
+SESSIONS = 256
+"""So many gateways are asked; who comes by others is known by id alone."""
+KNOWN = 1 << 16
+
+
+class Doors:
+    """Asks the gateways of those who come. ``put`` takes what is new."""
+
+    def __init__(self, agent: Agent, put: Callable[[Event], None]) -> None:
+        self._agent = agent
+        self._put = put
+        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._again: set[str] = set()
+        self._known: dict[str, tuple[str, str]] = {}
+
+    def token(self, agent: str) -> str:
+        """The name of the token by which an agent (``unity/256``) came; empty where none is known."""
+        return self._known.get(agent, ("", ""))[0]
+
+    def came(self, agent: AgentInfo) -> None:
+        """Somebody is online."""
+        if agent.zid == self._agent.mesh.zid or agent.type == ROS:
+            return
+        if agent.zid in self._asking:
+            self._again.add(agent.zid)
+        elif len(self._asking) < SESSIONS:
+            self._asking[agent.zid] = asyncio.get_running_loop().create_task(self._ask(agent.zid))
+
+    def left(self, agent: AgentInfo) -> None:
+        """Somebody is not any more: whoever has the id next may come by another token."""
+        self._known.pop(str(agent.key), None)
+
+    def close(self) -> None:
+        """Ask nobody any more."""
+        for task in self._asking.values():
+            task.cancel()
+
+    async def _ask(self, zid: str) -> None:
+        try:
+            while True:
+                await asyncio.sleep(PAUSE_S)
+                self._again.discard(zid)
+                answer = await self._agent.mesh.query(PING.of(zid=zid), ping.AGENTS, timeout_s=ANSWER_S)
+                self._told(zid, ping.decode_told(ping.decode(answer)[1]))
+                if zid not in self._again:
+                    return
+        except MacsError as error:  # no gateway, an old one, or it may not be asked
+            log.debug("%s does not tell who its agents are: %s", zid, error)
+        finally:
+            self._again.discard(zid)
+            del self._asking[zid]
+
+    def _told(self, zid: str, told: ping.GatewayTold) -> None:
+        for each in told.agents:
+            agent, said = str(AgentId(each.type, each.id)), (each.token, each.address)
+            if self._known.get(agent) == said or (agent not in self._known and len(self._known) >= KNOWN):
+                continue
+            self._known[agent] = said
+            value = {"agent": agent, "token": each.token, "address": each.address, "gateway": zid}
+            self._put(Event(TOKENS, value, keep=f"{TOKENS} {agent}"))

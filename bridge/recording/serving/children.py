@@ -1,0 +1,113 @@
+"""The programs that record and replay: each a process, told to end by its stdin or a signal, heard by its lines."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import signal
+import sys
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any
+
+from bridge.cli.running import READY, STOP_WITH_STDIN
+from macs_zenoh.errors import Refused
+from macs_zenoh.timeouts import within
+
+log = logging.getLogger("macs.record")
+
+START_S = 20.0
+"""How long one may take to be ready: it joins the mesh."""
+STOP_S = 10.0
+LONGEST_LINE = 1 << 20
+LAST_LINES = 5
+
+
+class Child:
+    """One program, from `started` until it has ended. ``on_end`` is called then."""
+
+    def __init__(self, process: asyncio.subprocess.Process, name: str, on_end: Callable[[Child], None]) -> None:
+        self.name = name
+        self.progress: dict[str, Any] = {}
+        """What it said last of how it is getting on."""
+        self.files: list[str] = []
+        self._process = process
+        self._ready = asyncio.Event()
+        self._last: deque[str] = deque(maxlen=LAST_LINES)
+        loop = asyncio.get_running_loop()
+        self._tasks = [loop.create_task(self._hear()), loop.create_task(self._hear_log())]
+        self._ended = loop.create_task(self._wait(on_end))
+
+    @classmethod
+    async def started(cls, words: Sequence[str], on_end: Callable[[Child], None]) -> Child:
+        """A program that is ready. Raises Refused with its last words."""
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "bridge", *words),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            start_new_session=True,
+            limit=LONGEST_LINE,
+            env={**os.environ, STOP_WITH_STDIN: "1", "PYTHONUNBUFFERED": "1"},
+        )
+        child = cls(process, words[0], on_end)
+        ready = asyncio.ensure_future(child._ready.wait())
+        try:
+            await asyncio.wait([ready, child._ended], timeout=START_S, return_when=asyncio.FIRST_COMPLETED)
+            if not ready.done():
+                raise Refused(f"macs {words[0]} did not begin: {child.problem or f'not within {START_S:g} s'}")
+        except BaseException:
+            await child.stop()
+            raise
+        finally:
+            ready.cancel()
+        return child
+
+    @property
+    def problem(self) -> str:
+        """Why it ended, in its own last words."""
+        return next((line for line in reversed(self._last) if line.startswith("macs")), "; ".join(self._last))
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        with suppress(ProcessLookupError):
+            self._process.send_signal(number)
+
+    async def stop(self) -> None:
+        """End it, as Ctrl-C does; killed when it does not."""
+        self.signal(signal.SIGTERM)
+        try:
+            await within(asyncio.shield(self._ended), STOP_S)
+        except asyncio.TimeoutError:
+            log.warning("macs %s did not stop within %g s, killed", self.name, STOP_S)
+            with suppress(ProcessLookupError):
+                self._process.kill()
+            await self._ended
+
+    async def _hear(self) -> None:
+        assert self._process.stdout is not None
+        async for line in self._process.stdout:
+            text = line.decode(errors="replace").rstrip()
+            if text.startswith(READY):
+                self._ready.set()
+            with suppress(ValueError):
+                said = json.loads(text)
+                if isinstance(said, dict) and "progress" in said:
+                    self.progress = said["progress"]
+                elif isinstance(said, dict) and "files" in said:
+                    self.files += said["files"]
+
+    async def _hear_log(self) -> None:
+        assert self._process.stderr is not None
+        async for line in self._process.stderr:
+            text = line.decode(errors="replace").rstrip()
+            self._last.append(text)
+            log.info("%s: %s", self.name, text)
+
+    async def _wait(self, on_end: Callable[[Child], None]) -> None:
+        await self._process.wait()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        on_end(self)

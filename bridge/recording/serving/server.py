@@ -1,0 +1,280 @@
+"""Answers what is asked of recordings, on a socket in their folder: HTTP, with JSON. Asyncio.
+
+Whoever can open the socket may do all of it; a gateway, which can, asks its visitors for the right to ``record``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import shutil
+import signal
+import socket
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from aiohttp import web
+from msgspec import Meta, Struct
+
+from bridge.recording.serving import socket_of
+from bridge.recording.serving.children import Child
+from bridge.recording.serving.folder import Folder
+from macs_zenoh.errors import ConfigError, MacsError, Refused, UsageError
+from macs_zenoh.protocol.name_patterns import NamePattern
+
+log = logging.getLogger("macs.record")
+
+BODY_BYTES = 4 << 10
+PLAYED_S = 1800.0
+"""A replay goes on, again and again from where it began, until it is stopped, and no longer than this."""
+READING = 2
+"""So many files are gone through at a time for who asks what happened in them."""
+
+Robot = Annotated[int, Meta(ge=1, le=0xFFFF)]
+
+
+class Start(Struct, frozen=True, forbid_unknown_fields=True):
+    """What to record: all robots and topics unless some are named."""
+
+    robots: Annotated[list[Robot], Meta(max_length=64)] = []
+    topics: Annotated[list[NamePattern], Meta(max_length=64)] = []
+    commands: bool = False
+    seconds: Annotated[float, Meta(ge=0, le=86400)] = 0.0
+    """0: until it is stopped."""
+
+
+class Replay(Struct, frozen=True, forbid_unknown_fields=True):
+    """What to play, and from where."""
+
+    name: str
+    start_s: Annotated[float, Meta(ge=0, le=1e9)] = 0.0
+
+
+class Nothing(Struct, frozen=True, forbid_unknown_fields=True):
+    """There is nothing to say."""
+
+
+Said = TypeVar("Said")
+
+
+@dataclass(frozen=True)
+class Service:
+    """What a recorder does.
+
+    Attributes:
+        folder: where its files are.
+        mesh: words for programs that join the mesh.
+        what: words for each recording.
+        ring: words for the ring; none: there is none.
+        most_bytes: of all files together.
+        first_replay: the id of the first robot that is played; others follow it.
+    """
+
+    folder: Path
+    mesh: Sequence[str] = ()
+    what: Sequence[str] = ()
+    ring: Sequence[str] = ()
+    most_bytes: int = 50 << 30
+    first_replay: int = 65001
+
+
+class Recorder:
+    """One recorder, from `open` to `close`."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self._folder = Folder(service.folder)
+        self._recording: Child | None = None
+        self._file = ""
+        self._ring: Child | None = None
+        self._replay: Child | None = None
+        self._replayed: dict[str, Any] = {}
+        self._problem = ""
+        self._turn = asyncio.Lock()
+        self._reading = asyncio.Semaphore(READING)
+        self._closing = False
+        self._runner: web.AppRunner | None = None
+
+    async def open(self) -> None:
+        """Serve. Raises ConfigError, UsageError: another one does so; Refused: the ring does not begin."""
+        path = socket_of(self._service.folder)
+        try:
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            _take_over(path)
+            app = web.Application(client_max_size=BODY_BYTES)
+            app.router.add_get("/state", self._answered(Nothing, self._state))
+            app.router.add_post("/start", self._answered(Start, self._start))
+            app.router.add_post("/stop", self._answered(Nothing, self._stop))
+            app.router.add_post("/ring", self._answered(Nothing, self._write_ring))
+            app.router.add_post("/replay", self._answered(Replay, self._play))
+            app.router.add_post("/replay-stop", self._answered(Nothing, self._stop_playing))
+            app.router.add_get("/happened/{name}", self._happened)
+            app.router.add_get("/files/{name}", self._file_of)
+            self._runner = web.AppRunner(app, handle_signals=False, access_log=None, shutdown_timeout=0.5)
+            await self._runner.setup()
+            before = os.umask(0o177)
+            try:
+                await web.UnixSite(self._runner, str(path)).start()
+            finally:
+                os.umask(before)
+        except OSError as error:
+            raise ConfigError(str(path), error.strerror or str(error)) from error
+        if self._service.ring:
+            self._ring = await self._begin("record", self._service.ring, self._folder.path / "ring.mcap")
+
+    async def close(self) -> None:
+        """End, with all that waits written."""
+        self._closing = True
+        children = [child for child in (self._recording, self._ring, self._replay) if child is not None]
+        await asyncio.gather(*(child.stop() for child in children))
+        if self._runner is not None:
+            await self._runner.cleanup()
+            socket_of(self._service.folder).unlink(missing_ok=True)
+
+    # -- answers -------------------------------------------------------------------------------------------------
+
+    def _answered(
+        self, kind: type[Said], answer: Callable[[Said], Awaitable[dict[str, Any]]]
+    ) -> Callable[[web.Request], Awaitable[web.Response]]:
+        async def answered(request: web.Request) -> web.Response:
+            try:
+                said = msgspec.json.decode(await request.read() or b"{}", type=kind)
+                return _json(await answer(said))
+            except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+                return _json({"error": f"that makes no sense: {error}"}, 400)
+            except Refused as refusal:
+                return _json({"error": refusal.reason}, 409)
+            except MacsError as error:
+                return _json({"error": str(error)}, 409)
+
+        return answered
+
+    async def _state(self, _: Nothing) -> dict[str, Any]:
+        being_written = {self._file} if self._recording is not None else set()
+        files = await asyncio.to_thread(self._folder.listed, being_written)
+        free = await asyncio.to_thread(shutil.disk_usage, self._folder.path)
+        return {
+            "recording": {"name": self._file, **self._recording.progress} if self._recording is not None else None,
+            "ring": self._ring.progress if self._ring is not None else None,
+            "replay": self._replayed if self._replay is not None else None,
+            "problem": self._problem,
+            "files": files,
+            "bytes": sum(file["bytes"] for file in files),
+            "most_bytes": self._service.most_bytes,
+            "free_bytes": free.free,
+        }
+
+    async def _start(self, said: Start) -> dict[str, Any]:
+        async with self._turn:
+            if self._recording is not None:
+                raise Refused(f"{self._file} is being recorded already")
+            left = self._service.most_bytes - await asyncio.to_thread(lambda: self._folder.bytes)
+            if left < 1 << 20:
+                raise Refused("the folder has as much as [record] folder_bytes lets it have; take some files away")
+            path = await asyncio.to_thread(self._folder.new)
+            words = [*self._service.what, "--max-size", str(left)]
+            words += [word for robot in said.robots for word in ("--robot", str(robot))]
+            words += [word for topic in said.topics for word in ("--topics", topic)]
+            words += ["--commands"] if said.commands and "--commands" not in words else []
+            words += ["--max-duration", f"{said.seconds}s"] if said.seconds else []
+            self._problem = ""
+            self._recording = await self._begin("record", words, path)
+            self._file = path.name
+            return {"name": path.name}
+
+    async def _stop(self, _: Nothing) -> dict[str, Any]:
+        async with self._turn:
+            if self._recording is None:
+                raise Refused("nothing is being recorded")
+            await self._recording.stop()
+            return {"name": self._file}
+
+    async def _write_ring(self, _: Nothing) -> dict[str, Any]:
+        if self._ring is None:
+            raise Refused("this recorder has no ring: it is begun with --ring 60s")
+        self._ring.signal(signal.SIGUSR1)
+        return {}
+
+    async def _play(self, said: Replay) -> dict[str, Any]:
+        async with self._turn:
+            robots = await asyncio.to_thread(self._folder.robots, said.name)
+            if not robots:
+                raise Refused(f"{said.name} has no topics of robots")
+            if self._replay is not None:
+                await self._replay.stop()
+            names = {robot: self._service.first_replay + number for number, robot in enumerate(robots)}
+            words = ["replay", *self._service.mesh, "--loop", "--start", f"{said.start_s:.3f}s"]
+            words += [word for old, new in names.items() for word in ("--as-robot", f"{old}:{new}")]
+            words += ["--", str(self._folder.file(said.name))]
+            self._replay = playing = await Child.started(words, self._ended)
+            asyncio.get_running_loop().call_later(PLAYED_S, self._played_enough, playing)
+            as_robots = {str(old): new for old, new in names.items()}
+            self._replayed = {"name": said.name, "start_s": said.start_s, "robots": as_robots}
+            return self._replayed
+
+    async def _stop_playing(self, _: Nothing) -> dict[str, Any]:
+        async with self._turn:
+            if self._replay is None:
+                raise Refused("nothing is being played")
+            await self._replay.stop()
+            return {}
+
+    async def _happened(self, request: web.Request) -> web.Response:
+        async with self._reading:
+            try:
+                return _json(await asyncio.to_thread(self._folder.happened, request.match_info["name"]))
+            except MacsError as error:
+                return _json({"error": str(error)}, 404)
+
+    async def _file_of(self, request: web.Request) -> web.StreamResponse:
+        try:
+            path = await asyncio.to_thread(self._folder.file, request.match_info["name"])
+        except UsageError as error:
+            return _json({"error": str(error)}, 404)
+        return web.FileResponse(path, chunk_size=256 << 10)
+
+    # -- programs ------------------------------------------------------------------------------------------------
+
+    async def _begin(self, verb: str, words: Sequence[str], path: Path) -> Child:
+        words = [verb, *self._service.mesh, *words, "--json", "--progress", "-o", str(path)]
+        return await Child.started(words, self._ended)
+
+    def _played_enough(self, child: Child) -> None:
+        """Nobody looks at it any more, as likely as not."""
+        if child is self._replay:
+            child.signal(signal.SIGTERM)
+
+    def _ended(self, child: Child) -> None:
+        if child is self._recording:
+            self._recording = None
+            log.info("%s is recorded", self._file)
+        elif child is self._ring:
+            self._ring = None
+            if not self._closing:
+                self._problem = f"the ring has ended: {child.problem}"
+                log.error("%s", self._problem)
+        elif child is self._replay:
+            self._replay = None
+
+
+def _take_over(path: Path) -> None:
+    """Take away a socket that nobody serves any more. Raises UsageError: somebody does."""
+    probe = socket.socket(socket.AF_UNIX)
+    try:
+        probe.connect(str(path))
+    except ConnectionRefusedError:
+        path.unlink(missing_ok=True)
+    except FileNotFoundError:
+        pass
+    else:
+        raise UsageError(f"{path.parent} has a recorder already")
+    finally:
+        probe.close()
+
+
+def _json(document: dict[str, Any], status: int = 200) -> web.Response:
+    return web.Response(body=msgspec.json.encode(document), content_type="application/json", status=status)
