@@ -1,4 +1,5 @@
-"""The mesh, live in Foxglove: ``live`` is what its server shows and what its clients ask for, ``program`` runs it.
+"""The mesh, live in Foxglove: ``live`` is what its server shows, ``publishing`` what its clients publish, ``relay``
+the door before it: whose page asks, by which token.
 
 The server is Foxglove's own SDK (extra ``foxglove``), which gets bytes as they come and decodes nothing.
 """

@@ -41,14 +41,18 @@ KEPT = 4096
 class Live(ServerListener):  # type: ignore[misc, unused-ignore]  # of a checkout without the SDK
     """One server for one mesh. The SDK calls in threads of its own; all else belongs to the loop."""
 
-    def __init__(self, agent: Agent, wanted: Wanted, *, publishes: bool) -> None:
-        """``publishes``: clients may publish and call services, which may move robots."""
+    def __init__(self, agent: Agent, wanted: Wanted, *, secret: str | None) -> None:
+        """``secret``: clients that say they will publish to a channel of this name may publish and call services,
+        which may move robots; None: nobody may."""
         self.recorder = Recorder(agent, self, wanted)
         self.recorder.demand = self._is_demanded
         self.recorder.on_offered = self._offered
         self.shown = 0
         self._agent = agent
-        self._publishes = publishes
+        self._publishes = secret is not None
+        self._secret = secret
+        self._trusted: dict[int, int] = {}
+        """Clients that know the secret, and the channel in which they said so. In the SDK's threads."""
         self._loop = asyncio.get_running_loop()
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
@@ -208,12 +212,17 @@ class Live(ServerListener):  # type: ignore[misc, unused-ignore]  # of a checkou
 
     def on_client_advertise(self, client: Any, channel: Any) -> None:
         """Somebody will publish."""
+        if self._secret is not None and channel.topic == self._secret:
+            self._trusted[client.id] = channel.id
+            return
         key, said = (client.id, channel.id), (channel.topic, channel.schema_name or "", channel.encoding)
-        if self._publishes:  # whatever the SDK lets through
+        if client.id in self._trusted:  # whatever the SDK lets through
             self._from_thread(self._published.advertise, key, *said)
 
     def on_client_unadvertise(self, client: Any, client_channel_id: int) -> None:
         """No more."""
+        if self._trusted.get(client.id) == client_channel_id:  # it has gone
+            del self._trusted[client.id]
         self._from_thread(self._published.unadvertise, (client.id, client_channel_id))
 
     def on_message_data(self, client: Any, client_channel_id: int, data: bytes) -> None:
@@ -225,6 +234,8 @@ class Live(ServerListener):  # type: ignore[misc, unused-ignore]  # of a checkou
             self._loop.call_soon_threadsafe(callback, *args)
 
     def _called(self, request: Any) -> bytes:
+        if request.client_id not in self._trusted:
+            raise PermissionError("calls come through the relay")
         robot, service, of_type = self._services[request.service_name]
         calling = asyncio.run_coroutine_threadsafe(
             self._agent.call_service(service, bytes(request.payload), robot=robot, type=of_type, timeout_s=CALL_S),
