@@ -248,7 +248,7 @@ class Relay:
             if why is None:
                 await there.send_bytes(data)
                 return
-            self.drops.once("not_allowed", "a call of %s is refused: %s", service, why)
+            self.drops.once("client_not_allowed", "a call of %s is refused: %s", service, why)
             call = int.from_bytes(data[5:9], "little")
             failure = {"op": "serviceCallFailure", "serviceId": number, "callId": call, "message": why}
             await client.here.send_str(json.dumps(failure))
@@ -267,7 +267,7 @@ class Relay:
         return grant.rights.of_registration(node, [robot], [])
 
     async def _refuse(self, client: _Client, topic: str, why: str) -> None:
-        self.drops.once("not_allowed", "%s is not published to: %s", topic, why)
+        self.drops.once("client_not_allowed", "%s is not published to: %s", topic, why)
         status = {"op": "status", "level": 1, "message": f"{topic[:200]}: {why}", "id": topic[:200]}
         await client.here.send_str(json.dumps(status))
 

@@ -39,7 +39,7 @@ class Record:
         """A token has changed."""
         self._audit.record(event, who(token=name))
 
-    def note(self, event: str, by: Mapping[str, str], what: str, result: str) -> None:
+    def other(self, event: str, by: Mapping[str, str], what: str, result: str) -> None:
         """Something else was done, or not: by whom, and what of it."""
         self._audit.record(event, by, what, result)
 

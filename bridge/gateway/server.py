@@ -249,9 +249,9 @@ class Gateway:
         waiting = {"waiting_for_id": self._entry.waiting} if self._entry.longest_s > NAMED_S else {}
         return {**waiting, **self._record.troubles()}
 
-    def note(self, event: str, by: Mapping[str, str], what: str = "", result: str = "done") -> None:
+    def keep_record(self, event: str, by: Mapping[str, str], what: str = "", result: str = "done") -> None:
         """Note in the record of who did what, if one is kept, what was done at the web port."""
-        self._record.note(event, by, what, result)
+        self._record.other(event, by, what, result)
 
     async def close(self) -> None:
         """Stop accepting, tell the mesh, send what waits for ``FLUSH_S`` at most, leave."""

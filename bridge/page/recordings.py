@@ -76,14 +76,14 @@ class Recordings:
     async def _ordered(self, request: web.Request, visitor: Grant) -> web.StreamResponse:
         what = request.match_info["what"]
         by = who(address=self._site.host_of(request), token=visitor.name)
-        note = self._site.gateway.note
+        keep_record = self._site.gateway.keep_record
         if not may_record(visitor):
-            note("recording", by, what, MISSING)
+            keep_record("recording", by, what, MISSING)
             return _refused()
         body = await request.read()
         self._site.goes_on(request)
         answer = await self._ask("POST", f"/{what}", body, request)
-        note("recording", by, what, "done" if answer.status == 200 else answer.reason or "refused")
+        keep_record("recording", by, what, "done" if answer.status == 200 else answer.reason or "refused")
         log.info("%s asked the recorder to %s: %s", visitor.name or self._site.host_of(request), what, answer.status)
         return answer
 
@@ -131,7 +131,7 @@ class Recordings:
             error = {"error": f"{DOWNLOADS} downloads go on already"}
             return web.json_response(error, status=503, headers={"Retry-After": "10"})
         by = who(address=self._site.host_of(request), token=visitor.name)
-        self._site.gateway.note("recording", by, f"download {name}")
+        self._site.gateway.keep_record("recording", by, f"download {name}")
         self._downloads += 1
         try:
             return await self._passed_on(request, name)
