@@ -16,7 +16,9 @@ from .protocol.messages import decode_data
 from .protocol.robot_state import Offered
 
 HELD_BYTES = 1 << 20
-"""Of one topic of one robot. The newest message is held whatever its size."""
+"""Of one topic of one robot. Its newest message is held if it is larger as well."""
+HELD_IN_ALL_BYTES = 16 << 20
+"""Of all topics of one agent. What is heard beyond that is not held."""
 
 
 class HasData(Protocol):
@@ -29,23 +31,47 @@ class HasData(Protocol):
 Message = TypeVar("Message", bound=HasData)
 
 
+class Room:
+    """What all topics of an agent hold together."""
+
+    def __init__(self, limit_bytes: int = HELD_IN_ALL_BYTES) -> None:
+        self.limit_bytes = limit_bytes
+        self.bytes = 0
+
+
 class Held(Generic[Message]):
     """The newest messages of one topic of one robot, as many as the deepest of its subscriptions takes."""
 
-    def __init__(self) -> None:
+    def __init__(self, room: Room) -> None:
+        self._room = room
         self._messages: deque[Message] = deque()
         self._bytes = 0
 
     def put(self, message: Message, depth: int) -> None:
         """One more; the oldest go."""
-        self._messages.append(message)
-        self._bytes += len(message.data)
-        while len(self._messages) > depth or (self._bytes > HELD_BYTES and len(self._messages) > 1):
-            self._bytes -= len(self._messages.popleft().data)
+        messages = self._messages
+        messages.append(message)
+        self._count(len(message.data))
+        while len(messages) > depth or (self._bytes > HELD_BYTES and len(messages) > 1):
+            self._drop()
+        while messages and self._room.bytes > self._room.limit_bytes:
+            self._drop()
 
     def newest(self, depth: int) -> list[Message]:
         """As many of them as one subscription takes, the newest last."""
         return list(self._messages)[-depth:]
+
+    def clear(self) -> None:
+        """Hold nothing any more."""
+        while self._messages:
+            self._drop()
+
+    def _drop(self) -> None:
+        self._count(-len(self._messages.popleft().data))
+
+    def _count(self, size: int) -> None:
+        self._bytes += size
+        self._room.bytes += size
 
 
 def latches(answer: bytes, topic: str) -> bool:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from msgspec import structs
 
 from .errors import CallTimeout, Closed, MacsError, Refused, Unreachable, UsageError, WireError
-from .held import Held, latches
+from .held import Held, Room, latches
 from .mesh import Sample
 from .mesh import Subscription as Declared
 from .protocol.directory import Change
@@ -101,6 +101,7 @@ class Nodes:
         self._tasks: set[asyncio.Task[None]] = set()
         self._logged: set[tuple[NodeKey, int, str]] = set()
         self._closed = False
+        self._held = Room()
         self._calls = RobotCalls(
             agent.mesh,
             agent.directory,
@@ -343,7 +344,7 @@ class Nodes:
         node.users.remove(user)
         if not node.users:
             self._nodes.pop(node.key, None)
-            node.held.clear()
+            node.let_go()
         gone = sorted(user.robots - node.robots), sorted(user.groups - node.groups)
         if not self._closed and any(gone):
             self._calls.register(RemoveNode(*self.agent.key, *node.key), *gone)
@@ -359,7 +360,7 @@ class Nodes:
                 if (stream := self._streams.pop((robot, name), None)) is not None:
                     stream.close()
                 if (node := self._nodes.get((NodeType.SUBSCRIBER, name))) is not None:
-                    node.held.pop(robot, None)
+                    node.let_go(robot)
             elif (robot, name) not in self._streams:
                 key = STREAM.of(type=ROS, id=robot, node=name)
                 take = partial(self._take_data, robot, name)
@@ -382,7 +383,7 @@ class Nodes:
         """For subscriptions that come later."""
         held = node.held.get(robot)
         if held is None:
-            held = node.held[robot] = Held()
+            held = node.held[robot] = Held(self._held)
         for message in messages:
             held.put(message, node.wanted.buffer_size)
 
@@ -459,7 +460,7 @@ class Nodes:
             for node in self._nodes.values():
                 node.confirmed.discard(change.agent.id)
                 node.refused.pop(change.agent.id, None)
-                node.held.pop(change.agent.id, None)  # it gives anew what it holds
+                node.let_go(change.agent.id)  # it gives anew what it holds
                 node.changed.set()
             if not change.online:
                 for (robot, _, _), answer in self._open.items():

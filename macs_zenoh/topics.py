@@ -94,6 +94,12 @@ class Node:
     def groups(self) -> set[int]:
         return {group for user in self.users for group in user.groups}
 
+    def let_go(self, robot: int | None = None) -> None:
+        """What was heard last of a robot, or of all, is not held any more."""
+        for each in list(self.held) if robot is None else [robot]:
+            if (held := self.held.pop(each, None)) is not None:
+                held.clear()
+
 
 class NodeUser:
     """One use of an interface node, until `close`."""
