@@ -7,7 +7,6 @@ import json
 import signal
 import socket as socketlib
 import sys
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack
 
@@ -195,9 +194,7 @@ async def test_ls_does_not_wait_for_a_robot_that_is_stuck(router: str, start_rob
     """It is listed with a question mark, and for programs with the problem; the others tell their state."""
     stuck, well = await start_robot(1), await start_robot(2)
     stuck.silent_for = 1000
-    began = time.monotonic()
-    listed = await macs("ls", "--json", "-e", router)
-    assert time.monotonic() - began < 10, "1 s for the answer, and the start of a program on a busy machine"
+    listed = await asyncio.wait_for(macs("ls", "--json", "-e", router), PATIENCE_S)
     assert [row["problem"] for row in listed] == ["no answer within 1 s", ""]
     assert listed[0]["status"] is None
     assert listed[1]["status"]["ros_node"] == "/r"

@@ -255,7 +255,7 @@ async def test_a_check_without_a_router_gives_up(tmp_path: Path) -> None:
     code, out, errors = await ended(
         "security", "check", str(plan_file), "--dir", str(found.directory), "-e", nowhere, "--timeout", "1"
     )
-    assert time.monotonic() - began < 10, "1 s, and the start of a program on a busy machine"
+    assert time.monotonic() - began < PATIENCE_S
     assert (code, out) == (1, "")
     assert errors == f"macs security: {nowhere} cannot be reached: nobody listens there, tried for 1 s\n"
 
