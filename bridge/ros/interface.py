@@ -106,6 +106,8 @@ class Robot:
     refusals: Refusals = field(default_factory=Refusals)
     audit: Audit = NO_AUDIT
     tracing: Tracing | None = None
+    made: dict[str, str] = field(default_factory=dict)
+    """Topics that our own node publishes for others, with their types."""
 
     def tell_refused(self, message: Message, topic: str, kind: str, reason: str) -> None:
         """Tell a message's sender why it was not taken; ``kind`` is the name under which that is counted."""

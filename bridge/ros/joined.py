@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from functools import partial
 
 from bridge import link_bytes
 from bridge.ros.agent import STOP_MESSAGES_S, RobotAgent
+from bridge.ros.pictures import Pictures, check_installed
 from bridge.ros.safety import EmergencyStop
 from bridge.ros.side import Side
 from bridge.settings import Settings
@@ -16,6 +18,7 @@ from macs_zenoh import joining, managers
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.guard import Guard, Limits
 from macs_zenoh.protocol.keyexpr import type_number
+from macs_zenoh.protocol.messages import NodeType
 from macs_zenoh.protocol.wire import Layout
 
 log = logging.getLogger("macs.ros")
@@ -34,9 +37,10 @@ async def joined(
 
     ``mesh``: over this one, which is open already.
 
-    Raises ConfigError; what `macs_zenoh.join` raises.
+    Raises ConfigError, MissingExtra; what `macs_zenoh.join` raises.
     """
     robot = settings.robot
+    check_installed(robot)
     own = managers.load(robot.managers)
     guard = Guard(
         Limits(
@@ -57,9 +61,24 @@ async def joined(
         link_bytes.tell_of(agent.mesh)
         ros_agent = RobotAgent(agent, session, robot, own, guard, emergency_stop)
         await ros_agent.start()
+        pictures = Pictures(ros_agent.nodes.robot, partial(_tell, asyncio.get_running_loop(), ros_agent))
+        pictures.start()
         log.info("robot %d serves %s", agent.id, session.full_name)
         try:
             yield ros_agent
         finally:
+            await pictures.close()
             await ros_agent.close()
             await asyncio.sleep(STOP_MESSAGES_S)
+
+
+def _tell(loop: asyncio.AbstractEventLoop, robot: RobotAgent, topic: str, kind: str, reason: str) -> None:
+    """Tell who registered for a topic what is wrong with it. From any thread."""
+
+    def tell() -> None:
+        for node in robot.nodes:
+            if node.NODE_TYPE == NodeType.SUBSCRIBER and node.topic == topic:
+                node.tell_registrants(kind, reason)
+
+    with suppress(RuntimeError):  # the loop has ended
+        loop.call_soon_threadsafe(tell)

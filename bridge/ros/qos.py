@@ -38,6 +38,11 @@ def for_subscription(publishers: Iterable[Qos], depth: int) -> Qos:
     )
 
 
+def best_effort(depth: int) -> Qos:
+    """What matches every publisher, but asks none for its last messages."""
+    return Qos(depth=depth, reliability=Reliability.BEST_EFFORT, durability=Durability.VOLATILE)
+
+
 def for_publisher(subscriptions: Iterable[Qos], depth: int, *, latched: bool) -> Qos:
     """What a publisher must offer to match all ``subscriptions``.
 

@@ -33,6 +33,19 @@ TopicOrNone = Annotated[
 ]
 
 
+class AsJpeg(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How pictures are made of a raw image topic."""
+
+    section: ClassVar[str] = "robot.rules.as_jpeg"
+
+    quality: Annotated[int, Meta(ge=1, le=100)] = 80
+    """Of JPEG."""
+    max_width: Annotated[int, Meta(ge=0, le=65_535)] = 0
+    """In pixels: of wider images groups of 2 x 2, 3 x 3 and so on become one each. 0: as they are."""
+    max_hz: Annotated[float, Meta(gt=0, le=1000)] = 30.0
+    """At most so many pictures per second, the latest."""
+
+
 class TopicRule(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What holds for topics, services and actions whose full name fits a pattern; one ``[[robot.rules]]`` table.
 
@@ -57,6 +70,9 @@ class TopicRule(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     cache: Annotated[int, Meta(ge=1, le=100_000)] | None = None
     """Topic data to headsets: keep the last so many messages, and send those again that a gateway missed while the
     mesh was interrupted (docs/reliable.md). It has nothing to do with ROS QoS, and wins over a `TrafficRule`."""
+    as_jpeg: AsJpeg | None = None
+    """Of a topic of sensor_msgs/Image: pictures of it on ``<name>/compressed``, made while somebody takes them. Needs
+    ``macs-zenoh[jpeg]``. ``as_jpeg = {}`` takes the defaults."""
     read_only: bool | None = None
     """Headsets may subscribe to the topic, not publish to it."""
 
