@@ -248,9 +248,6 @@ class _Nobody:
     def forget(self, node: object) -> None:
         """It holds nothing."""
 
-    def time_of_command(self, agents: Collection[int], groups: Collection[int]) -> tuple[int, str]:
-        raise NotImplementedError
-
 
 @dataclass(frozen=True)
 class GoalWish:

@@ -3,9 +3,10 @@
 Publishes a generated camera picture on ``/camera/image/compressed`` (sensor_msgs/CompressedImage, 10 Hz, best effort
 as cameras are), how far away what it shows is on ``/camera/depth`` (sensor_msgs/Image, 5 Hz), where it is on ``/pose``
 (geometry_msgs/PoseStamped, 20 Hz), a turret that swings on ``/turret/pose``, its ``/battery``
-(sensor_msgs/BatteryState), and once, for all who come, the ``/map`` of its floor (nav_msgs/OccupancyGrid). Drives as
-``/cmd_vel`` (geometry_msgs/Twist) says, and stops half a second after the last command. Serves ``/set_lights``
-(std_srvs/SetBool), which the picture shows.
+(sensor_msgs/BatteryState), and once, for all who come, the ``/map`` of its floor (nav_msgs/OccupancyGrid); while
+somebody takes them, what a laser and its joints show (`demo_topics`). Drives as ``/cmd_vel`` (geometry_msgs/Twist)
+says, and stops half a second after the last command. Serves ``/set_lights`` (std_srvs/SetBool), which the picture
+shows.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from std_srvs.srv import SetBool
 
 from bridge.logs import log_to_stderr
 from bridge.ros.demo_scene import CELL_M, MAP_M, Scene, floor_map
+from bridge.ros.demo_topics import Senses
 from bridge.ros.session import why
 
 log = logging.getLogger("macs.demo")
@@ -125,9 +127,13 @@ class DemoRobot:
         node.create_timer(1 / DEPTH_HZ, self._publish_depth)
         node.create_timer(1 / TURRET_HZ, self._publish_turret)
         node.create_timer(1 / BATTERY_HZ, self._publish_battery)
+        self._senses = Senses(node, self._robot, self._turret_angle)
 
     def _now_s(self) -> float:
         return float(self._node.get_clock().now().nanoseconds) / 1e9
+
+    def _turret_angle(self) -> float:
+        return math.sin(self._now_s() / 2)
 
     def _drive(self, twist: Any) -> None:
         self._robot.move(self._now_s())
@@ -197,7 +203,7 @@ class DemoRobot:
         return message
 
     def _publish_turret(self) -> None:
-        angle = math.sin(self._now_s() / 2)
+        angle = self._turret_angle()
         message = PoseStamped()
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.header.frame_id = "base_link"
@@ -263,7 +269,9 @@ def _run(node: Any, *, alone: bool, on_ready: Callable[[], None]) -> int:
         log.error("another node of this ROS domain takes %s: it would drive, too", COMMANDS)
         return 1
     on_ready()
-    log.info("demo robot: pictures on /camera/…, /pose, /battery; drive it on /cmd_vel; service /set_lights")
+    log.info(
+        "demo robot: pictures on /camera/…, /pose, /scan, /points, /map, /battery; driven on /cmd_vel; /set_lights"
+    )
     rclpy.spin(node)
     return 0
 

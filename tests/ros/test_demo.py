@@ -12,15 +12,16 @@ import zlib
 from collections.abc import AsyncIterator
 from typing import Any
 
+import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, Twist
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import CompressedImage, JointState, LaserScan, PointCloud2
 from std_srvs.srv import SetBool
 
-from bridge.ros import graph
+from bridge.ros import demo_senses, graph
 from bridge.ros.demo import Battery, Unicycle
-from bridge.ros.demo_scene import Scene
+from bridge.ros.demo_scene import PILLARS, Scene
 from tests.support.ros_peer import Peer
 from tests.support.waiting import PATIENCE_S, get
 
@@ -164,3 +165,38 @@ async def _call(peer: Peer, kind: type[Any], name: str, request: Any) -> Any:
 
     await peer.session.run(ask)
     return await asyncio.wait_for(answered, PATIENCE_S)
+
+
+def test_what_its_laser_measures_is_where_pillars_are() -> None:
+    """From anywhere each ray ends on the edge of a pillar or nowhere, and so do the points."""
+    robot = Unicycle()
+    for robot.x, robot.y, robot.heading in ((0.0, 0.0, 0.0), (4.0, -2.0, 1.0), (-7.0, 5.0, -2.5)):
+        distance, which = demo_senses.scan(robot)
+        for number in np.flatnonzero(np.isfinite(distance)):
+            angle = robot.heading + demo_senses.FIRST_RAD + number * demo_senses.STEP_RAD
+            at = robot.x + distance[number] * math.cos(angle), robot.y + distance[number] * math.sin(angle)
+            pillar = PILLARS[which[number]]
+            assert math.dist(at, (pillar.x, pillar.y)) == pytest.approx(pillar.radius, abs=1e-3)
+        points = demo_senses.points(robot)
+        assert 20 < len(points) < 2000
+        assert np.isfinite(points[:, :3]).all()
+
+
+def test_wheels_turn_as_it_drives() -> None:
+    """A metre ahead is ten turns of a wheel's radius; turning to the left the right one goes ahead."""
+    wheels = demo_senses.Wheels()
+    wheels.roll(1.0, 0.0, 1.0)
+    assert (wheels.left, wheels.right) == pytest.approx((10.0, 10.0))
+    wheels.roll(0.0, 1.0, 1.0)
+    assert wheels.right - wheels.left == pytest.approx(5.0)
+
+
+async def test_it_shows_more_than_pictures(demo: Any, peer: Peer) -> None:
+    """Scan, points and joints, each as programs that draw them expect."""
+    scan = await get(await peer.subscription(LaserScan, "/scan", qos_profile_sensor_data))
+    assert len(scan.ranges) == demo_senses.RAYS
+    assert scan.angle_min + scan.angle_increment * (len(scan.ranges) - 1) == pytest.approx(scan.angle_max, abs=1e-4)
+    cloud = await get(await peer.subscription(PointCloud2, "/points", qos_profile_sensor_data))
+    assert len(cloud.data) == cloud.row_step == cloud.width * cloud.point_step
+    joints = await get(await peer.subscription(JointState, "/joint_states"))
+    assert len(joints.name) == len(joints.position) == 3
