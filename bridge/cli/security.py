@@ -7,12 +7,16 @@ good, renews certificates with less than a third of their life left, and names w
 `check` proves by trying, against running routers, that each may do what the policy says and nothing else.
 docs/security.md has the policy's fields and what to do when something is stolen.
 
+`headset` prints how a headset's browser reaches the page /xr so that it gives it WebXR: addresses, a certificate for
+the web port, and what to do on the headset (docs/webxr.md).
+
 examples:
   macs security generate site.yaml --into pki
   macs security generate site.yaml --into pki --at /etc/macs       where the files will be on their machines
   macs security generate site.yaml --into pki --renew robot-7
   macs security check site.yaml --dir pki
   macs security check site.yaml --dir pki -e tls/10.0.0.5:7447 --json
+  macs security headset --into page-pki
 
 what it prints:
   robot-7: certificate made, new, until 2027-02-26                                   of generate
@@ -28,7 +32,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bridge.cli import output, running, terminal
+from bridge.cli import headset_ways, output, running, terminal
 from bridge.cli.terminal import BAD, Block
 
 if TYPE_CHECKING:
@@ -53,6 +57,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     generate.add_argument("--new-ca", action="store_true", help="a new authority: all certificates so far end")
     generate.add_argument("--json", action="store_true", help="for programs")
+    headset = verbs.add_parser(
+        "headset", help="how a headset's browser reaches /xr", description=headset_ways.run.__doc__
+    )
+    headset_ways.add_arguments(headset)
     check = verbs.add_parser("check", help="try everything on running routers", description=_check.__doc__)
     check.add_argument("policy", metavar="POLICY", help="the policy (YAML)")
     check.add_argument("--dir", required=True, metavar="DIR", help="what `generate` wrote")
@@ -67,6 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.what == "headset":
+        return headset_ways.run(args)
     return _generate(args) if args.what == "generate" else _check(args)
 
 
