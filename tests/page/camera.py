@@ -13,6 +13,8 @@ import rclpy
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CompressedImage, Image
 
+from bridge.cli.running import say_ready
+
 
 def main() -> int:
     """Until it is killed."""
@@ -47,6 +49,7 @@ def main() -> int:
         node.create_timer(1 / hz, publish)
     if raw_hz:
         node.create_timer(1 / raw_hz, publish_raw)
+    say_ready("camera")
     rclpy.spin(node)
     return 0
 

@@ -137,16 +137,17 @@ class Headset:
         """Hold until the robot is told to go; anew where a busy machine let the scene stand still."""
         heard.speeds.clear()
 
-        async def told() -> bool:
+        while not (len(heard.speeds) > 3 and heard.last):
             if not await self.state("held"):
                 await let_go()
-                await until(lambda: self.state("barred === ''"))
+                await until(lambda: self.state("held === false && macsXr.telling.state.barred === ''"))
                 await self.frame()
                 await take()
-                await asyncio.sleep(0.1)
-            return len(heard.speeds) > 3 and heard.last is not None and heard.last > 0
-
-        await until(told, every_s=0.05)
+            # it is told that it drives, or not: both take a moment
+            for _ in range(40):
+                await asyncio.sleep(0.05)
+                if len(heard.speeds) > 3 and heard.last:
+                    break
 
     async def frame(self, count: int = 2) -> None:
         """Wait until the scene has had so many frames."""
