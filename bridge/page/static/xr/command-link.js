@@ -110,9 +110,9 @@ export class CommandLink {
     const was = this.#hold.held;
     const began = this.#hold.input(sample, performance.now());
     if (was && !this.#hold.held) this.#ended();
+    const due = this.#hold.held && performance.now() - this.#sentAt >= 1000 / this.#settings.hz - 2;
     if (began) this.#report();
-    if (began) this.#tick();
-    else if (this.#hold.held && performance.now() - this.#sentAt >= 1000 / this.#settings.hz - 2) this.#tick();
+    if (began || due) this.#tick();
     if (poses) this.#sendPoses(poses, at);
   }
 
