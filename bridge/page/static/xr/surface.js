@@ -1,6 +1,6 @@
 /** What panels are made of: a bent rectangle, and a canvas that is drawn anew only when what it says has changed. */
 
-import { BufferAttribute, CanvasTexture, LinearFilter, Mesh, MeshBasicMaterial, PlaneGeometry, SRGBColorSpace } from "../vendor/three.js";
+import { CanvasTexture, Mesh, MeshBasicMaterial, PlaneGeometry, SRGBColorSpace } from "../vendor/three.js";
 import { COLOURS } from "./stage.js";
 
 const MOST_BEND = 1.7;
@@ -39,8 +39,7 @@ export class Sheet {
     this.context = this.canvas.getContext("2d");
     this.texture = new CanvasTexture(this.canvas);
     this.texture.colorSpace = SRGBColorSpace;
-    this.texture.minFilter = LinearFilter;
-    this.texture.generateMipmaps = false;
+    this.texture.anisotropy = 4; // text is read from the side as well, and from afar
     this.material = new MeshBasicMaterial({ map: this.texture, transparent: true, toneMapped: false });
     this.mesh = new Mesh(bent(width, height, curve, placed), this.material);
   }
@@ -114,5 +113,3 @@ export function wrapped(context, text, width, most) {
 export function tone(name) {
   return COLOURS[name] ?? COLOURS.text;
 }
-
-export { BufferAttribute };
