@@ -137,3 +137,38 @@ async def test_a_robot_whose_nodes_do_not_come_back(site: Site) -> None:
 
         await until(comes, PATIENCE_S, every_s=0.05)
     listening.cancel()
+
+
+async def test_a_router_of_the_robot_s_own(tmp_path: Path) -> None:
+    """Where the nodes have another router than the mesh, and it is killed, the robot is offline while it is away; the
+    agent that had registered hears it again, and each message once."""
+    async with AsyncExitStack() as stack:
+        enter = stack.enter_async_context
+        own, mesh = await enter(Router()), await enter(Router())
+        settings = tmp_path / "robots.toml"
+        settings.write_text(f'[rmw_zenoh]\nconnect = ["{own.endpoint}"]\n{SETTINGS}', encoding="utf-8")
+        await enter(Program("rmw-zenoh", "--settings", str(settings), "-e", mesh.endpoint))
+        gateway = await enter(Program("gateway", "--port", "0", "-e", mesh.endpoint))
+        headset = await enter(await Headset.connect("127.0.0.1", gateway.port))
+        node = await enter(ros.node("logger", connect=[own.endpoint]))
+        log = node.publisher("/log", INT, qos=HELD)
+        heard: list[int] = []
+        listening = take(await headset.subscribe("/log", INT, agents=[7], buffer_size=MANY), heard)
+        log.publish(numbered(0))
+        await until(lambda: heard, PATIENCE_S)
+
+        async def online() -> bool:
+            return 7 in (await headset.online()).ros_agent_ids
+
+        async def offline() -> bool:
+            return not await online()
+
+        await own.stop(signal.SIGKILL)
+        await until(offline, PATIENCE_S)
+        for number in range(1, 50):
+            log.publish(numbered(number))
+        await own.start()
+        await until(online, PATIENCE_S)
+        await until(lambda: heard[-1:] == [49], PATIENCE_S)
+        assert heard == list(range(50))
+        listening.cancel()
