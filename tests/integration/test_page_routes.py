@@ -117,7 +117,7 @@ async def test_without_libraries_the_page_says_what_to_do(
     start_gateway: StartGateway, session: aiohttp.ClientSession, monkeypatch: pytest.MonkeyPatch, there: bool
 ) -> None:
     """Where nothing was fetched from npm the page is one line that names the command; else it is the page."""
-    monkeypatch.setattr(files, "missing", lambda found: not there)
+    monkeypatch.setattr(files, "missing", lambda found, *wanted: not there)
     one = Browser(session, await start_gateway(web_port=0))
     text = await (await one.get("/")).text()
     assert ("make page" in text) is not there
