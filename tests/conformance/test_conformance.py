@@ -78,7 +78,7 @@ async def judged_headset(fault: Fault | None = None) -> list[Verdict]:
         await program.stop()
 
 
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(500)
 async def test_right_and_wrong_headsets_are_told_apart() -> None:
     """Our headset passes everything; with one fault of the table it fails the check that is meant for it."""
     names = list(client_faults.FAULTS)
@@ -108,7 +108,7 @@ async def judged_gateway(port: int, fault: Fault, group: int) -> list[Verdict]:
         return await gateway.judge("127.0.0.1", proxy.port, patience_s=3, most_s=150, group=group)
 
 
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(500)
 async def test_right_and_wrong_routers_are_told_apart(real_gateway: int) -> None:
     """Our gateway passes everything; with one fault of the table it fails the check that is meant for it."""
     right = await gateway.judge("127.0.0.1", real_gateway, patience_s=PATIENCE_S, most_s=150)
