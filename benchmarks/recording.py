@@ -28,7 +28,7 @@ from .recorded_robot import TOPICS
 ROBOTS = 3
 IMAGE, IMAGE_HZ = 900_000, 30.0
 SMALL, SMALL_HZ = 100, 2000.0
-SECONDS = 20.0
+SECONDS = 15.0
 BESIDE = 1.2
 """So many times as long a message may take beside a recording."""
 QUIET_S = 2.0
