@@ -36,8 +36,11 @@ class Doors:
         self._again: set[str] = set()
         self._known: dict[str, tuple[str, str]] = {}
 
-    def token(self, agent: str) -> str:
-        """The name of the token by which an agent (``unity/256``) came; empty where none is known."""
+    async def token(self, agent: str) -> str:
+        """The name of the token by which an agent (``unity/256``) came; empty where none is known, once gateways that
+        are being asked have answered."""
+        if agent not in self._known and self._asking:
+            await asyncio.wait(list(self._asking.values()), timeout=PAUSE_S + ANSWER_S)
         return self._known.get(agent, ("", ""))[0]
 
     def came(self, agent: AgentInfo) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 
 import msgspec
 
@@ -47,7 +47,7 @@ class SentCommands:
         sink: Sink,
         schemas: Schemas,
         robots: Mapping[int, RobotFollower],
-        token: Callable[[str], str] = lambda sender: "",
+        token: Callable[[str], Awaitable[str]] | None = None,
     ) -> None:
         self._sink = sink
         self._schemas = schemas
@@ -124,7 +124,7 @@ class SentCommands:
         robots = [meant] if meant is not None else list(self._robots.values())[:ASKED]
         topic = robots[0].topic_of(sent.node) if robots else "/" + sent.node.removeprefix("nd_").removeprefix("_")
         metadata = {"robot": sent.to, "sender": sent.sender, "as": "sent", "topic": topic, "node": sent.node}
-        if token := self._token(sent.sender):
+        if self._token is not None and (token := await self._token(sent.sender)):
             metadata["token"] = token
         name, of_type = command_topic(sent.sender, sent.to, topic), full_type(sent.type)
         for follower in robots:

@@ -66,7 +66,11 @@ class Kept:
 async def test_commands_have_it_beside_them() -> None:
     """The channel of what a headset sent names its token; of one that is not known nothing."""
     kept = Kept()
-    commands = SentCommands(kept, Schemas(None), {}, {"unity/256": "anna"}.get)  # type: ignore[arg-type]
+
+    async def token(sender: str) -> str:
+        return "anna" if sender == "unity/256" else ""
+
+    commands = SentCommands(kept, Schemas(None), {}, token)  # type: ignore[arg-type]
     for sender in ("unity/256", "unity/257"):
         commands.put(Sent(sender, "7", "nd__cmd_vel", "geometry_msgs/Twist", bytes(52)), 1)
     await until(lambda: len(kept.entries) == 2)
