@@ -13,7 +13,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import macs_zenoh
-from bridge.ros.definitions import Definitions, _written
+from bridge.ros.definitions import Definitions, Telling, _written
 from macs_zenoh import robot_types
 from macs_zenoh.agent import Agent
 from macs_zenoh.protocol.limits import ANSWER_BYTES
@@ -144,6 +144,7 @@ def test_a_type_without_a_text_is_written_from_its_class(kinds: Any) -> None:
 
 
 async def test_many_asking_at_once(agent: Agent) -> None:
-    """Each gets the same."""
-    told = await asyncio.gather(*(asked(agent, "geometry_msgs/msg/PoseStamped") for _ in range(16)))
+    """As many as may wait of one sender: each gets the same."""
+    asking = (asked(agent, "geometry_msgs/msg/PoseStamped") for _ in range(Telling.EACH))
+    told = await asyncio.gather(*asking)
     assert all(each == told[0] for each in told)
