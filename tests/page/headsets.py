@@ -40,6 +40,11 @@ device.position.set(0, 1.6, 0.2);
 window.device = device;
 """
 PICTURES = "/test/picture"
+PATIENT_ROBOT = """
+[robot]
+max_timed_command_age_s = 10.0
+"""
+"""Where a test is not about it: on a busy machine commands get old."""
 PATIENT = {"lockoutS": 5}
 """Settings of tests that are about something else: a machine that draws by its processor is slow at times."""
 

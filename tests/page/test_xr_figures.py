@@ -22,8 +22,8 @@ pytest.importorskip("rclpy")
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
 
-from tests.page.conftest import Site
-from tests.page.headsets import Headset, headset_at, needs_headset, with_webgl
+from tests.page.conftest import Site, StartSite
+from tests.page.headsets import PATIENT_ROBOT, Headset, headset_at, needs_headset, with_webgl
 from tests.support.browser import needs_browser
 from tests.support.processes import Process
 from tests.support.ros_peer import Peer
@@ -47,6 +47,12 @@ JPEG = """async ([shade]) => {
   for (const byte of bytes) text += String.fromCharCode(byte);
   return btoa(text);
 }"""
+
+
+@pytest.fixture
+async def site(start_site: StartSite) -> Site:
+    """One whose robot is patient."""
+    return await start_site(rules=PATIENT_ROBOT)
 
 
 def part(values: Sequence[float], share: float) -> float:

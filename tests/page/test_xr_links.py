@@ -9,9 +9,9 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from tests.page.conftest import Site, StartSite
+from tests.page.conftest import ROBOT, Site, StartSite
 from tests.page.driving import heard_at
-from tests.page.headsets import Headset, headset_at, needs_headset, with_webgl
+from tests.page.headsets import PATIENT_ROBOT, Headset, headset_at, needs_headset, with_webgl
 from tests.support.browser import OFFLINE, needs_browser
 from tests.support.waiting import until
 
@@ -23,12 +23,19 @@ macsXr.links.addEventListener('link', ({ detail: { which, up, id, resumed } }) =
   macsXr.told.push({ which, up, id, resumed, at: performance.now() });
 });
 """
-HELD_LONG = """
+HELD_LONG = f"""
+{PATIENT_ROBOT}
 [[robot.rules]]
 match = "/cmd_vel"
 exclusive = true
 hold_s = 60.0
 """
+
+
+@pytest.fixture
+async def site(start_site: StartSite) -> Site:
+    """One whose robot is patient."""
+    return await start_site(rules=PATIENT_ROBOT + ROBOT)
 
 
 async def told(headset: Headset, which: str) -> list[dict[str, object]]:

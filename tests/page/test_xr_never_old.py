@@ -16,7 +16,7 @@ pytest.importorskip("rclpy")
 
 from tests.page.conftest import Act, Site, StartSite
 from tests.page.driving import heard_at
-from tests.page.headsets import PICTURES, Headset, Pictures, headset_at, needs_headset, with_webgl
+from tests.page.headsets import PATIENT_ROBOT, PICTURES, Headset, Pictures, headset_at, needs_headset, with_webgl
 from tests.support.browser import needs_browser
 from tests.support.waiting import until
 
@@ -29,7 +29,7 @@ LOCKOUT_S = float(os.environ.get("MACS_LOCKOUT_S", "1.0"))
 @pytest.fixture
 async def site(start_site: StartSite) -> Site:
     """One whose robot has no dead-man."""
-    return await start_site(rules="")
+    return await start_site(rules=PATIENT_ROBOT)
 
 
 def by_grip(headset: Headset) -> tuple[Act, Act]:

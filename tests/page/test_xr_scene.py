@@ -16,9 +16,9 @@ pytest.importorskip("rclpy")
 from geometry_msgs.msg import PoseArray, PoseStamped
 from sensor_msgs.msg import Joy
 
-from tests.page.conftest import Site
+from tests.page.conftest import ROBOT, Site, StartSite
 from tests.page.driving import Heard, heard_at
-from tests.page.headsets import Headset, about_up, headset_at, needs_headset, with_webgl
+from tests.page.headsets import PATIENT_ROBOT, Headset, about_up, headset_at, needs_headset, with_webgl
 from tests.support.browser import needs_browser
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
@@ -26,6 +26,12 @@ from tests.support.waiting import until
 pytestmark = [needs_browser, needs_headset]
 
 POSES = {"head": "/xr/head", "right": "/xr/right", "rightHand": "/xr/right/hand", "joy": "/xr/joy"}
+
+
+@pytest.fixture
+async def site(start_site: StartSite) -> Site:
+    """One whose robot is patient."""
+    return await start_site(rules=PATIENT_ROBOT + ROBOT)
 
 
 async def by_stick(headset: Headset, hand: str, x: float, y: float) -> None:
@@ -61,7 +67,7 @@ async def test_it_sees_and_drives(site: Site) -> None:
     async with with_webgl(site), heard_at(site) as heard:
         headset = await headset_at(site)
         await headset.ready()
-        await until(lambda: headset.state("maxAgeS === 0.2"))  # its commands tell when they were made
+        await until(lambda: headset.state("maxAgeS === 10"))  # its commands tell when they were made
         await headset.page.set_viewport_size({"width": 1280, "height": 760})
         await headset.frame(4)
         await headset.shot("screen")

@@ -32,6 +32,9 @@ export const COLOURS = {
   stop: "#d92d20",
 };
 
+/** Whether edges and text are drawn finely: where there are two processors, they draw it all. */
+export const FINE = (navigator.hardwareConcurrency ?? 8) > 2;
+
 const EYES_M = 1.6;
 const FLOOR_M = 24;
 
@@ -68,9 +71,7 @@ const FLOOR = {
 
 export class Stage {
   constructor(canvas) {
-    // where there are two processors, they draw
-    const antialias = (navigator.hardwareConcurrency ?? 8) > 2;
-    this.renderer = new WebGLRenderer({ canvas, antialias, alpha: true, powerPreference: "high-performance" });
+    this.renderer = new WebGLRenderer({ canvas, antialias: FINE, alpha: true, powerPreference: "high-performance" });
     this.renderer.setPixelRatio(Math.min(2, devicePixelRatio || 1));
     this.renderer.xr.enabled = true;
     this.renderer.xr.setReferenceSpaceType("local-floor");

@@ -1,7 +1,7 @@
 /** What panels are made of: a bent rectangle, and a canvas that is drawn anew only when what it says has changed. */
 
-import { CanvasTexture, Mesh, MeshBasicMaterial, PlaneGeometry, SRGBColorSpace } from "../vendor/three.js";
-import { COLOURS } from "./stage.js";
+import { CanvasTexture, LinearFilter, Mesh, MeshBasicMaterial, PlaneGeometry, SRGBColorSpace } from "../vendor/three.js";
+import { COLOURS, FINE } from "./stage.js";
 
 const MOST_BEND = 1.7;
 const COLUMNS = 32;
@@ -39,7 +39,12 @@ export class Sheet {
     this.context = this.canvas.getContext("2d");
     this.texture = new CanvasTexture(this.canvas);
     this.texture.colorSpace = SRGBColorSpace;
-    this.texture.anisotropy = 4; // text is read from the side as well, and from afar
+    if (FINE) {
+      this.texture.anisotropy = 4; // text is read from the side as well, and from afar
+    } else {
+      this.texture.minFilter = LinearFilter;
+      this.texture.generateMipmaps = false;
+    }
     this.material = new MeshBasicMaterial({ map: this.texture, transparent: true, toneMapped: false });
     this.mesh = new Mesh(bent(width, height, curve, placed), this.material);
   }
