@@ -85,7 +85,8 @@ def answer(context: ssl.SSLContext, host: str, port: int) -> bytes:
 @needs_browser
 async def test_chromium_takes_them_for_secure(tmp_path: Path) -> None:
     """Each address that is said to be secure is, where the authority is trusted, and WebXR is there. One without TLS
-    is not. Who does not trust it sees the browser's warning, of which a picture is kept."""
+    is not. Who does not trust it sees the browser's warning, of which a picture is kept, and a
+    secure context behind it."""
     port, plain_port = free_port(), free_port()
     said = await certified(tmp_path / "pki", port)
     own = x509.load_pem_x509_certificate((tmp_path / "pki" / "page" / "cert.pem").read_bytes())
@@ -111,6 +112,10 @@ async def test_chromium_takes_them_for_secure(tmp_path: Path) -> None:
                 await page.goto(f"https://{HOSTS[1]}:{port}/xr")
             SCREENSHOTS.mkdir(parents=True, exist_ok=True)
             await page.screenshot(path=SCREENSHOTS / "certificate-warning.png")
+            await page.click("#details-button")
+            await page.click("#proceed-link")
+            await page.wait_for_url(f"https://{HOSTS[1]}:{port}/xr")
+            assert await page.evaluate("[isSecureContext, 'xr' in navigator]") == [True, True]
 
 
 async def test_wrong_words_are_told(tmp_path: Path) -> None:
