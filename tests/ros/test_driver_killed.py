@@ -28,7 +28,7 @@ HANGS_S = 1.5
 
 async def _drive(stack: AsyncExitStack, port: int) -> asyncio.subprocess.Process:
     """A headset in a process of its own; the speed is the number of the command."""
-    command = ("pub", "/cmd_vel", "geometry_msgs/Twist", '{"linear": {"x": "$i"}}', "--agents", "1")
+    command = ("pub", "/cmd_vel", "geometry_msgs/Twist", '{"linear": {"x": $i}}', "--agents", "1")
     how = ("--timed", "--rate", str(HZ), "--count", "100000")
     program = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "bridge", "headset", f"127.0.0.1:{port}", *command, *how),
