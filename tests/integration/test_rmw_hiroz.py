@@ -25,6 +25,7 @@ pytestmark = [pytest.mark.timeout(300), pytest.mark.soak]
 
 DOMAIN = 32
 CDR = b"\0\1\0\0"
+STRING = "std_msgs/msg/String"
 ACTION = "action_tutorials_interfaces/action/Fibonacci"
 DEFINED = {
     "action_tutorials_interfaces/action/Fibonacci.action": (
@@ -75,8 +76,12 @@ async def test_topics_both_ways(site: Site) -> None:
         began = time.monotonic()
         await site.there()
         print(f"online {time.monotonic() - began:.3f} s after it had said that it publishes")
-        (robot,) = [one for one in await macs("ls", "-v", "--json", "-e", site.endpoint) if one["type"] == "ros"]
-        assert robot["offers"]["publishers"]["/chatter"] == "std_msgs/msg/String"
+
+        async def offered() -> bool:
+            shown = [one for one in await macs("ls", "-v", "--json", "-e", site.endpoint) if one["type"] == "ros"]
+            return [(one["offers"] or {}).get("publishers", {}).get("/chatter") for one in shown] == [STRING]
+
+        await until(offered, PATIENCE_S)
         heard = await site.headset.subscribe("/chatter", "std_msgs/String", agents=[7])
         texts = [read_text(bytes((await anext(heard)).data)).decode() for _ in range(5)]
         first = int(texts[0].rpartition(" ")[2])

@@ -127,6 +127,8 @@ async def test_requests_and_replies_as_recorded(router: str) -> None:
         )
         client = node.client(endpoint.topic, endpoint.type, endpoint.hash)
         assert served.endpoint.key == asked[0]["key"]
+        querier = session.declare_querier(asked[0]["key"], target=zenoh.QueryTarget.ALL_COMPLETE)
+        await until(lambda: querier.matching_status.matching, PATIENCE_S)  # the way there is known
         for question, answer in zip(asked, answered, strict=True):
             replies = session.get(
                 question["key"],
