@@ -46,6 +46,7 @@ async def _serve(settings: Settings, ros_args: list[str], metrics: str | None) -
     from bridge.ros import agent
 
     memory.give_back()
+    running.switch_soon()
     await agent.run(
         settings,
         ros_args=ros_args,

@@ -72,6 +72,7 @@ async def _serve(settings: Settings, *, look: bool, dry_run: bool) -> int:
     from bridge.router import KEPT_IN, open_to_anybody
 
     memory.give_back()
+    running.switch_soon()
     if dry_run:
         robots = await program.look(settings) if look else settings.rmw_zenoh.robots
         for line in program.shown(robots) or ["no robots: there are no ROS nodes on the router"]:

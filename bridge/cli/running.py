@@ -34,6 +34,16 @@ INTERRUPTED = 130
 for a confirmation."""
 
 
+SWITCH_S = 0.001
+"""So soon Python's threads take turns in a robot's program."""
+
+
+def switch_soon() -> None:
+    """For who has to stop a robot: that comes in a thread of Zenoh's, which waits for its turn several times while the
+    loop has much to do, 5 ms each unless this is called."""
+    sys.setswitchinterval(SWITCH_S)
+
+
 def until_stopped(work: Callable[[], Coroutine[Any, Any, int]], *, interrupted: int = 0) -> int:
     """Run ``work`` to its end and return its exit code; SIGINT and those of `STOPS` cancel it. For who serves until it
     is stopped that is a success; for others ``interrupted`` is the exit code then.
