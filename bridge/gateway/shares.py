@@ -18,7 +18,7 @@ from collections.abc import Callable
 
 TURN_S = 0.003
 """Work for one agent that takes longer lets all others have their turn before it goes on."""
-SHARE = 0.01
+SHARE = 0.05
 """So much of the time anybody may take without waiting: a turn is used up by what is beyond it."""
 SHARE_OF_ADDRESS = 0.2
 """The same for all from one address together."""
