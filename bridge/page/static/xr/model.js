@@ -279,7 +279,7 @@ function fill(geometry, name, values, size, normalized = false) {
     return;
   }
   if (had) geometry.dispose(); // the larger one is another one
-  const room = new values.constructor(Math.max(size * 256, Math.ceil(values.length * 1.25)));
+  const room = new values.constructor(size * Math.max(256, Math.ceil((values.length / size) * 1.25))); // whole points only
   room.set(values);
   geometry.setAttribute(name, new BufferAttribute(room, size, normalized).setUsage(DynamicDrawUsage));
 }
