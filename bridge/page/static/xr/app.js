@@ -109,10 +109,12 @@ class Scene {
     this.pointing.update(sources, dt);
     this.looking.free(sources, this.pointing.panelUnder("mouse"));
     this.#stopIfPressed(sources);
-    const sample = this.immersion.attended ? this.input.drive(sources, this.stage.head().facing, immersive) : null;
+    // of who is not there it is not known whether he holds on: that he has let go has to be seen
+    const there = immersive ? this.immersion.attended : document.hasFocus();
+    const sample = there ? this.input.drive(sources, this.stage.head().facing) : undefined;
     const poses = immersive && this.wanted.size ? this.input.poses(frame, space, sources, this.wanted) : null;
-    this.sample = sample;
-    this.#send(sample, poses, began);
+    this.sample = sample ?? null;
+    if (there) this.#send(sample, poses, began);
     this.hands.show(sources, this.pointing.distances, this.telling.state.source);
     this.links.showPictures(this.room, this.wishes);
     this.stage.render();
@@ -257,7 +259,7 @@ class Scene {
   #lostFocus() {
     if (this.immersion.session) return;
     this.overlay.pad.release();
-    this.links.input(null, null);
+    this.links.away("the window lost the focus");
   }
 
   #follow(name, value) {

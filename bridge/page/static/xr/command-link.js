@@ -105,6 +105,7 @@ export class CommandLink {
 
   /** What hands do: {at, sample, poses}; `at` by this worker's clock. */
   input({ at, sample, poses }) {
+    if (this.#away) return; // what is held meanwhile has to be let go of before it counts
     this.#madeAt = at;
     this.#judge();
     const was = this.#hold.held;

@@ -43,8 +43,8 @@ export class Input {
     return sources.some(({ gamepad, stop }) => stop || stopButtons(gamepad)) || pads.some(stopGamepad);
   }
 
-  /** {source, forward, turn} while somebody holds on, else null: what drove before goes on. In XR no window has the focus. */
-  drive(sources, facing, immersive = false) {
+  /** {source, forward, turn} while somebody holds on, else null: what drove before goes on. */
+  drive(sources, facing) {
     const held = [];
     for (const source of sources) {
       const drive = source.kind === "hand" ? this.#byHand(source, facing) : stickDrive(source.gamepad);
@@ -52,7 +52,7 @@ export class Input {
     }
     for (const each of gamepads()) {
       const drive = gamepadDrive(each);
-      if (drive && (immersive || document.hasFocus())) held.push({ source: `gamepad ${each.index}`, ...drive });
+      if (drive) held.push({ source: `gamepad ${each.index}`, ...drive });
     }
     if (this.pad.sample) held.push(this.pad.sample);
     const chosen = held.find(({ source }) => source === this.#source) ?? held[0] ?? null;
