@@ -16,12 +16,14 @@ from pathlib import Path
 from urllib.parse import quote
 
 import aiohttp
+import msgspec
 from aiohttp import web
 
 from bridge.audit import who
 from bridge.gateway.site import Site
 from bridge.recording.serving import socket_of
 from macs_zenoh.errors import ConfigError
+from macs_zenoh.protocol.attempts import Attempts
 from macs_zenoh.protocol.rights import Grant
 
 log = logging.getLogger("macs.gateway")
@@ -38,6 +40,12 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}\.mcap", re.ASCII)
 MISSING = "this token does not give the right to record"
 
 
+class _Said(msgspec.Struct):
+    """An answer that is none."""
+
+    error: str
+
+
 class Recordings:
     """The way to one recorder."""
 
@@ -45,6 +53,8 @@ class Recordings:
         self._site = site
         self._socket = socket_of(folder)
         self._session: aiohttp.ClientSession | None = None
+        self._not_done = Attempts()
+        """What was asked for and not done, by who asked and for what."""
         self._downloads = 0
         self._next_s = 0.0
         """When the next piece of a download may go."""
@@ -65,7 +75,12 @@ class Recordings:
             self._session = None
 
     async def _state(self, _: web.Request, visitor: Grant) -> web.StreamResponse:
-        return _refused() if not may_record(visitor) else await self._ask("GET", "/state")
+        if not may_record(visitor):
+            return _refused()
+        answer = await self._ask("GET", "/state")
+        if answer.status != 200:
+            answer.set_status(200)  # that there is no recorder is a state as well
+        return answer
 
     async def _happened(self, request: web.Request, visitor: Grant) -> web.StreamResponse:
         if not may_record(visitor):
@@ -76,20 +91,30 @@ class Recordings:
     async def _ordered(self, request: web.Request, visitor: Grant) -> web.StreamResponse:
         what = request.match_info["what"]
         by = who(address=self._site.host_of(request), token=visitor.name)
-        keep_record = self._site.gateway.keep_record
         if not may_record(visitor):
-            keep_record("recording", by, what, MISSING)
+            self._note_refused(by, what, MISSING)
             return _refused()
         body = await request.read()
         self._site.goes_on(request)
         answer = await self._ask("POST", f"/{what}", body, request)
-        keep_record("recording", by, what, "done" if answer.status == 200 else answer.reason or "refused")
+        if answer.status == 200:
+            self._site.gateway.keep_record("recording", by, what)
+        else:
+            self._note_refused(by, what, _problem(answer))
         log.info("%s asked the recorder to %s: %s", visitor.name or self._site.host_of(request), what, answer.status)
         return answer
 
+    def _note_refused(self, by: dict[str, str], what: str, why: str) -> None:
+        """At once, and then once in a while with how often: or who asks all day would push what was done out of the
+        record."""
+        count = self._not_done.note(f"{by.get('token') or by.get('address')} {what}", time.monotonic())
+        if count:
+            told = "" if count == 1 else f" ({count} times by now)"
+            self._site.gateway.keep_record("recording", by, what, why + told)
+
     async def _ask(
         self, method: str, path: str, body: bytes = b"", request: web.Request | None = None
-    ) -> web.StreamResponse:
+    ) -> web.Response:
         """The recorder's answer, or why there is none."""
         try:
             async with (
@@ -100,10 +125,11 @@ class Recordings:
                 async for piece in found.content.iter_any():
                     answer += piece
                     if len(answer) > ANSWER_BYTES:
-                        return web.json_response({"error": "the recorder tells too much"})
+                        return _no_answer("the recorder tells too much")
                 return web.Response(body=bytes(answer), status=found.status, content_type="application/json")
         except (aiohttp.ClientError, asyncio.TimeoutError, OSError) as error:
-            return web.json_response({"error": f"the recorder does not answer: {_why(error)}"})
+            status = 504 if isinstance(error, asyncio.TimeoutError) else 502
+            return _no_answer(f"the recorder does not answer: {_why(error)}", status)
 
     @asynccontextmanager
     async def _going_on(self, request: web.Request | None) -> AsyncIterator[None]:
@@ -198,6 +224,18 @@ def _why(error: BaseException) -> str:
     if isinstance(error, asyncio.TimeoutError):
         return "it takes too long"
     return "is `macs record --serve` running?" if isinstance(error, OSError) else type(error).__name__
+
+
+def _no_answer(why: str, status: int = 502) -> web.Response:
+    return web.json_response({"error": why}, status=status)
+
+
+def _problem(answer: web.Response) -> str:
+    """Why something was not done, as the recorder says."""
+    try:
+        return msgspec.json.decode(answer.text or "", type=_Said).error
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        return answer.reason or "refused"
 
 
 def _refused() -> web.Response:
