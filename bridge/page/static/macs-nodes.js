@@ -145,31 +145,43 @@ export class Publisher extends Node {
     this.unsent = 0;
     /** The number of the last command that told its time. */
     this.lastTicks = 0;
+    /** When the newest of what was sent was made, by the headset's clock. */
+    this.lastMadeAt = -Infinity;
   }
 
   /**
    * Send CDR to these robots and groups, by default to all where it is registered. Whether it was sent: nothing is kept
    * for later. With `freshMs` it is not sent when the gateway has not answered for so long, or when bytes still wait
    * here: a command that cannot go at once does not go at all. `madeAt` is when it was made, by the clock of the headset's
-   * `CommandClock`, for robots that want to know; now unless it is said.
+   * `CommandClock`, for robots that want to know; now unless it is said. What was made before something that was sent is
+   * not sent: its number would have to be a greater one, and say that it is younger than it is.
    */
   publish(cdr, { robots, groups = [], freshMs = 0, madeAt } = {}) {
     const to = robots ?? [...this.robots];
     const toGroups = robots ? groups : [...this.groups];
+    const now = this.headset.clock?.now();
+    if (madeAt < this.lastMadeAt) {
+      this.unsent += 1;
+      return false;
+    }
     const frames = () => this.#frames(cdr, to, toGroups, madeAt);
     const sent = freshMs ? this.headset.sendFresh(frames, freshMs) : this.headset.sendNow(frames);
     if (!sent) this.unsent += 1;
+    else if (now !== undefined) this.lastMadeAt = Math.max(this.lastMadeAt, Math.min(madeAt ?? now, now));
     return sent;
   }
 
   #frames(data, robots, groups, madeAt) {
     const { clock } = this.headset;
     const timed = clock ? robots.filter((robot) => clock.tells(robot)) : [];
-    if (!timed.length) return packed(robots, groups, this.metadata(), data);
+    const timedGroups = clock ? groups.filter((group) => clock.tellsGroup(group)) : [];
+    if (!timed.length && !timedGroups.length) return packed(robots, groups, this.metadata(), data);
     this.lastTicks = clock.ticks.next(this.lastTicks, madeAt ?? clock.now());
     const told = { ...this.metadata({ requestId: this.lastTicks }), clock: clock.ticks.name };
+    clock.told(timed, timedGroups);
     const others = robots.filter((robot) => !timed.includes(robot));
-    return [...packed(timed, [], told, data), ...packed(others, groups, this.metadata(), data)];
+    const otherGroups = groups.filter((group) => !timedGroups.includes(group));
+    return [...packed(timed, timedGroups, told, data), ...packed(others, otherGroups, this.metadata(), data)];
   }
 }
 
