@@ -212,7 +212,7 @@ const parts = {
   },
 
   async targets() {
-    const { driveTopic, targets, wishes } = await load("xr/targets.js");
+    const { driveTopic, guardOf, targets, wishes } = await load("xr/targets.js");
     const { SHOWN, TWIST } = await load("xr/wire-types.js");
     const any = { robots: "any", groups: "any" };
     const ids = (me) => targets([1, 2, 3], { 1: 0, 2: 5, 3: 5 }, me).map(({ id }) => id);
@@ -229,7 +229,10 @@ const parts = {
       "/x": "std_msgs/msg/String",
     };
     const settings = { cameras: null, rightEye: "", layers: ["scan"], values: ["/x", "/gone"] };
-    const wished = (more) => wishes(1, offers, { ...settings, ...more }, SHOWN);
+    const wished = (more) => {
+      const meant = { ...settings, ...more };
+      return wishes(1, offers, meant, SHOWN, guardOf(offers, meant, SHOWN, null));
+    };
     const pictures = (more) => wished(more).filter(({ shown }) => shown === "picture");
     assert.deepEqual(pictures({}).map(({ topic, guards }) => [topic, guards]), [["/b/compressed", true], ["/raw", false]]);
     assert.deepEqual(pictures({ cameras: [] }), []);
@@ -241,6 +244,36 @@ const parts = {
     assert.deepEqual(driveTopic(takes, "", TWIST), ["/cmd_vel", "geometry_msgs/msg/Twist"]);
     assert.deepEqual(driveTopic(takes, "/other", TWIST)[0], "/other");
     assert.equal(driveTopic(takes, "/gone", TWIST), null, "what was chosen and is gone is not replaced");
+  },
+
+  async guards() {
+    const { guardOf, wishes } = await load("xr/targets.js");
+    const { SHOWN } = await load("xr/wire-types.js");
+    const settings = (cameras, rightEye = "") => ({ cameras, rightEye, layers: [], values: [] });
+    const [one, two] = ["/one/compressed", "/two/compressed"];
+    const type = "sensor_msgs/msg/CompressedImage";
+    const both = { [one]: type, [two]: type };
+    const guard = (publishers, meant, before, anew) => guardOf(publishers, meant, SHOWN, before, anew);
+    const auto = settings(null);
+    assert.equal(guard({}, auto, null), null, "a robot without pictures");
+    const first = guard(both, auto, null);
+    assert.deepEqual(first, { topic: one, type });
+    for (const left of [{ [two]: type }, {}, { [one]: "std_msgs/msg/String" }]) {
+      assert.deepEqual(guard(left, auto, first), first, "a camera that died guards on");
+      const [wish] = wishes(1, left, auto, SHOWN, first);
+      assert.deepEqual([wish.topic, wish.guards, wish.type], [one, true, type], "and is asked for");
+    }
+    assert.deepEqual(guard({ [two]: type }, auto, first, true), { topic: two, type }, "until somebody changes what is shown");
+    assert.deepEqual(guard({}, auto, first, true), first);
+    assert.equal(guard(both, settings([]), first), null, "or wants none");
+    assert.deepEqual(guard({ [two]: type }, settings([one, two]), null), { topic: one, type: "" }, "chosen, and not there");
+    const shown = wishes(1, { [two]: type }, settings([one, two]), SHOWN, { topic: one, type: "" });
+    assert.deepEqual(shown.map(({ topic, guards }) => [topic, guards]), [[two, false]]);
+    assert.deepEqual(guard({}, settings([one]), first), first);
+    assert.deepEqual(guard(both, auto, { topic: "/typo", type: "" }), first);
+    assert.deepEqual(guard(both, settings([one, two], one), null), { topic: two, type }, "the right eye's is none");
+    const eyes = wishes(1, both, settings(null, one), SHOWN, first);
+    assert.equal(new Set(eyes.map(({ key }) => key)).size, eyes.length);
   },
 };
 

@@ -15,7 +15,7 @@ import { Room } from "./room.js";
 import { Settings } from "./settings.js";
 import { Stage } from "./stage.js";
 import { Telling } from "./telling.js";
-import { driveTopic, targets, wishes } from "./targets.js";
+import { driveTopic, guardOf, pictureKey, targets, wishes } from "./targets.js";
 import { POSE_TYPES, SHOWN, TWIST } from "./wire-types.js";
 
 const OFFERS_MS = 2000;
@@ -53,6 +53,8 @@ class Scene {
     this.target = null;
     this.offers = { publishers: {}, subscribers: {} };
     this.wishes = [];
+    /** robot → the picture that driving it depends on: {topic, type}. */
+    this.guards = new Map();
     /** How long the work of each of the last frames took, in ms. */
     this.frameMs = [];
     this.frames = 0;
@@ -265,7 +267,7 @@ class Scene {
   #follow(name, value) {
     this.room.follow(name, value);
     this.links.settings(this.settings.values);
-    if (["cameras", "rightEye", "layers", "values"].includes(name)) this.#wish();
+    if (["cameras", "rightEye", "layers", "values"].includes(name)) this.#wish(true);
     if (name === "driveTopic") this.#aim();
   }
 
@@ -319,8 +321,13 @@ class Scene {
     this.links.aim({ ...this.target, topic, type });
   }
 
-  #wish() {
-    this.wishes = this.target ? wishes(this.target.seen, this.offers.publishers, this.settings.values, SHOWN) : [];
+  #wish(anew = false) {
+    const { publishers } = this.offers;
+    const { seen } = this.target ?? {};
+    const guard = this.target && guardOf(publishers, this.settings.values, SHOWN, this.guards.get(seen), anew);
+    if (this.target) this.guards.set(seen, guard);
+    this.links.guard(guard ? [pictureKey(seen, guard.topic)] : []);
+    this.wishes = this.target ? wishes(seen, publishers, this.settings.values, SHOWN, guard) : [];
     this.room.setPanels(this.wishes.filter(({ eye }) => eye === "left").map(({ panel }) => panel));
     const right = this.wishes.find(({ eye }) => eye === "right")?.panel;
     for (const screen of this.room.screens.values()) screen.setOther(screen.key === right);

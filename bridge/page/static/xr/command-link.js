@@ -27,6 +27,8 @@ const ZEROS_MS = [40, 80];
 const AGAIN_MS = 500;
 const LEAST_TICK_MS = 5;
 const ROBOTS = 16;
+/** Of a picture of which nothing was heard. */
+const NEVER = { at: null, late: 0 };
 
 export class CommandLink {
   #hold = new Hold();
@@ -96,10 +98,16 @@ export class CommandLink {
     this.#judge();
   }
 
-  /** A picture that driving depends on: how old it is is judged here; null: it is none any more. */
+  /** The pictures that driving depends on. The scene says which, and not who receives them: that one may not run. */
+  guard(keys) {
+    this.#seen = new Map(keys.map((key) => [key, this.#seen.get(key) ?? NEVER]));
+    this.#judge();
+  }
+
+  /** A picture came: how old it is is judged here; null: it is not received now. */
   see(key, seen) {
-    if (seen === null) this.#seen.delete(key);
-    else this.#seen.set(key, seen);
+    if (!this.#seen.has(key)) return;
+    this.#seen.set(key, seen ?? NEVER);
     this.#judge();
   }
 

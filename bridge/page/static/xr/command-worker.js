@@ -14,6 +14,7 @@ const ops = {
     self.macsXr = link;
   },
   aim: ({ target }) => link.aim(target),
+  guard: ({ keys }) => link.guard(keys),
   settings: ({ values }) => link.set(values),
   input: ({ at, sample, poses }) => link.input({ at: here(at), sample, poses }),
   away: ({ why }) => link.setAway(why),

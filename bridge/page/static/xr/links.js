@@ -37,6 +37,11 @@ export class Links extends EventTarget {
     this.commands.postMessage({ op: "aim", target });
   }
 
+  /** By which pictures driving is guarded: until they are told of, there are none. */
+  guard(keys) {
+    this.commands.postMessage({ op: "guard", keys });
+  }
+
   settings(values) {
     this.commands.postMessage({ op: "settings", values });
     this.sight.postMessage({ op: "points", most: values.points });

@@ -22,19 +22,51 @@ export function targets(online, members, me) {
   return found;
 }
 
-/** What is received of a robot: [{key, robot, topic, type, shown, guards, eye, panel}], by what it offers and the settings. */
-export function wishes(robot, publishers, settings, shownAs) {
+/**
+ * The picture that driving depends on: {topic, type}, or null where none is meant. `before` is what it was. Pictures that end
+ * do not end that: it stays until somebody chooses another one, or none. `type` is "" while nobody has offered the chosen one; `anew`:
+ * somebody has just changed what is shown.
+ */
+export function guardOf(publishers, settings, shownAs, before, anew = false) {
+  const isPicture = (topic) => shownAs[publishers[topic]] === "picture";
+  const [chosen] = (settings.cameras ?? []).filter((topic) => topic !== settings.rightEye);
+  const [first] = pictures(publishers, settings, shownAs);
+  const kept = before?.type ? before.topic : undefined;
+  const topic = settings.cameras ? chosen : anew ? (first ?? kept) : (kept ?? first);
+  if (!topic) return null;
+  return { topic, type: isPicture(topic) ? publishers[topic] : before?.topic === topic ? before.type : "" };
+}
+
+/** What of the robot's pictures is shown, the one that guards first. */
+function pictures(publishers, settings, shownAs) {
+  const isPicture = (topic) => shownAs[publishers[topic]] === "picture";
+  // compressed ones first: raw ones cost a link ten times as much
+  const found = Object.keys(publishers).filter(isPicture).sort((one, other) => publishers[one].localeCompare(publishers[other]));
+  return (settings.cameras ?? found.slice(0, 2)).filter((topic) => isPicture(topic) && topic !== settings.rightEye);
+}
+
+const keyOf = (robot, topic, shown) => `${robot} ${topic} ${shown}`;
+
+/** By which name pictures of this topic are told of. */
+export const pictureKey = (robot, topic) => keyOf(robot, topic, "picture");
+
+/**
+ * What is received of a robot: [{key, robot, topic, type, shown, guards, eye, panel}], by what it offers and the settings. The
+ * picture of `guard` is asked for also while nobody offers it.
+ */
+export function wishes(robot, publishers, settings, shownAs, guard) {
   const offered = Object.entries(publishers);
   const found = [];
   const typed = (shown) => offered.filter(([, type]) => shownAs[type] === shown);
-  const add = (topic, type, shown, more = {}) => found.push({ key: `${robot} ${topic} ${shown}`, robot, topic, type, shown, ...more });
-  // compressed pictures first: raw ones cost a link ten times as much
-  const pictures = typed("picture").sort(([, one], [, other]) => one.localeCompare(other));
-  const chosen = settings.cameras ?? pictures.slice(0, 2).map(([topic]) => topic);
-  const cameras = chosen.filter((topic) => shownAs[publishers[topic]] === "picture" && topic !== settings.rightEye);
-  cameras.forEach((topic, at) => add(topic, publishers[topic], "picture", { guards: at === 0, panel: topic, eye: "left" }));
+  const add = (topic, type, shown, more = {}) => found.push({ key: keyOf(robot, topic, shown), robot, topic, type, shown, ...more });
+  const others = pictures(publishers, settings, shownAs).filter((topic) => topic !== guard?.topic);
+  const cameras = guard?.type ? [guard.topic, ...others] : others;
+  for (const topic of cameras) {
+    const guards = topic === guard?.topic;
+    add(topic, guards ? guard.type : publishers[topic], "picture", { guards, panel: topic, eye: "left" });
+  }
   const right = settings.rightEye;
-  if (right && cameras.length && shownAs[publishers[right]] === "picture") {
+  if (right && cameras.length && right !== guard?.topic && shownAs[publishers[right]] === "picture") {
     add(right, publishers[right], "picture", { guards: false, panel: cameras[0], eye: "right" });
   }
   const [pose] = typed("pose").sort(([one], [other]) => one.length - other.length);

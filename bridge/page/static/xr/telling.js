@@ -120,7 +120,7 @@ export class Telling {
     const { links, wishes } = this.scene;
     if (!links.sightUp.connected) return { text: "connection lost", tone: "bad" };
     const rate = links.rates.get(wishes.find(({ guards }) => guards)?.key);
-    if (!rate) return { text: "none chosen", tone: "muted" };
+    if (!rate) return { text: this.state.blind || "none chosen", tone: "muted" };
     const age = rate.pictureAgeMs === null ? null : rate.pictureAgeMs + now - rate.at;
     const [text, tone] = age === null ? ["none yet", "bad"] : quality(age, 150, 300);
     return { text: `${digits(rate.hz)} Hz · ${text} old · ${digits(rate.bytesPerS / 1000)} kB/s`, tone };
