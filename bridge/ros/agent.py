@@ -226,6 +226,7 @@ class RobotAgent:
         if self._guard is not None:
             self._guard.on_command = _ignore
         self.agent.on_message(_ignore)
+        self.nodes.close()  # before all that may fail: what moves is stopped here
         self.offers.close()
         self._clocks.close()
         if self._mirrors is not None:
@@ -234,7 +235,6 @@ class RobotAgent:
             self._stop_later.cancel()
         for answer in self._answering:
             answer.cancel()
-        self.nodes.close()
         if self._last_words is not None:
             self._last_words.close()
         if self.stop_line is not None:

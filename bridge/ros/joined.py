@@ -62,14 +62,12 @@ async def joined(
         ros_agent = RobotAgent(agent, session, robot, own, guard, emergency_stop)
         await ros_agent.start()
         pictures = Pictures(ros_agent.nodes.robot, partial(_tell, asyncio.get_running_loop(), ros_agent))
+        stack.push_async_callback(asyncio.sleep, STOP_MESSAGES_S)
+        stack.push_async_callback(pictures.close)
+        stack.push_async_callback(ros_agent.close)  # first, and whatever fails: what moves is stopped
         pictures.start()
         log.info("robot %d serves %s", agent.id, session.full_name)
-        try:
-            yield ros_agent
-        finally:
-            await pictures.close()
-            await ros_agent.close()
-            await asyncio.sleep(STOP_MESSAGES_S)
+        yield ros_agent
 
 
 def _tell(loop: asyncio.AbstractEventLoop, robot: RobotAgent, topic: str, kind: str, reason: str) -> None:

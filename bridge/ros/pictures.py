@@ -7,6 +7,7 @@ somebody takes the other. One thread makes all pictures; of a topic for which it
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import threading
@@ -24,10 +25,12 @@ from bridge.ros.types import InterfaceName
 from bridge.settings.robot import AsJpeg, RobotSettings
 from macs_zenoh.errors import MacsError, MissingExtra, Refused
 from macs_zenoh.protocol.rmw_zenoh.qos import Qos
+from macs_zenoh.timeouts import within
 
 log = logging.getLogger("macs.ros")
 
 LOOK_S = 1.0
+CLOSE_S = 2.0
 MOST = 64
 """So many topics have pictures."""
 BEHIND, FAILED = "jpeg_behind", "no_jpeg"
@@ -52,25 +55,32 @@ class Pictures:
         self._made: dict[str, _Picture] = {}
         """By the name of the raw topic. In the ROS thread."""
         self._encoder = _Encoder(self._encode)
-        self._open = True
+        self._open = False
 
     def start(self) -> None:
         """Look for images from now on, where settings want pictures of any."""
         if any(rule.as_jpeg is not None for rule in self._robot.rules.settings.rules):
+            self._open = True
             self._side.submit(self._look_again)
 
     async def close(self) -> None:
-        """End all."""
+        """End all. Waits no longer than `CLOSE_S` for a ROS thread that does not get to it, and for a picture that is
+        being made: that thread ends with the program."""
+        if not self._open:
+            return
         self._open = False
-        with contextlib.suppress(MacsError):
-            await self._side.run(self._close)
-        self._encoder.close()
+        with contextlib.suppress(MacsError, asyncio.TimeoutError):
+            await within(asyncio.wrap_future(self._side.submit(self._close)), CLOSE_S)
+        await asyncio.to_thread(self._encoder.close, CLOSE_S)
 
     # -- in the ROS thread ---------------------------------------------------------------------------------------
 
     def _close(self) -> None:
         for name in list(self._made):
-            self._end(name)
+            try:
+                self._end(name)
+            except Exception:  # the middleware's, whatever it is: the others end nevertheless
+                log.exception("the pictures of %s did not end", name)
 
     def _look_again(self) -> None:
         if self._open:
@@ -200,13 +210,14 @@ class _Encoder:
         with self._changed:
             self._waiting.pop(picture, None)
 
-    def close(self) -> None:
+    def close(self, timeout_s: float) -> None:
+        """Waits so long at most for the one that is being made."""
         with self._changed:
             self._open = False
             self._changed.notify()
             thread = self._thread
         if thread is not None:
-            thread.join()
+            thread.join(timeout_s)
 
     def _run(self) -> None:
         while (work := self._next()) is not None:
