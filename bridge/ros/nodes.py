@@ -393,15 +393,15 @@ class InterfaceNodes:
             return message
         age_s = message.age_s + waited_s
         settings = self.robot.rules.settings
-        most_s = settings.max_command_age_s
-        if message.metadata.clock and settings.max_timed_command_age_s:
-            most_s = min(most_s or math.inf, settings.max_timed_command_age_s)
+        late = 0 < settings.max_command_age_s < age_s
+        if message.metadata.clock:
+            late |= 0 < settings.max_timed_command_age_s < message.at_most_s + waited_s
         stops = (self.stop is not None and key == self.stop.key) or says_halt(message)
-        if not stops and 0 < most_s < age_s:
-            reason = f"a command waited for {age_s:.2f} s, the last of it for its registration"
+        if late and not stops:
+            reason = f"a command waited for {age_s:.2f} s or more, the last of it for its registration"
             self.drops.note("too_old", f"{key.node_name[:80]} from {Registrant.of(message)}", reason)
             return None
-        return message._replace(age_s=age_s)
+        return message._replace(age_s=age_s, at_most_s=message.at_most_s + waited_s)
 
     def _was_stopped(self, within_s: float) -> bool:
         """Whether a stop has ended since then; one that holds is for the nodes to judge."""

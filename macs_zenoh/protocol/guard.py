@@ -346,7 +346,7 @@ class Guard:
             for message in self._covered(self._urgent, sender, len(payload), messages, now):
                 most_s = self._passes(message, sender, age_s, now)
                 if most_s is not None:
-                    command(message._replace(age_s=most_s) if most_s > AGED_S else message)
+                    command(message if max(age_s, most_s) <= AGED_S else _aged(message, age_s, most_s))
         return True
 
     def covered(self, key: str, size: int, messages: list[Message], now: float) -> list[Message]:
@@ -373,7 +373,7 @@ class Guard:
             return message._replace(age_s=age_s)
         with self._lock:
             most_s = self._passes(message, sender_of(key), age_s, now)
-        return None if most_s is None else message._replace(age_s=most_s)
+        return None if most_s is None else _aged(message, age_s, most_s)
 
     def pressed(self, sender: tuple[int, int], now: float) -> None:
         """Somebody stops the robot by asking, which overtakes what it puts: a release that it sent before is not what
@@ -405,9 +405,9 @@ class Guard:
                     command(message)
 
     def _passes(self, message: Message, sender: str, age_s: float, now: float) -> float | None:
-        """How old a command is that is carried out, at most; None: it is not."""
+        """How old a command that is carried out is at most by its sender's clock; None: it is not."""
         if self._stops(message):
-            return age_s
+            return 0.0
         if self._overtaken(message, sender, age_s, now):
             self.on_dropped("too_old", sender, "a release was sent before the stop that its sender asked for")
             return None
@@ -418,7 +418,7 @@ class Guard:
             self.on_refused(message, *told.refusal)
             return None
         if self._fresh.take(sender, age_s, now) or halt:
-            return max(age_s, told.age_s)
+            return told.age_s
         self.on_dropped("too_old", sender, f"a command has waited for {age_s:.2f} s on its way, or behind such a one")
         return None
 
@@ -439,6 +439,10 @@ class Guard:
 
     def _found_bad(self, _key: str, _error: WireError) -> None:
         self._bad = True  # the loop finds it too, and counts it
+
+
+def _aged(message: Message, age_s: float, at_most_s: float) -> Message:
+    return message._replace(age_s=age_s, at_most_s=at_most_s)
 
 
 INBOX_KEYS, GROUP_KEYS = UNICAST.prefix, GROUP.prefix

@@ -18,13 +18,15 @@ from .wire import Layout, parse_frame, parse_frames
 
 class Message(NamedTuple):
     """What an agent receives. The sender is taken from the key, which routers can check, and not from the JSON;
-    ``metadata`` is corrected to name the same. ``age_s``: how long a command waited on its way, if known."""
+    ``metadata`` is corrected to name the same. ``age_s``: how long a command waited on its way, if known.
+    ``at_most_s``: how old it is at most by its sender's clock, with a whole way there and back: for limits only."""
 
     sender_type: str
     sender_id: int
     metadata: Metadata
     data: bytes
     age_s: float = 0.0
+    at_most_s: float = 0.0
 
 
 class _Sender(NamedTuple):
