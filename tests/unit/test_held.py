@@ -15,6 +15,7 @@ from macs_zenoh.protocol.robot_state import Offered, TopicQos
 @dataclass
 class Said:
     data: bytes
+    received_s: float = 0.0
 
 
 def test_the_newest_are_held_in_order() -> None:
@@ -40,19 +41,36 @@ def test_large_ones_are_held_as_far_as_there_is_room() -> None:
     assert [each.data for each in held.newest(10)] == [b"small"]
 
 
-def test_all_together_hold_no_more_than_there_is_room_for() -> None:
-    """What would be too much of one topic costs no other what it holds; what is let go of makes room."""
+def test_cameras_make_room_for_a_map() -> None:
+    """Where all together is too much, what brings most goes, whoever came first; what is let go of makes room."""
     room = Room(100)
-    one: Held[Said] = Held(room)
-    other: Held[Said] = Held(room)
-    one.put(Said(bytes(80)), depth=3)
-    other.put(Said(bytes(15)), depth=3)
-    other.put(Said(bytes(10)), depth=3)
-    assert (len(one.newest(3)), [len(each.data) for each in other.newest(3)]) == (1, [10])
-    other.put(Said(bytes(30)), depth=3)
-    assert (len(one.newest(3)), other.newest(3), room.bytes) == (1, [], 80)
-    one.clear()
-    assert room.bytes == 0
+    cameras: list[Held[Said]] = [Held(room) for _ in range(3)]
+    latched: Held[Said] = Held(room)
+    for second in range(5):
+        for camera in cameras:
+            camera.put(Said(bytes(40), second), depth=3)
+    assert room.bytes <= 100
+    latched.put(Said(bytes(60), 5), depth=3)
+    for second in range(6, 600):
+        for camera in cameras:
+            camera.put(Said(bytes(40), second), depth=3)
+        assert (len(latched.newest(3)), latched.is_short, room.bytes) == (1, False, 100)
+    assert sum(camera.is_short for camera in cameras) >= 2
+    latched.clear()
+    for camera in cameras:
+        camera.clear()
+    assert (room.bytes, room.holding) == (0, set())
+
+
+def test_what_is_too_large_for_all_is_known_to_be_missing() -> None:
+    """Until as many as are wanted have come after it."""
+    held: Held[Said] = Held(Room(100))
+    held.put(Said(bytes(101)), depth=2)
+    assert (held.newest(2), held.is_short) == ([], True)
+    held.put(Said(b"1"), depth=2)
+    assert held.is_short
+    held.put(Said(b"2"), depth=2)
+    assert (len(held.newest(2)), held.is_short) == (2, False)
 
 
 @pytest.mark.parametrize(
