@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from msgspec import structs
 
 from .errors import CallTimeout, Closed, MacsError, Refused, Unreachable, UsageError, WireError
-from .held import Held, Room, latches
+from .late import Late
 from .mesh import Sample
 from .mesh import Subscription as Declared
 from .protocol.directory import Change
@@ -43,7 +43,7 @@ from .protocol.registrations import AgentKey, NodeKey, Task
 from .protocol.stream_reading import StreamReader
 from .protocol.wire import Layout
 from .registration_calls import RobotCalls, StreamChanges
-from .timeouts import within
+from .timeouts import Deadline, within
 from .topics import (
     DEPTH,
     Chosen,
@@ -101,7 +101,7 @@ class Nodes:
         self._tasks: set[asyncio.Task[None]] = set()
         self._logged: set[tuple[NodeKey, int, str]] = set()
         self._closed = False
-        self._held = Room()
+        self._late = Late(agent)
         self._calls = RobotCalls(
             agent.mesh,
             agent.directory,
@@ -129,20 +129,26 @@ class Nodes:
         if depth < 1:
             raise UsageError("a depth of at least 1 message is needed")
         robots, groups = chosen(robot, group)
-        node = await self._node(NodeType.SUBSCRIBER, topic, of_type, robots, groups, timeout_s)
-        latching = await self._latching(node, self._online(robots, groups), timeout_s)
+        until = Deadline(timeout_s)
+        node = await self._node(NodeType.SUBSCRIBER, topic, of_type, robots, groups, until)
         subscription = TopicSubscription(self, node, robots, groups, depth)
-        for each in latching & node.held.keys():  # from here on it hears what comes
-            self._give(subscription, node.held[each].newest(depth))
-        return await self._use(subscription, node, timeout_s, depth)
+        before = self._late.before(node, self._online(robots, groups), depth)
+        await self._use(subscription, node, until, depth)  # from its beginning on it hears what comes
+        try:
+            await self._late.give(subscription, node, before, until)
+        except BaseException:
+            subscription.close()
+            raise
+        return subscription
 
     async def advertise(
         self, topic: str, robot: Chosen, group: Chosen, of_type: str | None, timeout_s: float
     ) -> TopicPublisher:
         """See `Agent.advertise`."""
         robots, groups = chosen(robot, group)
-        node = await self._node(NodeType.PUBLISHER, topic, of_type, robots, groups, timeout_s)
-        return await self._use(TopicPublisher(self, node, robots, groups), node, timeout_s)
+        until = Deadline(timeout_s)
+        node = await self._node(NodeType.PUBLISHER, topic, of_type, robots, groups, until)
+        return await self._use(TopicPublisher(self, node, robots, groups), node, until)
 
     async def publish(
         self, topic: str, data: bytes | Value, robot: Chosen, group: Chosen, of_type: str | None, timeout_s: float
@@ -187,7 +193,7 @@ class Nodes:
         self, service: str, request: bytes | Value, robot: int, of_type: str | None, timeout_s: float
     ) -> Any:
         """See `Agent.call_service`."""
-        deadline = time.monotonic() + timeout_s
+        until = Deadline(timeout_s)
         robots, groups = chosen(robot, ())
         if (ROS, robot) not in self.agent.directory:
             raise Unreachable(f"ros/{robot}", "it is not online")
@@ -195,22 +201,23 @@ class Nodes:
         if user is None or user.refused or is_other(of_type, user):
             if user is not None:
                 user.close()
-            node = await self._node(NodeType.CLIENT, service, of_type, robots, groups, timeout_s)
-            user = await self._use(ServiceUser(self, node, robots, groups), node, timeout_s)
+            node = await self._node(NodeType.CLIENT, service, of_type, robots, groups, until)
+            user = await self._use(ServiceUser(self, node, robots, groups), node, until)
             self._services[service, robot] = user
         if is_cdr(request):
-            return await self._ask(user, robot, request, deadline - time.monotonic(), timeout_s)
+            return await self._ask(user, robot, request, until)
         cdr = self.types().serialize(request_of(user.type), value_of(request))
-        answer = await self._ask(user, robot, cdr, deadline - time.monotonic(), timeout_s)
+        answer = await self._ask(user, robot, cdr, until)
         return self.types().deserialize(response_of(user.type), answer)
 
     async def use_action(self, action: str, of_type: str, robot: int, timeout_s: float) -> NodeUser:
         """See `Agent.use_action`."""
         robots, groups = chosen(robot, ())
-        node = await self._node(NodeType.ACTION, action, of_type, robots, groups, timeout_s)
-        return await self._use(NodeUser(self, node, robots, groups), node, timeout_s)
+        until = Deadline(timeout_s)
+        node = await self._node(NodeType.ACTION, action, of_type, robots, groups, until)
+        return await self._use(NodeUser(self, node, robots, groups), node, until)
 
-    async def _ask(self, user: ServiceUser, robot: int, request: bytes, left_s: float, timeout_s: float) -> bytes:
+    async def _ask(self, user: ServiceUser, robot: int, request: bytes, until: Deadline) -> bytes:
         name = node_name(user.topic)
         number = self._next_request() % REQUEST_IDS
         # by naming CallFailure a caller asks to be told why there is no answer
@@ -224,9 +231,9 @@ class Nodes:
         answer = self._open[robot, name, number] = asyncio.get_running_loop().create_future()
         try:
             self.agent.send(request, to=ROS, ids=[robot], metadata=metadata)
-            await asyncio.wait([answer], timeout=max(0.001, left_s))
+            await asyncio.wait([answer], timeout=max(0.001, until.left_s))
             if not answer.done():
-                raise CallTimeout(f"service {user.topic} of ros/{robot}", timeout_s)
+                raise CallTimeout(f"service {user.topic} of ros/{robot}", until.timeout_s)
             response: bytes = answer.result()
             return response
         finally:
@@ -240,13 +247,13 @@ class Nodes:
         of_type: str | None,
         robots: Collection[int],
         groups: Collection[int],
-        timeout_s: float,
+        until: Deadline,
     ) -> Node:
         """The node of a topic or service, as it is, or a new one."""
         known = self._nodes.get((kind, node_name(topic)))
         if of_type is None:
             of_type = (
-                known.wanted.data_exchange_type if known else await self._type(kind, topic, robots, groups, timeout_s)
+                known.wanted.data_exchange_type if known else await self._type(kind, topic, robots, groups, until)
             )
         known = self._nodes.get((kind, node_name(topic)))
         of_type = short_type(of_type)
@@ -259,14 +266,13 @@ class Nodes:
         return known
 
     async def _type(
-        self, kind: NodeType, topic: str, robots: Collection[int], groups: Collection[int], timeout_s: float
+        self, kind: NodeType, topic: str, robots: Collection[int], groups: Collection[int], until: Deadline
     ) -> str:
         """What the robots that are meant, and are online, call the type."""
 
         async def offers(robot: int) -> Functionality:
-            return decode_data(
-                Functionality, await self.agent.call(ROS, robot, "offers", timeout_s=timeout_s), ANSWER_BYTES
-            )
+            answer = await self.agent.call(ROS, robot, "offers", timeout_s=max(0.001, until.left_s))
+            return decode_data(Functionality, answer, ANSWER_BYTES)
 
         asked = self._online(robots, groups)
         if not asked:
@@ -278,13 +284,6 @@ class Nodes:
                 raise answer
         return type_behind(topic, kind, told)
 
-    async def _latching(self, node: Node, robots: Collection[int], timeout_s: float) -> set[int]:
-        """Those robots whose topic holds messages for late ones, of which others here have had them."""
-        asked = [robot for robot in robots if robot in node.held]
-        asking = [self.agent.call(ROS, robot, "offers", timeout_s=timeout_s) for robot in asked]
-        answers = zip(asked, await asyncio.gather(*asking, return_exceptions=True), strict=True)
-        return {robot for robot, answer in answers if isinstance(answer, bytes) and latches(answer, node.topic)}
-
     def means(self, user: NodeUser, robot: int) -> bool:
         """Whether a robot is one of those that a user named, by its id or its group."""
         if robot in user.robots:
@@ -295,7 +294,7 @@ class Nodes:
     def _online(self, robots: Collection[int], groups: Collection[int]) -> list[int]:
         return [robot.id for robot in self.agent.directory.of_type(ROS) if robot.id in robots or robot.group in groups]
 
-    async def _use(self, user: User, node: Node, timeout_s: float, depth: int = DEPTH) -> User:
+    async def _use(self, user: User, node: Node, until: Deadline, depth: int = DEPTH) -> User:
         """Register for this user what is not registered, and wait for the robots that are online.
 
         Raises Refused when all of them refuse, CallTimeout when none answers.
@@ -310,20 +309,19 @@ class Nodes:
             node.confirmed.clear()  # all of them are asked again
             self._calls.register(node.wanted, sorted(user.robots), sorted(user.groups))
         try:
-            await self._answered(user, node, timeout_s)
+            await self._answered(user, node, until)
         except BaseException:
             user.close()
             raise
         return user
 
-    async def _answered(self, user: NodeUser, node: Node, timeout_s: float) -> None:
-        deadline = time.monotonic() + timeout_s
+    async def _answered(self, user: NodeUser, node: Node, until: Deadline) -> None:
         while user.is_open:
             meant = self._online(user.robots, user.groups)
             waiting = [robot for robot in meant if robot not in node.confirmed and robot not in node.refused]
             if 0 in node.refused:
                 raise Refused(node.refused[0])
-            left_s = deadline - time.monotonic()
+            left_s = until.left_s
             if waiting and left_s > 0:
                 node.changed.clear()
                 with suppress(asyncio.TimeoutError):
@@ -332,7 +330,7 @@ class Nodes:
             if any(robot in node.confirmed for robot in meant):
                 return
             if waiting:
-                raise CallTimeout(f"registration of {node.topic} on ros/{waiting[0]}", timeout_s)
+                raise CallTimeout(f"registration of {node.topic} on ros/{waiting[0]}", until.timeout_s)
             if meant:
                 raise Refused(_reasons({robot: node.refused[robot] for robot in meant}))
             log.info("%s: no robot that was named is online; registered when one comes", node.topic)
@@ -343,7 +341,8 @@ class Nodes:
         """A user has closed."""
         node.users.remove(user)
         if not node.users:
-            self._nodes.pop(node.key, None)
+            if self._nodes.get(node.key) is node:
+                del self._nodes[node.key]
             node.let_go()
         gone = sorted(user.robots - node.robots), sorted(user.groups - node.groups)
         if not self._closed and any(gone):
@@ -374,18 +373,10 @@ class Nodes:
                 continue
             of_type, now = node.wanted.data_exchange_type, time.monotonic()
             messages = [TopicMessage(robot, node.topic, of_type, cdr, self.types, now) for cdr in data]
-            self._hold(node, robot, messages)
+            self._late.hold(node, robot, messages)
             for user in list(node.users):
                 if self.means(user, robot):
                     self._give(user, messages)
-
-    def _hold(self, node: Node, robot: int, messages: Iterable[TopicMessage]) -> None:
-        """For subscriptions that come later."""
-        held = node.held.get(robot)
-        if held is None:
-            held = node.held[robot] = Held(self._held)
-        for message in messages:
-            held.put(message, node.wanted.buffer_size)
 
     def _give(self, user: NodeUser, messages: Iterable[TopicMessage]) -> None:
         assert isinstance(user, TopicSubscription)
@@ -457,6 +448,7 @@ class Nodes:
     def presence(self, change: Change) -> None:
         """Somebody came or left: robots that come back are told again what is used of them."""
         if change.agent.type == ROS:
+            self._late.is_back(change.agent.id)
             for node in self._nodes.values():
                 node.confirmed.discard(change.agent.id)
                 node.refused.pop(change.agent.id, None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Awaitable
 from typing import TypeVar
 
@@ -12,6 +13,19 @@ else:
     from async_timeout import timeout
 
 T = TypeVar("T")
+
+
+class Deadline:
+    """A limit of time, in seconds, for several waits that come one after the other."""
+
+    def __init__(self, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        self._at = time.monotonic() + timeout_s
+
+    @property
+    def left_s(self) -> float:
+        """How long may still be waited. Below 0 it is over."""
+        return self._at - time.monotonic()
 
 
 async def within(awaitable: Awaitable[T], timeout_s: float | None) -> T:

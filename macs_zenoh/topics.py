@@ -202,6 +202,12 @@ class TopicSubscription(NodeUser):
         self._arrived.set()
         return not full
 
+    def put_before(self, messages: Collection[TopicMessage]) -> None:
+        """Older ones, as far as there is room beside those that wait."""
+        room = self.depth - len(self._waiting)
+        self._waiting.extendleft(list(messages)[: -room - 1 : -1] if room > 0 else ())
+        self._arrived.set()
+
     async def receive(self) -> TopicMessage:
         """The next message. Raises Closed once the subscription or its agent is."""
         while not self._waiting:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable
 
 import pytest
 
 import macs_zenoh
+from macs_zenoh import late, nodes
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Refused
+from macs_zenoh.held import Room
 from macs_zenoh.protocol.messages import (
     AddNode,
     Metadata,
@@ -18,10 +20,13 @@ from macs_zenoh.protocol.messages import (
     RemoveNode,
     StreamData,
     decode_data,
+    encode_data,
     encode_management,
 )
+from macs_zenoh.protocol.robot_state import Offered, TopicQos
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
+from macs_zenoh.timeouts import within
 from tests.support.local import patient
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
@@ -236,6 +241,92 @@ async def test_many_subscribe_at_once(router: str) -> None:
         for user in users:
             user.close()
         await until(lambda: not first.registrants, PATIENCE_S)
+
+
+async def test_the_last_other_may_leave_while_one_subscribes(router: str) -> None:
+    """Whoever comes meanwhile shares its node, and keeps it when that one leaves."""
+    async with robot(router, 1) as first, macs_zenoh.join("unity", id=300, settings=patient(router)) as agent:
+        asked, may_say = asyncio.Event(), asyncio.Event()
+
+        async def offers(call: macs_zenoh.Call) -> bytes:
+            asked.set()
+            await may_say.wait()
+            return b"{}"
+
+        first.agent.serve("offers", offers)
+        await knows(agent, 1)
+        other = await agent.subscribe(TOPIC, robot=1, type=STRING)
+        await hears(other, 1)
+        subscribing = asyncio.create_task(agent.subscribe(TOPIC, robot=1, type=STRING, timeout_s=PATIENCE_S))
+        await asyncio.wait_for(asked.wait(), PATIENCE_S)
+        other.close()
+        third = await agent.subscribe(TOPIC, robot=1, type=STRING, timeout_s=1)
+        may_say.set()
+        second = await subscribing
+        await hears(third, 1)
+        await hears(second, 1)
+        second.close()
+        while third._waiting:
+            await third.receive()
+        await hears(third, 1)
+        third.close()
+        await until(lambda: not first.registrants, PATIENCE_S)
+
+
+async def test_who_does_not_say_what_it_holds_is_asked_once(router: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It costs one later subscription a moment, which is counted, and the next ones nothing."""
+    monkeypatch.setattr(late, "OFFERS_S", 0.2)
+    async with robot(router, 1) as first, macs_zenoh.join("unity", id=300, settings=patient(router)) as agent:
+        asked: list[int] = []
+
+        async def offers(call: macs_zenoh.Call) -> bytes:
+            asked.append(1)
+            await asyncio.Event().wait()
+            return b""
+
+        first.agent.serve("offers", offers)
+        await knows(agent, 1)
+        for _ in range(3):
+            await hears(await agent.subscribe(TOPIC, robot=1, type=STRING, timeout_s=PATIENCE_S), 1)
+        assert (len(asked), agent.drops["not_held"]) == (1, 1)
+
+
+async def test_what_has_no_room_is_counted(router: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A later subscription of a latched topic whose messages are not held goes on without them, and it is counted."""
+    monkeypatch.setattr(late, "Room", lambda: Room(3))
+    async with robot(router, 1) as first, macs_zenoh.join("unity", id=300, settings=patient(router)) as agent:
+
+        async def offers(call: macs_zenoh.Call) -> bytes:
+            return encode_data(Offered(qos={TOPIC: TopicQos("reliable", "transient_local")}))
+
+        first.agent.serve("offers", offers)
+        await knows(agent, 1)
+        await hears(await agent.subscribe(TOPIC, robot=1, type=STRING), 1)
+        assert agent.drops["not_held"] == 0
+        await hears(await agent.subscribe(TOPIC, robot=1, type=STRING), 1)
+        assert agent.drops["not_held"] == 1
+
+
+async def test_the_time_is_for_all_of_it(router: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it took to learn the type is gone when the registration is waited for."""
+    waits: list[float] = []
+
+    async def recorded(awaitable: Awaitable[object], timeout_s: float) -> object:
+        waits.append(timeout_s)
+        return await within(awaitable, timeout_s)
+
+    monkeypatch.setattr(nodes, "within", recorded)
+    async with robot(router, 1) as first, macs_zenoh.join("unity", id=300, settings=patient(router)) as agent:
+
+        async def offers(call: macs_zenoh.Call) -> bytes:
+            await asyncio.sleep(0.3)
+            return b'{"publishers": {"/chatter": "std_msgs/msg/String"}}'
+
+        first.agent.serve("offers", offers)
+        await knows(agent, 1)
+        await agent.subscribe(TOPIC, robot=1, timeout_s=PATIENCE_S)
+        assert waits
+        assert max(waits) <= PATIENCE_S - 0.3
 
 
 async def test_registrations_survive_the_router() -> None:

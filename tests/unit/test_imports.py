@@ -33,6 +33,7 @@ WITH_ASYNCIO = WITH_ZENOH | {
         "deadline.py",
         "identity.py",
         "joining.py",
+        "late.py",
         "locked_out.py",
         "nodes.py",
         "presence.py",
