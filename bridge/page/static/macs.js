@@ -114,6 +114,8 @@ export class Headset extends EventTarget {
     this.roundTripMs = null;
     /** Messages that came and could not be read. */
     this.badMessages = 0;
+    /** How many connections were begun: another number is another connection. */
+    this.joins = 0;
     /** A `CommandClock`, where commands tell their time. */
     this.clock = null;
   }
@@ -321,6 +323,7 @@ export class Headset extends EventTarget {
 
   #join() {
     const { WebSocket: Socket, handshakeMs, maxMessageBytes } = this.#options;
+    this.joins += 1;
     const socket = new Socket(this.url, [SUBPROTOCOL]);
     socket.binaryType = "arraybuffer";
     this.#socket = socket;
