@@ -75,6 +75,7 @@ def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int])
         ),
         nodes=[node.status() for node in nodes],
         drops={**lost_before, **nodes.drops},
+        max_timed_command_age_s=nodes.robot.rules.settings.max_timed_command_age_s,
     )
     return msgspec.json.encode(state)
 

@@ -86,6 +86,8 @@ class RobotStatus(Struct, frozen=True):
     ros_domain: int | None = None
     beside: str | UnsetType = UNSET
     """What its agent cannot do for its safety, where that is a program beside the robot."""
+    max_timed_command_age_s: float | UnsetType = UNSET
+    """It asks what time commands were made, and how old they may be; 0: of any age."""
 
 
 class TopicQos(Struct, frozen=True):
