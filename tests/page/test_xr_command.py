@@ -5,11 +5,31 @@ from __future__ import annotations
 import pytest
 
 from tests.page.test_macs_js import ran
-from tests.support.browser import needs_node
+from tests.support.browser import STATIC, needs_node
 
-PARTS = ("asked", "left", "groups", "anew", "never_younger")
+PARTS = (
+    "asked",
+    "left",
+    "groups",
+    "anew",
+    "never_younger",
+    "late",
+    "owed",
+    "owed_to_a_group",
+    "grouped",
+    "too_many",
+    "standing",
+    "compared",
+    "types",
+    "poke",
+)
 
 
+LIBRARIES = STATIC / "vendor" / "libraries.js"
+NEEDS = pytest.mark.skipif(not LIBRARIES.is_file(), reason="libraries are missing: make page")
+
+
+@NEEDS
 @needs_node
 @pytest.mark.parametrize("part", PARTS)
 def test_what_holds(part: str) -> None:

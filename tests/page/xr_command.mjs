@@ -66,6 +66,99 @@ async function later(wire) {
   throw new Error("nothing was said");
 }
 
+/** What a `CommandLink` needs of a headset; robots that are `here` are online. */
+class Gateway extends Wire {
+  connected = true;
+  waitingBytes = 0;
+  roundTripMs = 1;
+  joins = 1;
+  here = [];
+  drops = 0;
+  answers = true;
+
+  forget(node) {
+    this.nodes = this.nodes.filter((each) => each !== node);
+  }
+
+  async online({ timeoutMs = 50 } = {}) {
+    if (this.answers) return { robots: this.here, headsets: [7] };
+    await pause(timeoutMs);
+    throw Object.assign(new Error("no answer"), { kind: "timeout" });
+  }
+
+  keepConnecting() {}
+  follow() {}
+  isFresh() {
+    return true;
+  }
+
+  drop() {
+    this.drops += 1;
+  }
+
+  close() {
+    this.connected = false;
+  }
+
+  come(...robots) {
+    this.here = robots;
+    this.tell("presence", { robots });
+  }
+
+  /** Commands that were sent since the last time: [{ids, groups, x}]. */
+  commands() {
+    const found = this.sent.splice(0).filter(({ meta, data }) => meta?.nodeType === 2 && data.length > 5);
+    return found.map(({ ids, groups, data }) => ({ ids, groups, x: text(data).linear.x ?? 0 }));
+  }
+}
+
+const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+
+async function until(holds) {
+  for (let tries = 0; tries < 400; tries++) {
+    if (holds()) return;
+    await pause(10);
+  }
+  throw new Error(`not within 4 s: ${holds}`);
+}
+
+/** A `CommandLink` that drives: its robots answer `status`, `events` is what it says. */
+async function linked(more = {}) {
+  globalThis.WebSocket ??= class {};
+  const { Publisher, Subscription } = await load("macs-nodes.js");
+  const { CommandLink } = await load("xr/command-link.js");
+  const headset = new Gateway();
+  const add = (Kind, topic, type, { robots = [], groups = [] } = {}, ...rest) => {
+    let node = headset.nodes.find((each) => each instanceof Kind && each.name === topic);
+    if (!node) headset.nodes.push((node = new Kind(headset, topic, type, {}, ...rest)));
+    return node.register({ robots, groups });
+  };
+  headset.advertise = (...rest) => add(Publisher, ...rest);
+  headset.subscribe = (topic, type, options, then) => add(Subscription, topic, type, options, then);
+  const write = (value) => new TextEncoder().encode(JSON.stringify(value));
+  const types = { get: async () => ({ write }), forget() {} };
+  const status = {};
+  const told = { events: [], state: {} };
+  const tell = (message) => (message.op === "event" ? told.events.push(message.text) : Object.assign(told[message.op] ?? {}, message));
+  const ask = async (path) => status[path.split("/")[3]] ?? null;
+  const me = { may: ["command", "stop", "view"], robots: "any", groups: "any" };
+  const link = new CommandLink({ url: "", me, kept: null, tell, headset, types, ask, ...more });
+  link.set({ forward: 1, turn: 1, hz: 30, lockoutS: 0 });
+  const aim = (robots, others = {}) => link.aim({ robots, topic: "/cmd_vel", type: "geometry_msgs/msg/Twist", seen: robots[0], ...others });
+  const sample = { source: "right", forward: 1, turn: 0 };
+  const grip = (at = performance.now()) => link.input({ at, sample });
+  const free = (at = performance.now()) => link.input({ at, sample: null });
+  const drive = async () => {
+    await until(() => {
+      free();
+      grip();
+      return told.state.held;
+    });
+    headset.commands();
+  };
+  return { headset, link, status, told, aim, grip, free, drive };
+}
+
 const parts = {
   async asked() {
     const { time, wire, clock, command } = await begun();
@@ -186,8 +279,209 @@ const parts = {
     assert.ok(command({ robots: [1] }).sent, "a zero always goes, whatever was said of the time before");
     clock.close();
   },
+
+  async late() {
+    const { headset, link, told, aim, grip, free, drive } = await linked();
+    headset.come(1);
+    aim([1]);
+    await drive();
+    const now = performance.now();
+    grip(now - 300);
+    assert.equal(told.state.held, false, "what is told so late ends it");
+    assert.match(told.state.why, /too late/);
+    assert.deepEqual(headset.commands().map(({ x }) => x), [0]);
+    free(now - 150);
+    grip(now - 100);
+    assert.equal(told.state.held, false, "what hands did before the zero does not come after it");
+    assert.deepEqual(headset.commands(), []);
+    await drive();
+    const ends = performance.now() + 400;
+    while (performance.now() < ends); // the worker stands still, and what was told meanwhile waits
+    for (let at = ends - 390; at < ends - 210; at += 20) grip(at);
+    free(ends - 100);
+    grip(ends - 90);
+    const said = headset.commands();
+    assert.ok(said.every(({ x }) => x === 0), JSON.stringify(said));
+    free();
+    grip();
+    assert.ok(link && headset.commands().some(({ x }) => x === 1), "taken hold of anew");
+  },
+
+  async owed() {
+    const { headset, told, aim, drive, free } = await linked();
+    headset.come(1, 2);
+    aim([1, 2]);
+    await drive();
+    headset.come(1);
+    free();
+    await pause(120); // the zeros that are said in any case
+    const zeros = () => headset.commands().flatMap(({ ids }) => ids);
+    assert.ok(zeros().filter((id) => id === 1).length >= 4, "who is there is told once more, whoever else is not");
+    await pause(600);
+    assert.deepEqual(zeros(), [], "once");
+    aim([3]);
+    headset.come(1, 2);
+    await until(() => zeros().includes(2));
+    assert.equal(told.events.length, 0);
+    const { DEBT_MS, Debts } = await load("xr/owed.js");
+    const debts = new Debts([1, 2], 0);
+    assert.deepEqual([debts.pay([2, 3]), debts.pay([2, 3]), debts.robots], [[2], null, [1]]);
+    assert.ok(debts.isOpen(DEBT_MS - 1) && !debts.isOpen(DEBT_MS), "not for ever");
+    assert.deepEqual(new Debts([], 0).pay([]), [], "a group whose robots nobody knows");
+  },
+
+  async owed_to_a_group() {
+    const { headset, aim, drive, free } = await linked();
+    headset.come(1);
+    aim([], { groups: [5], members: [1, 2], seen: 1 });
+    await drive();
+    headset.come();
+    free();
+    await pause(120);
+    headset.commands();
+    await pause(600);
+    assert.deepEqual(headset.commands(), [], "nobody of it is there");
+    headset.come(2);
+    await until(() => headset.commands().some(({ groups, ids }) => groups.includes(5) && !ids.length));
+  },
+
+  async grouped() {
+    const { headset, link, status, told, aim, drive } = await linked();
+    headset.come(1, 2, 3);
+    status[1] = { nodes: [], stopped: false };
+    status[2] = { nodes: [{ name: "/cmd_vel", control: { holder: "unity/9", seconds_left: 1 } }], stopped: false };
+    aim([], { groups: [5], members: [1, 2], seen: 1 });
+    await until(() => told.state.barred === "headset 9 has control");
+    status[2] = { nodes: [], stopped: true };
+    link.halt.said.clear();
+    await until(() => told.state.barred === "the robot is stopped");
+    status[2].stopped = false;
+    link.halt.said.clear();
+    await drive();
+    headset.come(3);
+    assert.equal(told.state.barred, "the robot is not online");
+  },
+
+  async too_many() {
+    const { headset, told, aim, free, grip, drive } = await linked();
+    const robots = Array.from({ length: 65 }, (_, at) => at + 1);
+    headset.come(...robots);
+    aim(robots);
+    free();
+    grip();
+    assert.match(told.state.barred, /65 robots are too many: at most 64/);
+    assert.deepEqual(headset.commands(), []);
+    aim(robots.slice(1));
+    await drive();
+    free();
+    assert.equal(new Set(headset.commands().flatMap(({ ids }) => ids)).size, 64, "all of them");
+  },
+
+  async standing() {
+    const { Standing } = await load("xr/standing.js");
+    const open = [];
+    let most = 0;
+    const ask = (path) => new Promise((resolve) => (most = Math.max(most, open.push({ path, resolve }))));
+    let rounds = 0;
+    const standing = new Standing({ ask, told() {}, done: () => (rounds += 1) });
+    standing.mean([1, 2, 3, 4], "/cmd_vel");
+    const running = standing.round();
+    for (let more = 0; more < 10; more++) standing.round({ anew: false });
+    const answer = async (value) => {
+      open.shift().resolve(value);
+      await pause(1);
+    };
+    const mine = { nodes: [{ name: "/cmd_vel", control: { holder: "unity/7", seconds_left: 1 } }] };
+    for (let more = 0; more < 4; more++) await answer(mine);
+    await running;
+    assert.deepEqual([rounds, most, open.length], [1, 3, 0], "one round at a time");
+    assert.equal(standing.said.get(4).holder, "unity/7");
+    standing.round();
+    standing.round();
+    for (let more = 0; more < 4; more++) await answer(more ? mine : { error: "it does not answer" });
+    assert.equal(standing.said.get(1), null, "what it said before is not shown on");
+    assert.equal(open.length, 3, "what happened meanwhile is asked for");
+    standing.mean([9], "/other");
+    for (let more = 0; more < 4; more++) await answer(mine);
+    assert.equal(standing.said.has(2), false, "of others");
+
+    const { headset, status, told, aim } = await linked();
+    headset.come(1);
+    status[1] = mine;
+    aim([1]);
+    await until(() => told.state.holder === "you");
+    delete status[1];
+    await until(() => told.state.holder === null && told.state.unknown.join() === "1");
+  },
+
+  async compared() {
+    const { headset, link, status, told, aim, drive } = await linked();
+    headset.come(1, 2);
+    status[1] = { nodes: [], max_timed_command_age_s: 0.2 };
+    status[2] = { nodes: [] };
+    aim([1]);
+    await until(() => told.state.barred === "robot 1 has not compared clocks yet");
+    headset.ask(1, link.clock.ticks.name, 5);
+    headset.ask(1, link.clock.ticks.name, 0, true);
+    await drive();
+    link.clock.dispatchEvent(new Event("anew"));
+    assert.deepEqual([told.state.held, told.state.why], [false, "another clock begins"]);
+    aim([2]);
+    await until(() => told.state.clockless?.join() === "2");
+    assert.equal(told.state.barred, "", "a robot of before");
+  },
+
+  async types() {
+    const { persisted } = await load("xr/asking.js");
+    const said = [];
+    let tries = 0;
+    const attempt = async () => {
+      if ((tries += 1) < 4) throw new Error("nobody knows it");
+      return "a type";
+    };
+    assert.equal(await persisted(attempt, () => true, (text) => said.push(text), 1), "a type");
+    assert.deepEqual(said, ["nobody knows it"]);
+    tries = -1000;
+    assert.equal(await persisted(attempt, () => tries < -990, () => {}, 1), null, "as long as it is wanted");
+    let known = false;
+    const write = (value) => new TextEncoder().encode(JSON.stringify(value));
+    const get = async () => {
+      if (!known) throw new Error("nobody knows it");
+      return { write };
+    };
+    const { headset, told, aim, drive } = await linked({ types: { get, forget() {} } });
+    headset.come(1);
+    aim([1]);
+    await until(() => told.events.includes("nobody knows it"));
+    known = true;
+    await until(() => told.state.barred === "");
+    await drive();
+  },
+
+  async poke() {
+    const { Poke } = await load("xr/poke.js");
+    const headset = new Gateway();
+    const poke = new Poke(headset, { answerMs: 30, joinMs: 30 });
+    await Promise.all([poke.ask(), poke.ask()]);
+    assert.equal(headset.drops, 0, "it answers");
+    headset.answers = false;
+    await Promise.all([poke.ask(), poke.ask(), poke.ask()]);
+    assert.equal(headset.drops, 1, "one question at a time");
+    const asked = poke.ask();
+    headset.joins += 1; // it was lost meanwhile, and another one is there
+    await asked;
+    assert.equal(headset.drops, 1, "not the one that has just been made");
+    headset.connected = false;
+    await poke.ask();
+    assert.equal(headset.drops, 2, "one that hangs as it is made");
+    const hanging = poke.ask();
+    headset.connected = true;
+    await hanging;
+    assert.equal(headset.drops, 2);
+  },
 };
 
 const { part } = JSON.parse(readFileSync(0, "utf8"));
 await parts[part]();
 console.log(JSON.stringify({ held: part }));
+process.exit(0); // what it began goes on

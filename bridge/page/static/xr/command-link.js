@@ -6,13 +6,17 @@
  * is not fresh, or the scene has not said anything for a while: a scene that hangs drives nothing.
  */
 
-import { CommandClock } from "../macs-clock.js";
+import { CommandClock, ROBOTS } from "../macs-clock.js";
 import { Headset } from "../macs.js";
 import { Types } from "../ros.js";
+import { get, persisted, soon } from "./asking.js";
 import { stamp } from "./axes.js";
 import { lockout } from "./freshness.js";
 import { Halt } from "./halt.js";
-import { Hold } from "./hold.js";
+import { Hold, STILL_MS } from "./hold.js";
+import { Debts } from "./owed.js";
+import { Poke } from "./poke.js";
+import { Standing } from "./standing.js";
 import { POSE_TYPES, TWIST } from "./wire-types.js";
 
 const FOLLOW_MS = 1000;
@@ -21,12 +25,9 @@ const RETRY_MS = [20, 50, 100, 200, 300, 500];
 const STATUS_MS = 500;
 /** Nothing goes to a gateway that has not answered for so long. */
 const FRESH_MS = 200;
-/** A gateway that is asked on entering XR, after sleep or in a new network, and has not answered by then, is reached anew. */
-const POKE_MS = 400;
 const ZEROS_MS = [40, 80];
 const AGAIN_MS = 500;
 const LEAST_TICK_MS = 5;
-const ROBOTS = 16;
 /** Of a picture of which nothing was heard. */
 const NEVER = { at: null, late: 0 };
 
@@ -39,52 +40,76 @@ export class CommandLink {
   #settings = {};
   #away = "";
   #madeAt = 0;
+  /** When a zero was said last: what hands did before it counts no more. */
+  #endedAt = -Infinity;
   #sentAt = -Infinity;
   /** When nothing waited here last. */
   #clearAt = 0;
   #askedAt = -Infinity;
-  #status = new Map();
   #timer = null;
   #refusal = "";
 
-  /** `tell(message)` tells the scene; `me` is what this token may; `kept` a stop of the page before. */
-  constructor({ url, me, kept, tell }) {
+  /**
+   * `tell(message)` tells the scene; `me` is what this token may; `kept` a stop of the page before. `headset`, `types` and
+   * `ask` are those of a gateway unless others are given.
+   */
+  constructor({ url, me, kept, tell, headset, types, ask = get }) {
     this.tell = tell;
     this.me = me;
-    this.types = new Types("");
-    this.headset = new Headset(url, { silenceMs: SILENCE_MS, retryMs: RETRY_MS });
+    this.types = types ?? new Types("", soon);
+    this.headset = headset ?? new Headset(url, { silenceMs: SILENCE_MS, retryMs: RETRY_MS });
+    this.poking = new Poke(this.headset);
+    this.standing = new Standing({
+      ask,
+      told: (robot, { stopped }) => this.halt.note(robot, stopped === true),
+      done: () => this.#judge(),
+    });
     this.clock = new CommandClock(this.headset);
     this.halt = new Halt(this.headset, me, kept);
     this.online = [];
     this.#listen();
     this.headset.keepConnecting();
     this.headset.follow(FOLLOW_MS);
-    setInterval(() => this.#askStatus(), STATUS_MS);
+    setInterval(() => this.#askStatus({ anew: false }), STATUS_MS);
     setInterval(() => this.#report(), 250);
   }
 
   /** Ask the gateway now: the way to it may be another one. */
-  async poke() {
-    if (!this.headset.connected) return;
-    const answered = await this.headset.online({ timeoutMs: POKE_MS }).catch(() => null);
-    if (answered === null && this.headset.connected) this.headset.drop();
+  poke() {
+    return this.poking.ask();
   }
 
-  /** Whom commands are for: {robots, groups, topic, type}; null: nobody. */
+  /**
+   * Whom commands are for: {robots, groups, members, topic, type}; null: nobody. `members` are the robots that are meant,
+   * also where only groups may be named.
+   */
   aim(target) {
     this.#letGo("another robot was chosen");
     const before = this.#drive;
     this.#drive = null;
-    if (before && !before.owes) this.#leave(before);
+    if (before && !before.debts) this.#leave(before);
     this.#closePoses();
-    this.#status.clear();
     this.#refusal = "";
-    this.#target = target && { ...target, robots: target.robots.slice(0, ROBOTS), groups: target.groups ?? [] };
-    this.clock.mean(target && this.me.may.includes("command") ? this.#target.robots : []);
+    this.#target = target && { members: target.robots, ...target, groups: target.groups ?? [] };
+    const { robots, groups, members, topic } = this.#target ?? { robots: [], groups: [], members: [], topic: "" };
+    this.standing.mean(members, topic);
+    if (this.#commands) this.clock.mean(robots, groups, members);
+    else this.clock.mean([]);
     this.#askStatus();
     this.#judge();
-    if (target?.topic && this.me.may.includes("command")) this.#aimDrive();
+    if (topic && this.#commands) this.#aimDrive();
     this.#openPoses();
+  }
+
+  /** Whether anything at all may be sent to whom it is aimed at. */
+  get #commands() {
+    return Boolean(this.#target) && this.me.may.includes("command") && !this.#tooMany;
+  }
+
+  /** A part of a group would be driven, and the rest not: rather none. */
+  get #tooMany() {
+    const { length } = this.#target?.members ?? [];
+    return length > ROBOTS ? `${length} robots are too many: at most ${ROBOTS} are driven at once` : "";
   }
 
   /** What somebody chose: {forward, turn, hz, lockoutS, poseHz, frame, …, head, left, right …} */
@@ -114,15 +139,18 @@ export class CommandLink {
   /** What hands do: {at, sample, poses}; `at` by this worker's clock. */
   input({ at, sample, poses }) {
     if (this.#away) return; // what is held meanwhile has to be let go of before it counts
-    this.#madeAt = at;
+    const now = performance.now();
+    const made = Math.min(at, now);
+    if (now - made > STILL_MS || made < this.#endedAt) return this.#letGo("what hands do was told too late");
+    this.#madeAt = made;
     this.#judge();
     const was = this.#hold.held;
-    const began = this.#hold.input(sample, performance.now());
+    const began = this.#hold.input(sample, made);
     if (was && !this.#hold.held) this.#ended();
     const due = this.#hold.held && performance.now() - this.#sentAt >= 1000 / this.#settings.hz - 2;
     if (began) this.#report();
     if (began || due) this.#tick();
-    if (poses) this.#sendPoses(poses, at);
+    if (poses) this.#sendPoses(poses, made);
   }
 
   /** Nobody looks or holds any more, and why; empty: somebody does again. */
@@ -133,7 +161,8 @@ export class CommandLink {
 
   /** Ask for control, or give it: {action: "take" | "release" | "give", to}. */
   async control(request) {
-    const { robots = [], topic } = this.#target ?? {};
+    const { robots = [], groups = [], topic } = this.#target ?? {};
+    if (groups.length && !robots.length) this.#say("control", "this token names groups only: robots give control one by one");
     for (const robot of robots) {
       try {
         const { done, reason } = await this.headset.ask(robot, "RobotControl", { ...request, topic });
@@ -163,16 +192,19 @@ export class CommandLink {
   // -- driving -------------------------------------------------------------------------------------------------------
 
   async #aimDrive() {
-    const { topic, type, robots, groups } = this.#target;
+    const { topic, type, robots, groups, members } = this.#target;
     const node = this.headset.advertise(topic, type, { robots, groups });
-    const drive = { topic, robots, groups, node, shape: TWIST[type], type: null, owes: 0 };
+    const drive = { topic, robots, groups, members, node, shape: TWIST[type], type: null, debts: null };
     this.#drive = drive;
-    try {
-      drive.type = await this.types.get(type, robots[0] ?? this.#target.seen);
-    } catch (error) {
-      this.#say("drive", error.message);
-    }
+    drive.type = await this.#typed(type, "drive", () => this.#drive === drive);
     this.#judge();
+  }
+
+  /** A type, asked for as long as it is wanted: a robot that comes later knows it then. */
+  #typed(type, kind, wanted) {
+    const { members, seen } = this.#target;
+    const whom = () => members.find((robot) => this.online.includes(robot)) ?? members[0] ?? seen;
+    return persisted(() => this.types.get(type, whom()), wanted, (text) => this.#say(kind, text));
   }
 
   /** Why nobody may drive now, in words; empty when he may. */
@@ -180,12 +212,13 @@ export class CommandLink {
     const now = performance.now();
     const was = this.#hold.held;
     const quiet = this.#quiet(now);
-    const holder = [...this.#status.values()].map((each) => each.holder).find((each) => each && each !== this.#own);
-    let why = quiet;
+    const holder = this.#status.map((each) => each.holder).find((each) => each && each !== this.#own);
+    let why = quiet || this.#tooMany;
     if (!why && !this.me.may.includes("command")) why = "this token may not drive";
     else if (!why && !this.#drive) why = "the robot takes no velocities";
     else if (!why && !this.#drive.type) why = "the type of its commands is asked for";
     else if (!why && holder) why = `${named(holder)} has control`;
+    else if (!why) why = this.#uncompared();
     this.#hold.bar(why);
     if (was && !this.#hold.held) this.#ended();
     clearTimeout(this.#timer);
@@ -194,14 +227,28 @@ export class CommandLink {
     this.told = why;
   }
 
+  /** What those that are meant said of themselves. */
+  get #status() {
+    return [...this.standing.said.values()].filter(Boolean);
+  }
+
+  /** A robot that compares clocks and has not yet would take commands of any age. */
+  #uncompared() {
+    for (const [robot, said] of this.standing.said) {
+      if (!said?.compares || !this.online.includes(robot) || this.clock.of(robot)?.known) continue;
+      return `robot ${robot} has not compared clocks yet`;
+    }
+    return "";
+  }
+
   /** Why nothing at all goes out. */
   #quiet(now) {
     if (this.#away) return this.#away;
     if (!this.headset.connected) return "no connection";
     if (!this.#target) return "no robot is chosen";
-    const { robots } = this.#target;
-    if (robots.length && !robots.some((robot) => this.online.includes(robot))) return "the robot is not online";
-    return this.halt.bars(robots) || this.#blind(now);
+    const { members } = this.#target;
+    if (members.length && !members.some((robot) => this.online.includes(robot))) return "the robot is not online";
+    return this.halt.bars(members) || this.#blind(now);
   }
 
   #blind(now) {
@@ -261,11 +308,12 @@ export class CommandLink {
   /** A zero at once and twice more, and once again when the gateway is known to have taken it and the robot is there. */
   #ended() {
     const drive = this.#drive;
-    const { robots, groups } = drive;
+    this.#endedAt = performance.now();
     this.speed = { linear: 0, angular: 0 };
-    const zero = () => {
+    const zero = (members = drive.members) => {
       const message = drive.type.write(drive.shape({}, {}, performance.timeOrigin + performance.now()));
-      if (!this.#drives(drive)) drive.node.publish(message, { robots, groups });
+      const { robots, groups } = this.#others(drive, members);
+      if (robots.length || groups.length) drive.node.publish(message, { robots, groups });
     };
     zero();
     for (const ms of ZEROS_MS) setTimeout(zero, ms);
@@ -278,20 +326,28 @@ export class CommandLink {
     return this.#hold.held && this.#drive === drive;
   }
 
-  /** What is owed is owed also when another robot is chosen meanwhile. */
+  /** Of these robots of a drive those that nobody drives now. */
+  #others(drive, members) {
+    const driven = this.#hold.held && this.#drive.node === drive.node ? this.#drive.members : [];
+    const robots = drive.robots.filter((robot) => members.includes(robot) && !driven.includes(robot));
+    return { robots, groups: drive.members.some((robot) => driven.includes(robot)) || this.#drives(drive) ? [] : drive.groups };
+  }
+
+  /** What is owed is owed also when another robot is chosen meanwhile, and by each robot on its own. */
   async #owe(drive, zero) {
-    const debt = (drive.owes += 1);
-    while (drive.owes === debt && !this.#drives(drive)) {
+    const debts = (drive.debts = new Debts(drive.members, performance.now()));
+    const owing = () => drive.debts === debts && !this.#drives(drive);
+    while (owing() && debts.isOpen(performance.now())) {
       const there = await this.headset.online().catch(() => null);
-      if (drive.owes !== debt || this.#drives(drive)) break;
-      if (there && drive.robots.every((robot) => there.robots.includes(robot))) {
-        zero();
-        break;
-      }
-      await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+      const paid = there && owing() ? debts.pay(there.robots) : null;
+      if (paid) zero(paid);
+      if (debts.isOpen(performance.now())) await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
     }
-    if (drive.owes !== debt) return;
-    drive.owes = 0;
+    if (drive.debts !== debts) return;
+    drive.debts = null;
+    if (!this.#drives(drive) && debts.robots.length) {
+      this.#say("drive", `robot ${debts.robots.join(", ")} did not come back to be told to stand`);
+    }
     if (this.#drive !== drive) this.#leave(drive);
   }
 
@@ -308,17 +364,14 @@ export class CommandLink {
   // -- poses ---------------------------------------------------------------------------------------------------------
 
   #openPoses() {
-    if (!this.#target || !this.me.may.includes("command")) return;
-    const { robots, groups, seen } = this.#target;
+    if (!this.#commands) return;
+    const { robots, groups } = this.#target;
     for (const [kind, type] of Object.entries(POSE_TYPES)) {
       const topic = this.#settings[kind];
       if (!topic || this.#poses.has(kind)) continue;
       const one = { node: this.headset.advertise(topic, type, { robots, groups }), type: null, sentAt: -Infinity };
       this.#poses.set(kind, one);
-      this.types.get(type, robots[0] ?? seen).then(
-        (found) => (one.type = found),
-        (error) => this.#say("poses", error.message),
-      );
+      this.#typed(type, "poses", () => this.#poses.get(kind) === one).then((found) => (one.type = found));
     }
   }
 
@@ -350,6 +403,7 @@ export class CommandLink {
     const { headset } = this;
     headset.addEventListener("link", ({ detail: { up, id, why, resumed } }) => {
       if (!up) this.#letGo("the connection is lost");
+      if (!up) this.standing.forget();
       else if (this.#target) this.#askStatus();
       this.tell({ op: "link", which: "commands", up, id, why, resumed });
       this.#judge();
@@ -369,6 +423,11 @@ export class CommandLink {
       this.#say("refused", `${robot ? `robot ${robot}` : "the gateway"} refused ${name}: ${reason}`);
     });
     headset.addEventListener("access", ({ detail: { kind, reason } }) => this.tell({ op: "access", kind, reason }));
+    this.clock.addEventListener("known", () => this.#judge());
+    this.clock.addEventListener("anew", () => {
+      this.#letGo("another clock begins");
+      this.#say("clock", "another clock begins: take hold anew");
+    });
     this.halt.addEventListener("change", () => {
       this.#judge();
       this.tell({ op: "stop", ...this.halt.words(headset.connected), kept: this.halt.kept, stopped: this.halt.stopped() });
@@ -385,25 +444,8 @@ export class CommandLink {
   }
 
   /** Who has control, and whether it is stopped, as each robot says it itself. */
-  async #askStatus() {
-    const target = this.#target;
-    if (!target || !this.headset.connected || this.#away) return;
-    for (const robot of target.robots.length ? target.robots : [target.seen].filter(Boolean)) {
-      const answer = await get(`/view/robots/${robot}/status`);
-      if (target !== this.#target) return;
-      if (!answer || answer.error) continue;
-      const node = answer.nodes?.find((each) => each.name === target.topic && (each.control || each.deadman));
-      this.#status.set(robot, {
-        holder: node?.control?.holder ?? null,
-        exclusive: Boolean(node?.control),
-        secondsLeft: node?.control?.seconds_left ?? 0,
-        deadmanS: node?.deadman?.silence_s ?? null,
-        drops: answer.drops ?? {},
-        registrants: node?.registrants ?? [],
-      });
-      this.halt.note(robot, answer.stopped === true);
-    }
-    this.#judge();
+  #askStatus(how) {
+    if (this.#target && this.headset.connected && !this.#away) this.standing.round(how);
   }
 
   /** Other headsets that would command this robot: whom control can be given to. */
@@ -418,9 +460,11 @@ export class CommandLink {
 
   /** What the scene shows. */
   #report() {
-    const status = [...this.#status.values()];
+    const status = this.#status;
+    const here = (this.#target?.members ?? []).filter((robot) => this.online.includes(robot));
     const holder = status.map((each) => each.holder).find(Boolean) ?? null;
-    const clock = this.#target?.robots.map((robot) => this.clock.of(robot)).find((each) => each?.known);
+    const clock = here.map((robot) => this.clock.of(robot)).find((each) => each?.known);
+    const clockless = here.filter((robot) => this.standing.said.get(robot)?.compares === false && !this.clock.tells(robot));
     this.tell({
       op: "state",
       id: this.headset.id,
@@ -438,7 +482,10 @@ export class CommandLink {
       secondsLeft: status[0]?.secondsLeft ?? 0,
       deadmanS: status[0]?.deadmanS ?? null,
       drops: status[0]?.drops ?? {},
+      /** Robots that were asked who has control, and do not say. */
+      unknown: here.filter((robot) => this.standing.said.get(robot) === null),
       maxAgeS: clock?.maxAgeS ?? null,
+      clockless,
       refusal: this.#refusal,
       unsent: this.#drive?.node.unsent ?? 0,
     });
@@ -449,13 +496,4 @@ export class CommandLink {
 function named(agent) {
   const [type, id] = agent.split("/");
   return `${{ unity: "headset", ros: "robot" }[type] ?? type} ${id}`;
-}
-
-async function get(path) {
-  try {
-    const response = await fetch(path, { cache: "no-store" });
-    return response.ok ? await response.json() : null;
-  } catch {
-    return null;
-  }
 }

@@ -9,8 +9,10 @@ import { Headset } from "../macs.js";
 import { decoded } from "../page/pixels.js";
 import { Rate } from "../page/topics.js";
 import { Types, numberAt } from "../ros.js";
+import { persisted, soon } from "./asking.js";
 import { Frames, cloud, joints, map, poseOf, scan, stampMs } from "./decode.js";
 import { Freshness } from "./freshness.js";
+import { Poke } from "./poke.js";
 
 const SILENCE_MS = 3000;
 const RETRY_MS = [50, 100, 200, 500, 1000];
@@ -44,18 +46,17 @@ export class SightLink {
   constructor({ url, tell, commands }) {
     this.tell = tell;
     this.commands = commands;
-    this.types = new Types("");
+    this.types = new Types("", soon);
     this.points = 20000;
     this.headset = new Headset(url, { silenceMs: SILENCE_MS, retryMs: RETRY_MS });
+    this.poking = new Poke(this.headset);
     this.headset.addEventListener("link", ({ detail }) => this.tell({ op: "link", which: "pictures", ...detail }));
     this.headset.keepConnecting();
     setInterval(() => this.#report(), TOLD_MS);
   }
 
-  async poke() {
-    if (!this.headset.connected) return;
-    const answered = await this.headset.online({ timeoutMs: 400 }).catch(() => null);
-    if (answered === null && this.headset.connected) this.headset.drop();
+  poke() {
+    return this.poking.ask();
   }
 
   /** What is wanted now: [{key, robot, topic, type, shown, guards, path}]; what is wanted no more is left. */
@@ -85,18 +86,16 @@ export class SightLink {
     this.headset.close();
   }
 
-  #begin(one) {
+  async #begin(one) {
     this.#watched.set(one.key, one);
     this.#guard(one, one.guards);
-    this.types.get(one.type, one.robot).then(
-      (type) => {
-        if (this.#watched.get(one.key) !== one) return;
-        one.reader = type;
-        const options = { robots: [one.robot], bufferSize: one.shown === "frames" ? 10 : 1 };
-        this.#nodes.set(one.topic, this.headset.subscribe(one.topic, one.type, options, (message) => this.#take(message)));
-      },
-      (error) => (one.problem = error.message),
-    );
+    const wanted = () => this.#watched.get(one.key) === one;
+    const type = await persisted(() => this.types.get(one.type, one.robot), wanted, (text) => (one.problem = text));
+    if (!type || !wanted()) return;
+    one.problem = "";
+    one.reader = type;
+    const options = { robots: [one.robot], bufferSize: one.shown === "frames" ? 10 : 1 };
+    this.#nodes.set(one.topic, this.headset.subscribe(one.topic, one.type, options, (message) => this.#take(message)));
   }
 
   #guard(one, guards) {

@@ -1,12 +1,12 @@
 /** Whom somebody may look at and drive: robots that are online, and their groups. Pure. */
 
 /**
- * [{id, label, robots, groups, seen}]: `robots` and `groups` name those that commands are for, `seen` is the one whose pictures
- * are shown. `members` tells the group of each robot: {robot: group}; `me` what the token may.
+ * [{id, label, robots, groups, members, seen}]: `robots` and `groups` name those that commands are for, `members` are all robots
+ * that are meant by that, `seen` is the one whose pictures are shown. `members` tells the group of each robot: {robot: group}; `me` what the token may.
  */
 export function targets(online, members, me) {
   const mine = me.robots === "any" ? online : online.filter((robot) => me.robots.includes(robot));
-  const found = mine.map((robot) => ({ id: `robot/${robot}`, label: `Robot ${robot}`, robots: [robot], groups: [], seen: robot }));
+  const found = mine.map((robot) => ({ id: `robot/${robot}`, label: `Robot ${robot}`, robots: [robot], groups: [], members: [robot], seen: robot }));
   const groups = new Map();
   for (const robot of online) {
     const group = members[robot] ?? 0;
@@ -17,7 +17,8 @@ export function targets(online, members, me) {
     const byGroup = me.groups === "any" || me.groups.includes(group);
     if (!named && !byGroup) continue;
     const label = `Group ${group} · ${robots.length} ${robots.length === 1 ? "robot" : "robots"}`;
-    found.push({ id: `group/${group}`, label, robots: named ? robots : [], groups: named ? [] : [group], seen: robots[0] });
+    const whom = named ? { robots, groups: [] } : { robots: [], groups: [group] };
+    found.push({ id: `group/${group}`, label, ...whom, members: robots, seen: robots[0] });
   }
   return found;
 }
