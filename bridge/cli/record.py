@@ -6,7 +6,8 @@ Nothing is lost silently: what did not get into the file is counted there and on
 or when the disk is full; after a crash `macs bag repair` keeps all that was on the disk.
 
 --ring keeps the last minute in memory and writes it when asked (kill -USR1, or its agent's verb `record` for those
-whom [record] allow names), and by itself at a stop or when a dead-man acts (--on).
+whom [record] allow names), and by itself at a stop or when a dead-man acts (--on). A program asks by kill -USR2: that
+is refused after [record] ring_files files, and a line says what became of it.
 
 --serve FOLDER is a recorder that a gateway's page asks ([gateway] recordings = "FOLDER"): start, stop, write the ring,
 list, download, replay. It says nothing by itself and records what it is asked to, but for the ring of --ring.
@@ -57,6 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: macs_DATE.mcap here")
     where.add_argument("--max-size", type=size, default=0, metavar="SIZE", help="end at so much, as 500MB or 2GiB")
     where.add_argument("--max-duration", type=seconds, default=0.0, metavar="TIME", help="end after 90s, 10m, 1h")
+    where.add_argument(
+        "--max-folder", type=size, default=0, metavar="SIZE", help="and when the recordings of its folder have so much"
+    )
     where.add_argument("--split", action="store_true", help="begin another file then, instead of ending")
     where.add_argument("--compress", choices=("zstd", "lz4", "none"), help="chunks (default: lz4)")
     ring = parser.add_argument_group("the last minute")
@@ -90,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _serve(args: argparse.Namespace, settings: Settings) -> int:
-    if args.output or args.split or args.max_size or args.max_duration:
+    if args.output or args.split or args.max_size or args.max_folder or args.max_duration:
         raise UsageError("--serve chooses names and sizes itself: [record] folder_bytes is how much it may keep")
     try:
         from bridge.recording.serving.server import Recorder, Service
@@ -137,6 +141,7 @@ async def _record(args: argparse.Namespace, settings: Settings) -> int:
         max_bytes=args.max_size,
         max_s=args.max_duration,
         split=args.split,
+        folder_bytes=args.max_folder,
         ring_s=args.ring or 0.0,
         ring_bytes=args.ring_size or said.ring_bytes,
         on=tuple(args.on or said.on),
@@ -163,6 +168,7 @@ async def _record(args: argparse.Namespace, settings: Settings) -> int:
             on_ready=lambda me: running.say_ready(f"recording as {me} to {path}"),
             on_progress=tell,
             on_file=lambda report: output.say_if_possible(_told(report, args.json)),
+            on_asked=lambda told: output.say_if_possible(_asked(told, args.json)),
         )
 
 
@@ -176,6 +182,12 @@ def _progress(report: Report) -> dict[str, object]:
         "topics": report.topics,
         "lost": dict(report.lost),
     }
+
+
+def _asked(told: dict[str, str], as_json: bool) -> str:
+    if as_json:
+        return output.as_json({"ring": told})
+    return plain(f"writing {told['file']}" if "file" in told else f"not written: {told['refused']}")
 
 
 def _told(report: Report, as_json: bool) -> str:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from bridge.recording.mcap_file import McapFile
+from bridge.recording.room import FULL, LEAST, taken
 from bridge.recording.streams import LOST, PREFIX, ROS2MSG, Channel
 from macs_zenoh.errors import ConfigError
 
@@ -69,6 +70,7 @@ class Plan:
         max_bytes: a file that has so much is finished; 0: no limit.
         max_s: a file that is so long is finished; 0: no limit.
         split: go on in another file then; else the recording ends.
+        folder_bytes: the recording ends when the recordings of its folder have so much together; 0: no limit.
         about: metadata of each file.
     """
 
@@ -77,6 +79,7 @@ class Plan:
     max_bytes: int = 0
     max_s: float = 0.0
     split: bool = False
+    folder_bytes: int = 0
     about: Mapping[str, str] = field(default_factory=dict)
 
     def file(self, number: int) -> Path:
@@ -108,6 +111,8 @@ class Disk:
         self._lost_channel = Channel(LOST)
         self._written_before = 0
         self._file: McapFile | None = None
+        self._room = 0
+        """What this file may have of its folder, as it was when somebody looked."""
         self._began_ns = 0
         self._thread = threading.Thread(target=self._run, name="macs-disk", daemon=True)
 
@@ -160,6 +165,9 @@ class Disk:
 
     def _open(self) -> None:
         path = self.plan.file(len(self.files))
+        self._look_for_room(path)
+        if self.plan.folder_bytes and self._room < LEAST:
+            raise ConfigError(str(path.parent), f"{FULL}; take some files away")
         try:
             self._file = McapFile(path, compression=self.plan.compression)
             self.files.append(path)
@@ -183,6 +191,7 @@ class Disk:
                     self._tell_lost()
                     self._file.flush()
                     self._count_bytes()
+                    self._look_for_room(self._file.path)
                 if last and not self._queue:
                     break
         except OSError as error:
@@ -213,6 +222,8 @@ class Disk:
             entry = queue.popleft()
             self._taken_bytes += len(entry.data)
             self._write(entry)
+            if self.plan.folder_bytes and self._file is not None and self._file.size >= self._room:
+                return FULL
             if self._is_full(entry.log_ns):
                 if not self.plan.split:
                     return "the recording has the size or length that it may have"
@@ -220,6 +231,10 @@ class Disk:
                 self._open()
                 self._begin(entry.log_ns)
         return ""
+
+    def _look_for_room(self, path: Path) -> None:
+        if self.plan.folder_bytes:
+            self._room = self.plan.folder_bytes - taken(path.absolute().parent, path.absolute())
 
     def _is_full(self, log_ns: int) -> bool:
         file, plan = self._file, self.plan

@@ -47,6 +47,7 @@ class Order:
     max_bytes: int = 0
     max_s: float = 0.0
     split: bool = False
+    folder_bytes: int = 0
     ring_s: float = 0.0
     ring_bytes: int = 512 << 20
     on: tuple[str, ...] = ()
@@ -57,7 +58,7 @@ class Order:
 
     def plan(self, path: Path, about: dict[str, str]) -> Plan:
         """The files."""
-        return Plan(path, self.compression, self.max_bytes, self.max_s, self.split, about)
+        return Plan(path, self.compression, self.max_bytes, self.max_s, self.split, self.folder_bytes, about)
 
 
 @dataclass
@@ -212,7 +213,6 @@ class Recording:
             log.info("%s goes on: %s", open_disk.plan.path, reason)
             return open_disk.plan.path
         self._dumped_at, self._dumps_end = now, now + self._order.after_s
-        self._dumps_made += 1
         path = self._order.path
         stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
         path = path.with_name(f"{path.stem}_{name}_{stamp}{path.suffix}")
@@ -220,8 +220,10 @@ class Recording:
         while path.exists():
             number += 1
             path = path.with_name(f"{self._order.path.stem}_{name}_{stamp}_{number}{path.suffix}")
-        disk = Disk(Plan(path, self._order.compression, about={**self._about(), "reason": reason}))
+        plan = self._order.plan(path, {**self._about(), "reason": reason})
+        disk = Disk(plan, lambda why: log.warning("%s has ended: %s", path, why))
         disk.start()
+        self._dumps_made += 1
         self._ring.write(disk)
         self._dumps[disk] = self._loop.create_task(self._after(disk, reason))
         log.info("writing %s: %s", path, reason)
@@ -285,15 +287,18 @@ async def record(
     on_ready: Callable[[str], None],
     on_progress: Callable[[Report], None],
     on_file: Callable[[Report], None],
+    on_asked: Callable[[dict[str, str]], None],
 ) -> int:
-    """Record until it ends or is cancelled; the exit code. Raises ConfigError, and what `macs_zenoh.join` raises."""
+    """Record until it ends or is cancelled; the exit code. ``on_asked`` hears what became of a program's wish for the
+    ring. Raises ConfigError, and what `macs_zenoh.join` raises."""
     kind, number = order.agent or (2, 0)
     async with macs_zenoh.join(type_name(kind), id=number or None, settings=mesh, on_waiting=on_waiting) as agent:
         recording = Recording(order, agent, on_file)
         recording.start()
-        asked = getattr(signal, "SIGUSR1", None)
-        if order.ring_s and asked is not None:
-            asyncio.get_running_loop().add_signal_handler(asked, lambda: _dump_asked(recording))
+        if order.ring_s and hasattr(signal, "SIGUSR1"):
+            loop = asyncio.get_running_loop()
+            loop.add_signal_handler(signal.SIGUSR1, lambda: _dump_asked(recording))
+            loop.add_signal_handler(signal.SIGUSR2, lambda: on_asked(_dump_for_program(recording)))
         on_ready(str(agent.key))
         try:
             while not recording.ended.is_set():
@@ -304,6 +309,16 @@ async def record(
         finally:
             await asyncio.shield(recording.stop())
     return int(recording.failed)
+
+
+def _dump_for_program(recording: Recording) -> dict[str, str]:
+    """What became of it: the ``file``, or why it is ``refused``."""
+    try:
+        return {"file": recording.dump_for_others("asked", "asked by a signal").name}
+    except Refused as refusal:
+        return {"refused": refusal.reason}
+    except (ConfigError, UsageError) as error:
+        return {"refused": str(error)}
 
 
 def _dump_asked(recording: Recording) -> None:

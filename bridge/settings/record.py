@@ -32,7 +32,7 @@ class RecordSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     """How far it steps back for others where processors are few, as `nice` has it: what is recorded waits in memory,
     what a headset sees and commands does not. 0: not at all."""
     folder_bytes: Annotated[int, Meta(ge=1 << 20, le=1 << 50)] = 50 * 1024 * 1024 * 1024
-    """`--serve` begins no recording when its folder has so much, and ends one when it has."""
+    """`--serve` begins no file when its folder has so much, and ends those that are written, of its ring too."""
     replay_first_id: Annotated[int, Meta(ge=1, le=0xFFFF)] = 65001
     """As which robots `--serve` plays recordings: from this id on."""
     compress: Literal["zstd", "lz4", "none"] = "lz4"

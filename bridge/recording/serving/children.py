@@ -22,6 +22,7 @@ log = logging.getLogger("macs.record")
 START_S = 20.0
 """How long one may take to be ready: it joins the mesh."""
 STOP_S = 10.0
+ANSWER_S = 10.0
 LONGEST_LINE = 1 << 20
 LAST_LINES = 5
 
@@ -36,6 +37,7 @@ class Child:
         self.files: list[str] = []
         self._process = process
         self._ready = asyncio.Event()
+        self._answer: asyncio.Future[dict[str, str]] | None = None
         self._last: deque[str] = deque(maxlen=LAST_LINES)
         loop = asyncio.get_running_loop()
         self._tasks = [loop.create_task(self._hear()), loop.create_task(self._hear_log())]
@@ -76,6 +78,22 @@ class Child:
         with suppress(ProcessLookupError):
             self._process.send_signal(number)
 
+    async def ask_for_ring(self) -> dict[str, str]:
+        """What becomes of the wish that it writes its ring: the ``file``. One at a time. Raises Refused."""
+        if not self._ready.is_set():
+            raise Refused("it has not begun yet")
+        self._answer = asyncio.get_running_loop().create_future()
+        try:
+            self.signal(signal.SIGUSR2)
+            waits: list[asyncio.Future[Any]] = [self._answer, self._ended]
+            await asyncio.wait(waits, timeout=ANSWER_S, return_when=asyncio.FIRST_COMPLETED)
+            told = self._answer.result() if self._answer.done() else {"refused": f"macs {self.name} does not answer"}
+        finally:
+            self._answer = None
+        if "refused" in told:
+            raise Refused(told["refused"])
+        return told
+
     async def stop(self) -> None:
         """End it, as Ctrl-C does; killed when it does not."""
         self.signal(signal.SIGTERM)
@@ -97,6 +115,9 @@ class Child:
                 said = json.loads(text)
                 if isinstance(said, dict) and "progress" in said:
                     self.progress = said["progress"]
+                elif isinstance(said, dict) and "ring" in said:
+                    if self._answer is not None and not self._answer.done():
+                        self._answer.set_result(said["ring"])
                 elif isinstance(said, dict) and "files" in said:
                     self.files += said["files"]
 

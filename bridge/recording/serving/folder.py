@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import stat
 import time
 from collections.abc import Collection
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 from bridge.recording.bag import Bag, Unfinished
 from bridge.recording.happened import happened
+from bridge.recording.room import known, taken
 from macs_zenoh.errors import MacsError, UsageError
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}\.mcap", re.ASCII)
@@ -30,7 +30,7 @@ class Folder:
     def file(self, name: str) -> Path:
         """The file of a name that somebody said. Raises UsageError: it is no name, or no file of this folder."""
         path = self.path / name
-        if NAME.fullmatch(name) is None or self._size(path) is None:
+        if NAME.fullmatch(name) is None or known(path) is None:
             raise UsageError(f"there is no recording called {name[:80]!r}")
         return path
 
@@ -46,21 +46,21 @@ class Folder:
     @property
     def bytes(self) -> int:
         """Of all recordings together."""
-        return sum(size for _, size, _ in self._files())
+        return taken(self.path)
 
     def listed(self, being_written: Collection[str]) -> list[dict[str, Any]]:
         """What there is, the newest first; of a file that is being written its size alone."""
         files = sorted(self._files(), key=lambda each: (each[2], each[0]), reverse=True)[:SHOWN]
-        told, known = [], {}
+        told, facts_of = [], {}
         for name, size, changed_ns in files:
             about: dict[str, Any] = {"name": name, "bytes": size, "changed_ns": changed_ns}
             if name in being_written:
                 told.append({**about, "state": "recording"})
                 continue
             key = (name, size, changed_ns)
-            known[key] = facts = self._known.get(key) or self._facts(self.path / name)
+            facts_of[key] = facts = self._known.get(key) or self._facts(self.path / name)
             told.append({**about, **facts})
-        self._known = known
+        self._known = facts_of
         return told
 
     def happened(self, name: str) -> dict[str, Any]:
@@ -83,18 +83,9 @@ class Folder:
     def _files(self) -> list[tuple[str, int, int]]:
         found = []
         for path in self.path.iterdir():
-            if NAME.fullmatch(path.name) is not None and (known := self._size(path)) is not None:
-                found.append((path.name, *known))
+            if NAME.fullmatch(path.name) is not None and (about := known(path)) is not None:
+                found.append((path.name, *about))
         return found
-
-    @staticmethod
-    def _size(path: Path) -> tuple[int, int] | None:
-        """Size and time of change; None for what is no plain file, as a link that leads elsewhere."""
-        try:
-            known = path.lstat()
-        except OSError:
-            return None
-        return (known.st_size, known.st_mtime_ns) if stat.S_ISREG(known.st_mode) else None
 
     @staticmethod
     def _facts(path: Path) -> dict[str, Any]:

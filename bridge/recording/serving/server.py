@@ -20,6 +20,7 @@ import msgspec
 from aiohttp import web
 from msgspec import Meta, Struct
 
+from bridge.recording.room import FULL, LEAST
 from bridge.recording.serving import socket_of
 from bridge.recording.serving.children import Child
 from bridge.recording.serving.folder import Folder
@@ -94,7 +95,7 @@ class Recorder:
         self._replay: Child | None = None
         self._replayed: dict[str, Any] = {}
         self._problem = ""
-        self._turn = asyncio.Lock()
+        self._turn, self._ring_turn = asyncio.Lock(), asyncio.Lock()
         self._reading = asyncio.Semaphore(READING)
         self._closing = False
         self._runner: web.AppRunner | None = None
@@ -163,7 +164,7 @@ class Recorder:
             "replay": self._replayed if self._replay is not None else None,
             "problem": self._problem,
             "files": files,
-            "bytes": sum(file["bytes"] for file in files),
+            "bytes": await asyncio.to_thread(lambda: self._folder.bytes),
             "most_bytes": self._service.most_bytes,
             "free_bytes": free.free,
         }
@@ -172,11 +173,10 @@ class Recorder:
         async with self._turn:
             if self._recording is not None:
                 raise Refused(f"{self._file} is being recorded already")
-            left = self._service.most_bytes - await asyncio.to_thread(lambda: self._folder.bytes)
-            if left < 1 << 20:
-                raise Refused("the folder has as much as [record] folder_bytes lets it have; take some files away")
+            if self._service.most_bytes - await asyncio.to_thread(lambda: self._folder.bytes) < LEAST:
+                raise Refused(f"{FULL}; take some files away")
             path = await asyncio.to_thread(self._folder.new)
-            words = [*self._service.what, "--max-size", str(left)]
+            words = [*self._service.what]
             words += [word for robot in said.robots for word in ("--robot", str(robot))]
             words += [word for topic in said.topics for word in ("--topics", topic)]
             words += ["--commands"] if said.commands and "--commands" not in words else []
@@ -196,8 +196,8 @@ class Recorder:
     async def _write_ring(self, _: Nothing) -> dict[str, Any]:
         if self._ring is None:
             raise Refused("this recorder has no ring: it is begun with --ring 60s")
-        self._ring.signal(signal.SIGUSR1)
-        return {}
+        async with self._ring_turn:
+            return {"name": (await self._ring.ask_for_ring())["file"]}
 
     async def _play(self, said: Replay) -> dict[str, Any]:
         async with self._turn:
@@ -240,7 +240,8 @@ class Recorder:
     # -- programs ------------------------------------------------------------------------------------------------
 
     async def _begin(self, verb: str, words: Sequence[str], path: Path) -> Child:
-        words = [verb, *self._service.mesh, *words, "--json", "--progress", "-o", str(path)]
+        most = ("--max-folder", str(self._service.most_bytes))
+        words = [verb, *self._service.mesh, *words, *most, "--json", "--progress", "-o", str(path)]
         return await Child.started(words, self._ended)
 
     def _played_enough(self, child: Child) -> None:
