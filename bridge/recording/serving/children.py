@@ -14,6 +14,7 @@ from contextlib import suppress
 from typing import Any
 
 from bridge.cli.running import READY, STOP_WITH_STDIN
+from bridge.recording.room import FULL
 from macs_zenoh.errors import Refused
 from macs_zenoh.timeouts import within
 
@@ -28,13 +29,14 @@ LAST_LINES = 5
 
 
 class Child:
-    """One program, from `started` until it has ended. ``on_end`` is called then."""
+    """One program, from `spawned` until it has ended. ``on_end`` is called then."""
 
     def __init__(self, process: asyncio.subprocess.Process, name: str, on_end: Callable[[Child], None]) -> None:
         self.name = name
         self.progress: dict[str, Any] = {}
         """What it said last of how it is getting on."""
-        self.files: list[str] = []
+        self._reasons: deque[str] = deque(maxlen=LAST_LINES)
+        """Why its files ended."""
         self._process = process
         self._ready = asyncio.Event()
         self._answer: asyncio.Future[dict[str, str]] | None = None
@@ -44,8 +46,8 @@ class Child:
         self._ended = loop.create_task(self._wait(on_end))
 
     @classmethod
-    async def started(cls, words: Sequence[str], on_end: Callable[[Child], None]) -> Child:
-        """A program that is ready. Raises Refused with its last words."""
+    async def spawned(cls, words: Sequence[str], on_end: Callable[[Child], None]) -> Child:
+        """A program that has begun, and is not `ready`: who keeps it knows it before it can have ended."""
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "bridge", *words),
             stdin=asyncio.subprocess.PIPE,
@@ -55,22 +57,34 @@ class Child:
             limit=LONGEST_LINE,
             env={**os.environ, STOP_WITH_STDIN: "1", "PYTHONUNBUFFERED": "1"},
         )
-        child = cls(process, words[0], on_end)
-        ready = asyncio.ensure_future(child._ready.wait())
+        return cls(process, words[0], on_end)
+
+    async def ready(self) -> None:
+        """Wait for it. Raises Refused with its last words: it has been ended."""
+        ready = asyncio.ensure_future(self._ready.wait())
         try:
-            await asyncio.wait([ready, child._ended], timeout=START_S, return_when=asyncio.FIRST_COMPLETED)
-            if not ready.done():
-                raise Refused(f"macs {words[0]} did not begin: {child.problem or f'not within {START_S:g} s'}")
+            await asyncio.wait([ready, self._ended], timeout=START_S, return_when=asyncio.FIRST_COMPLETED)
+            if not self._ready.is_set():
+                raise Refused(f"macs {self.name} did not begin: {self._words or f'not within {START_S:g} s'}")
         except BaseException:
-            await child.stop()
+            await self.stop()
             raise
         finally:
             ready.cancel()
-        return child
 
     @property
     def problem(self) -> str:
-        """Why it ended, in its own last words."""
+        """Why it ended, where it should not have; empty where it ended in order, or goes on."""
+        code = self._process.returncode
+        if not code:
+            return FULL if FULL in self._reasons else ""
+        if code < 0:
+            return f"it was ended by signal {-code}"
+        return (self._reasons[-1] if self._reasons else "") or self._words or f"exit code {code}"
+
+    @property
+    def _words(self) -> str:
+        """Its last words."""
         return next((line for line in reversed(self._last) if line.startswith("macs")), "; ".join(self._last))
 
     def signal(self, number: signal.Signals) -> None:
@@ -119,7 +133,7 @@ class Child:
                     if self._answer is not None and not self._answer.done():
                         self._answer.set_result(said["ring"])
                 elif isinstance(said, dict) and "files" in said:
-                    self.files += said["files"]
+                    self._reasons.append(str(said.get("reason", "")))
 
     async def _hear_log(self) -> None:
         assert self._process.stderr is not None

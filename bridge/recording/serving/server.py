@@ -32,6 +32,7 @@ log = logging.getLogger("macs.record")
 BODY_BYTES = 4 << 10
 PLAYED_S = 1800.0
 """A replay goes on, again and again from where it began, until it is stopped, and no longer than this."""
+RING_AGAIN_S = 5.0
 READING = 2
 """So many files are gone through at a time for who asks what happened in them."""
 
@@ -94,7 +95,10 @@ class Recorder:
         self._ring: Child | None = None
         self._replay: Child | None = None
         self._replayed: dict[str, Any] = {}
-        self._problem = ""
+        self._problems: dict[str, str] = {}
+        """Of the recording, the ring and the replay: why it ended, until it is begun again."""
+        self._ring_gone = asyncio.Event()
+        self._ring_keeper: asyncio.Task[None] | None = None
         self._turn, self._ring_turn = asyncio.Lock(), asyncio.Lock()
         self._reading = asyncio.Semaphore(READING)
         self._closing = False
@@ -125,11 +129,14 @@ class Recorder:
         except OSError as error:
             raise ConfigError(str(path), error.strerror or str(error)) from error
         if self._service.ring:
-            self._ring = await self._begin("record", self._service.ring, self._folder.path / "ring.mcap")
+            await self._begin_ring()
+            self._ring_keeper = asyncio.create_task(self._keep_ring())
 
     async def close(self) -> None:
         """End, with all that waits written."""
         self._closing = True
+        if self._ring_keeper is not None:
+            self._ring_keeper.cancel()
         children = [child for child in (self._recording, self._ring, self._replay) if child is not None]
         await asyncio.gather(*(child.stop() for child in children))
         if self._runner is not None:
@@ -162,7 +169,7 @@ class Recorder:
             "recording": {"name": self._file, **self._recording.progress} if self._recording is not None else None,
             "ring": self._ring.progress if self._ring is not None else None,
             "replay": self._replayed if self._replay is not None else None,
-            "problem": self._problem,
+            "problem": "; ".join(self._problems.values()),
             "files": files,
             "bytes": await asyncio.to_thread(lambda: self._folder.bytes),
             "most_bytes": self._service.most_bytes,
@@ -181,9 +188,12 @@ class Recorder:
             words += [word for topic in said.topics for word in ("--topics", topic)]
             words += ["--commands"] if said.commands and "--commands" not in words else []
             words += ["--max-duration", f"{said.seconds}s"] if said.seconds else []
-            self._problem = ""
-            self._recording = await self._begin("record", words, path)
+            self._problems.pop("recording", None)
             self._file = path.name
+            self._recording = recording = await self._record(words, path)
+            await recording.ready()
+            if problem := self._problems.get("recording"):  # it has ended since
+                raise Refused(problem)
             return {"name": path.name}
 
     async def _stop(self, _: Nothing) -> dict[str, Any]:
@@ -210,10 +220,12 @@ class Recorder:
             words = ["replay", *self._service.mesh, "--loop", "--start", f"{said.start_s:.3f}s"]
             words += [word for old, new in names.items() for word in ("--as-robot", f"{old}:{new}")]
             words += ["--", str(self._folder.file(said.name))]
-            self._replay = playing = await Child.started(words, self._ended)
-            asyncio.get_running_loop().call_later(PLAYED_S, self._played_enough, playing)
             as_robots = {str(old): new for old, new in names.items()}
             self._replayed = {"name": said.name, "start_s": said.start_s, "robots": as_robots}
+            self._problems.pop("replay", None)
+            self._replay = playing = await Child.spawned(words, self._ended)
+            await playing.ready()
+            asyncio.get_running_loop().call_later(PLAYED_S, self._played_enough, playing)
             return self._replayed
 
     async def _stop_playing(self, _: Nothing) -> dict[str, Any]:
@@ -239,10 +251,28 @@ class Recorder:
 
     # -- programs ------------------------------------------------------------------------------------------------
 
-    async def _begin(self, verb: str, words: Sequence[str], path: Path) -> Child:
+    async def _record(self, words: Sequence[str], path: Path) -> Child:
         most = ("--max-folder", str(self._service.most_bytes))
-        words = [verb, *self._service.mesh, *words, *most, "--json", "--progress", "-o", str(path)]
-        return await Child.started(words, self._ended)
+        words = ["record", *self._service.mesh, *words, *most, "--json", "--progress", "-o", str(path)]
+        return await Child.spawned(words, self._ended)
+
+    async def _begin_ring(self) -> None:
+        self._ring = ring = await self._record(self._service.ring, self._folder.path / "ring.mcap")
+        await ring.ready()
+
+    async def _keep_ring(self) -> None:
+        """Begin it again where it has ended."""
+        while True:
+            await self._ring_gone.wait()
+            await asyncio.sleep(RING_AGAIN_S)
+            self._ring_gone.clear()
+            try:
+                await self._begin_ring()
+                self._problems.pop("ring", None)
+                log.info("the ring goes on, without what it had")
+            except (Refused, OSError) as error:
+                self._ring_gone.set()
+                log.error("the ring does not begin: %s", error)
 
     def _played_enough(self, child: Child) -> None:
         """Nobody looks at it any more, as likely as not."""
@@ -250,16 +280,23 @@ class Recorder:
             child.signal(signal.SIGTERM)
 
     def _ended(self, child: Child) -> None:
+        problem = child.problem
         if child is self._recording:
             self._recording = None
+            self._tell("recording", f"{self._file} has ended: {problem}" if problem else "")
             log.info("%s is recorded", self._file)
         elif child is self._ring:
             self._ring = None
-            if not self._closing:
-                self._problem = f"the ring has ended: {child.problem}"
-                log.error("%s", self._problem)
+            self._ring_gone.set()
+            self._tell("ring", f"the ring has ended: {problem or 'somebody has ended it'}; it begins again")
         elif child is self._replay:
             self._replay = None
+            self._tell("replay", f"the replay has ended: {problem}" if problem else "")
+
+    def _tell(self, what: str, problem: str) -> None:
+        if problem and not self._closing:
+            self._problems[what] = problem
+            log.error("%s", problem)
 
 
 def _take_over(path: Path) -> None:

@@ -9,6 +9,7 @@ const KINDS = ["stop", "deadman", "refusal", "loss", "control"];
 export class RecordView {
   constructor(page) {
     this.page = page;
+    this.refused = "";
     this.state = h("p", { class: "facts", role: "status", id: "record-state" }, "Asking the recorder …");
     this.problem = h("p", { class: "bad", role: "alert", id: "record-problem" });
     this.commands = h("input", { type: "checkbox", id: "record-commands", checked: true });
@@ -89,7 +90,7 @@ export class RecordView {
     parts.push(`${size(told.bytes)} of ${size(told.most_bytes)}, ${size(told.free_bytes)} free on the disk`);
     say(this.state, parts.join(" · "));
     this.state.dataset.recording = recording === null ? "" : recording.name;
-    if (told.problem) say(this.problem, told.problem);
+    say(this.problem, [this.refused, told.problem].filter(Boolean).join(" · "));
     this.#showReplay(replay);
     this.keyed.set(files.map(({ name }) => name));
     for (const file of files) this.#fill(this.keyed.get(file.name), file);
@@ -177,6 +178,7 @@ export class RecordView {
 
   /** Ask for something; what comes of it, or why it is not done, is shown. */
   async #order(what, said = {}) {
+    this.refused = "";
     say(this.problem, "");
     let told = null;
     try {
@@ -185,7 +187,8 @@ export class RecordView {
     } catch {
       told = { error: "the gateway does not answer" };
     }
-    if (told.error) say(this.problem, told.error);
+    this.refused = told.error ?? "";
+    say(this.problem, this.refused);
     this.#show(await this.page.get("/recordings/state"));
   }
 
