@@ -4,6 +4,7 @@ Open ws://127.0.0.1:8765 there (Open connection, Foxglove WebSocket). A robot is
 at it. Web pages from elsewhere are refused unless --origin names them, as https://app.foxglove.dev; programs of this
 machine are not. With --tokens each client shows a token that `macs token` made, in the address since Foxglove has no
 other place: ws://HOST:8765/?token=macs_... It is for all that is shown; what is published and called needs its rights.
+Other users of THIS machine can look without one: the SDK's server, behind ours, listens on a port of 127.0.0.1.
 
 It only shows, unless it has --publish: then the publish and service panels work on /ROBOT/TOPIC, and MAY MOVE ROBOTS,
 as far as their rules, control, dead-man and emergency stop let a headset do so.
@@ -51,7 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--topics", type=pattern, action="append", default=[], metavar="PATTERN", help="as '/camera/**'; repeat (all)"
     )
-    parser.add_argument("--tokens", metavar="FILE", help="each client shows a token of this file of `macs token`")
+    parser.add_argument(
+        "--tokens",
+        metavar="FILE",
+        help="each client shows a token of this file of `macs token`; users of this machine can look without",
+    )
     parser.add_argument(
         "--origin", action="append", default=[], metavar="ORIGIN", help="web pages from there may come; repeat"
     )
