@@ -163,9 +163,12 @@ class Pictures:
         try:
             image = read_image(cdr)
             data = jpeg.encode(image, picture.rule.quality, picture.rule.max_width)
-        except NotAnImage as error:
-            self._robot.drops.note(FAILED, picture.name, str(error))
-            self._tell(picture.topic, FAILED, f"no picture can be made of {picture.name}: {error}")
+        except Exception as error:  # the library has limits of its own, and says them in many ways
+            reason = str(error) or type(error).__name__
+            if not isinstance(error, NotAnImage):
+                log.debug("%s: no picture", picture.name, exc_info=True)
+            self._robot.drops.note(FAILED, picture.name, reason)
+            self._tell(picture.topic, FAILED, f"no picture can be made of {picture.name}: {reason}")
             return
         with contextlib.suppress(Exception):  # it was closed meanwhile
             publisher.publish(write_compressed(image, f"{image.encoding}; jpeg compressed bgr8", data))

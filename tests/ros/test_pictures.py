@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import asyncio
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -230,6 +231,27 @@ async def test_what_cannot_be_shown_is_counted_and_told(router: str, domain: int
             await until(lambda: told)
             assert "'16UC1' is none of rgb8, bgr8" in told[0]
             assert agent.nodes.drops["no_jpeg"]
+
+
+async def test_what_the_library_refuses_is_counted_and_told(
+    router: str, domain: int, peer: Peer, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An image higher than a JPEG may be, as one whose encoding is not known: in one line, and not at each frame."""
+    message = image(picture(RED, width=2, height=65_600), "rgb8")
+    async with robot(router, domain) as agent, published(peer, message):
+        await until(lambda: "/camera/image/compressed" in agent.nodes.robot.made)
+        async with macs_zenoh.join("unity", settings=patient(router)) as headset:
+            await until(lambda: (1, ROBOT) in headset.directory)
+            taker = await headset.subscribe("/camera/image/compressed", robot=ROBOT)
+            told: list[str] = []
+            taker.on_refused(lambda _robot, reason: told.append(reason))
+            await until(lambda: told)
+            assert "no picture can be made of /camera/image: " in told[0]
+            await until(lambda: agent.nodes.drops["no_jpeg"] > 2)
+    said = [
+        record for record in caplog.records if record.levelno > logging.DEBUG and "/camera/image" in record.message
+    ]
+    assert [record.exc_info for record in said if "no_jpeg" in record.message or record.exc_info] == [None]
 
 
 async def test_there_are_no_more_than_are_wanted(router: str, domain: int, peer: Peer) -> None:
