@@ -246,6 +246,113 @@ const parts = {
     assert.equal(driveTopic(takes, "/gone", TWIST), null, "what was chosen and is gone is not replaced");
   },
 
+  async opened() {
+    const { Opened } = await load("xr/opened.js");
+    const drive = { forward: 1, turn: 0 };
+    const opened = new Opened();
+    const read = (held, source = "right", kind = "controller") => [{ source, kind, drive: held ? drive : null, open: !held }];
+    const held = [{ source: "right", ...drive }];
+    assert.deepEqual(opened.held(read(true)), [], "it came with its grip held");
+    assert.deepEqual(opened.held(read(false)), []);
+    assert.deepEqual(opened.held(read(true)), held);
+    assert.deepEqual(opened.held([]), [], "it sleeps");
+    assert.deepEqual(opened.held(read(true)), [], "and is held as it wakes up");
+    opened.held(read(false));
+    assert.deepEqual(opened.held(read(true)), held);
+    assert.deepEqual(opened.held(read(true, "right", "hand")), [], "a hand is another one than its controller");
+    opened.held(read(false));
+    opened.clear();
+    assert.deepEqual(opened.held(read(true)), [], "nobody was there meanwhile");
+    const [pinch] = read(false, "right", "hand");
+    assert.deepEqual(opened.held([{ ...pinch, open: false }]), []);
+    assert.deepEqual(opened.held(read(true, "right", "hand")), [], "pinched on a panel, and never seen open");
+  },
+
+  async halt() {
+    const { Halt } = await load("xr/halt.js");
+    const me = { may: ["stop"], robots: "any", groups: "any" };
+    const started = (kept = null) => {
+      const headset = new EventTarget();
+      const node = { robots: new Set(), register() {}, deregister() {} };
+      const sent = [];
+      let take;
+      headset.connected = true;
+      headset.subscribe = (_topic, _type, _options, listener) => ((take = listener), node);
+      headset.advertise = () => ({ ...node, publish: (data, { robots }) => sent.push([data[4], ...robots]) });
+      const status = new Map();
+      const halt = new Halt(headset, me, kept, async (robot) => status.get(robot));
+      const says = (senderId, stopped) => take({ senderId, data: new Uint8Array([0, 1, 0, 0, Number(stopped)]) });
+      const link = (up) => {
+        headset.connected = up;
+        headset.dispatchEvent(new CustomEvent("link", { detail: { up } }));
+      };
+      const words = () => halt.words(headset.connected);
+      const check = () => halt.check(performance.now() + 2000);
+      return { halt, says, link, words, sent, status, check };
+    };
+    const confirmed = () => {
+      const one = started();
+      one.halt.setOnline([1, 2]);
+      one.halt.press();
+      one.says(1, true);
+      one.says(2, true);
+      assert.deepEqual(one.words(), { state: "stopped", text: "robot 1, 2 stopped" });
+      one.sent.length = 0;
+      return one;
+    };
+    for (const latched of [true, false]) {
+      const one = confirmed();
+      one.halt.setOnline([2]);
+      one.halt.setOnline([1, 2]); // its program has started anew, which ends its stop
+      if (latched) one.says(1, false);
+      assert.deepEqual(one.words(), { state: "waiting", text: "not confirmed yet by robot 1" });
+      assert.match(one.halt.bars([1]), /stop/);
+      if (!latched) assert.deepEqual(one.sent, [[1, 1]]);
+      one.says(1, true);
+      assert.equal(one.words().state, "stopped");
+      one.halt.release();
+    }
+    const told = confirmed();
+    told.halt.setOnline([1]);
+    told.halt.setOnline([1, 2]);
+    told.says(2, true);
+    assert.equal(told.words().state, "stopped", "it says that it holds on");
+    told.halt.release();
+
+    const away = confirmed();
+    away.link(false);
+    assert.deepEqual(away.words(), { state: "waiting", text: "no connection: how robots are is not known" });
+    away.link(true);
+    assert.deepEqual(away.sent, [[1, 1, 2]], "the way to them was lost: told again");
+    assert.equal(away.words().state, "waiting");
+    away.status.set(1, true).set(2, true);
+    await away.check(); // what they said on the topic was lost
+    assert.deepEqual(away.words(), { state: "stopped", text: "robot 1, 2 stopped" });
+    away.halt.release();
+
+    const lost = started();
+    lost.halt.setOnline([1, 2]);
+    lost.says(2, false);
+    lost.halt.press();
+    lost.status.set(1, true).set(2, true);
+    await lost.halt.check();
+    assert.equal(lost.words().state, "waiting", "just pressed: nobody is asked yet");
+    await lost.check();
+    assert.deepEqual(lost.words(), { state: "stopped", text: "robot 1, 2 stopped" });
+    lost.halt.release();
+    lost.status.set(1, false).set(2, false);
+    await lost.check();
+    assert.equal(lost.words().state, "free", "that they go on was lost");
+
+    const others = confirmed();
+    others.halt.pressedAt = performance.now() - 5000;
+    others.says(1, false);
+    others.says(2, false);
+    assert.equal(others.words().state, "free", "somebody has let all of them go on");
+    others.halt.setOnline([1, 2, 3]);
+    assert.equal(others.words().state, "free");
+  },
+
   async guards() {
     const { guardOf, wishes } = await load("xr/targets.js");
     const { SHOWN } = await load("xr/wire-types.js");

@@ -27,6 +27,13 @@ class Scene {
   #idleAt = 0;
   #stopping = true;
   #before = 0;
+  #absent = "";
+  #blurred = false;
+  /** Why nothing is drawn; empty: all is. */
+  #undrawn = "";
+  #space = null;
+  /** Whether the origin has moved since somebody took hold of something: then poses are of another place. */
+  #moved = false;
 
   constructor(me) {
     this.me = me;
@@ -107,30 +114,61 @@ class Scene {
     const space = this.stage.renderer.xr.getReferenceSpace();
     const immersive = Boolean(frame && space && this.immersion.session);
     const sources = immersive ? this.input.read(frame, space, this.immersion.session.inputSources) : this.looking.sources();
-    this.pointing.targets = this.room.targets;
-    this.pointing.update(sources, dt);
-    this.looking.free(sources, this.pointing.panelUnder("mouse"));
     this.#stopIfPressed(sources);
+    this.#follows(immersive ? space : null);
+    this.#undrawn = this.#draw(sources, dt);
+    this.#attend();
+    const there = !this.#absent;
+    const sample = there ? this.input.drive(sources, this.stage.head().facing) : null;
+    if (sample) this.#moved = false;
+    const posed = there && immersive && this.wanted.size && !this.#moved;
+    const poses = posed ? this.input.poses(frame, space, sources, this.wanted) : null;
+    this.sample = sample;
     // of who is not there it is not known whether he holds on: that he has let go has to be seen
-    const there = immersive ? this.immersion.attended : document.hasFocus();
-    const sample = there ? this.input.drive(sources, this.stage.head().facing) : undefined;
-    const poses = immersive && this.wanted.size ? this.input.poses(frame, space, sources, this.wanted) : null;
-    this.sample = sample ?? null;
     if (there) this.#send(sample, poses, began);
-    this.hands.show(sources, this.pointing.distances, this.telling.state.source);
-    this.links.showPictures(this.room, this.wishes);
-    this.stage.render();
     this.frames += 1;
     this.frameMs.push(performance.now() - began);
     if (this.frameMs.length > 600) this.frameMs.splice(0, 300);
   }
 
-  #send(sample, poses, now) {
+  /** Draw all; why nothing was drawn, or "". Only what was drawn was shown. */
+  #draw(sources, dt) {
+    try {
+      this.pointing.targets = this.room.targets;
+      this.pointing.update(sources, dt);
+      this.looking.free(sources, this.pointing.panelUnder("mouse"));
+      this.hands.show(sources, this.pointing.distances, this.telling.state.source);
+      this.links.showPictures(this.room, this.wishes);
+      this.stage.render();
+      if (this.stage.lost) return "nothing is drawn: the browser took the graphics away";
+      this.links.acknowledge();
+      return "";
+    } catch (error) {
+      return `nothing is drawn: ${error.message}`;
+    }
+  }
+
+  /** The origin of all poses may move, as when who wears the headset centres his view: what is held then is held elsewhere. */
+  #follows(space) {
+    if (space === this.#space) return;
+    this.#space = space;
+    space?.addEventListener("reset", () => space === this.#space && this.#jumped());
+    this.#moved = false;
+  }
+
+  #jumped() {
+    this.#moved = true;
+    this.input.letGo();
+    this.links.away("the view was centred anew");
+    this.links.away(this.#absent);
+  }
+
+  #send(sample, poses, at) {
     const idle = sample === null && poses === null && !this.driven;
     this.driven = sample !== null;
-    if (idle && now - this.#idleAt < IDLE_MS) return;
-    this.#idleAt = now;
-    this.links.input(sample, poses);
+    if (idle && at - this.#idleAt < IDLE_MS) return;
+    this.#idleAt = at;
+    this.links.input(sample, poses, at);
   }
 
   /** Pressed anew: who comes with it pressed has pressed nothing. */
@@ -227,21 +265,29 @@ class Scene {
     this.immersion.addEventListener("left", () => this.#immersed(false));
     this.immersion.addEventListener("attention", () => this.#attend());
     document.addEventListener("visibilitychange", () => this.#attend());
-    addEventListener("blur", () => this.#lostFocus());
-    addEventListener("focus", () => this.#attend());
+    for (const type of ["blur", "focus"]) {
+      addEventListener(type, () => {
+        this.#blurred = type === "blur";
+        this.#attend();
+      });
+    }
     addEventListener("online", () => this.links.poke());
     navigator.connection?.addEventListener?.("change", () => this.links.poke());
     addEventListener("pagehide", () => this.links.away("the page was closed"));
     addEventListener("pageshow", (event) => event.persisted && location.reload());
     addEventListener("keydown", (event) => {
-      if (event.key === "Escape" && !document.querySelector("dialog[open]")) this.stop();
+      if (event.key !== "Escape") return;
+      this.stop();
+      this.overlay.dialog.close();
     });
     this.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
   }
 
   #immersed(immersive) {
-    this.overlay.pad.release();
+    this.input.letGo();
+    this.overlay.dialog.close();
     this.links.away("the headset was put on or off");
+    this.links.away(this.#absent);
     this.stage.setImmersive(immersive);
     this.stage.setReal(this.immersion.mode === "immersive-ar");
     this.links.poke();
@@ -250,18 +296,22 @@ class Scene {
 
   /** Whoever is not there any more has let go of everything. */
   #attend() {
-    const { session } = this.immersion;
-    const hidden = session ? !this.immersion.attended : document.hidden;
-    if (hidden) this.overlay.pad.release();
-    this.links.away(hidden ? (session ? "the headset is off" : "the page is hidden") : "");
-    if (!hidden) this.links.poke();
+    const absent = this.#absence();
+    if (absent) this.input.letGo();
+    if (absent === this.#absent) return;
+    this.#absent = absent;
+    this.links.away(absent);
+    if (!absent) this.links.poke();
   }
 
-  /** In XR the window has no focus, and somebody is there all the same. */
-  #lostFocus() {
-    if (this.immersion.session) return;
-    this.overlay.pad.release();
-    this.links.away("the window lost the focus");
+  /** Why nobody sees the scene, or means it with what he holds; empty: somebody does. */
+  #absence() {
+    const { session } = this.immersion;
+    // in XR the window has no focus, and somebody is there all the same
+    if (session && !this.immersion.attended) return "the headset is off";
+    if (!session && document.hidden) return "the page is hidden";
+    if (!session && (this.#blurred || !document.hasFocus())) return "the window lost the focus";
+    return this.overlay.dialog.open ? "the settings are open" : this.#undrawn;
   }
 
   #follow(name, value) {

@@ -156,6 +156,7 @@ export class CommandLink {
   /** Nobody looks or holds any more, and why; empty: somebody does again. */
   setAway(why) {
     this.#away = why;
+    this.#letGo(why || "somebody is there again"); // what was taken hold of meanwhile does not count either
     this.#judge();
   }
 

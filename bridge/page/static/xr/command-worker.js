@@ -19,7 +19,10 @@ const ops = {
   input: ({ at, sample, poses }) => link.input({ at: here(at), sample, poses }),
   away: ({ why }) => link.setAway(why),
   control: ({ request }) => link.control(request),
-  stop: () => link.stop(),
+  stop: ({ press }) => {
+    link.stop();
+    self.postMessage({ op: "pressed", press });
+  },
   release: () => link.release(),
   poke: () => link.poke(),
   drop: () => link.headset.drop(),

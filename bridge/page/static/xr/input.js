@@ -7,6 +7,7 @@
 
 import { Vector3 } from "../vendor/three.js";
 import { pose } from "./axes.js";
+import { Opened } from "./opened.js";
 import { gamepadDrive, handDrive, joy, pinchPoint, pinched, stickDrive, stopButtons, stopGamepad, stopHand } from "./gestures.js";
 
 const WRIST = "wrist";
@@ -17,6 +18,7 @@ export class Input {
   /** hand → where it began to drive by pinching, and where the head looked then. */
   #begun = { left: null, right: null };
   #source = null;
+  #opened = new Opened();
 
   constructor({ settings, pad }) {
     this.settings = settings;
@@ -45,19 +47,30 @@ export class Input {
 
   /** {source, forward, turn} while somebody holds on, else null: what drove before goes on. */
   drive(sources, facing) {
-    const held = [];
+    const read = [];
     for (const source of sources) {
-      const drive = source.kind === "hand" ? this.#byHand(source, facing) : stickDrive(source.gamepad);
-      if (drive) held.push({ source: source.name, ...drive });
+      const hand = source.kind === "hand";
+      if (!(hand ? source.joints : source.gamepad)) continue; // of what is not seen it is not known whether it holds on
+      const drive = hand ? this.#byHand(source, facing) : stickDrive(source.gamepad);
+      read.push({ source: source.name, kind: source.kind, drive, open: !drive && !(hand && source.pressed) });
     }
     for (const each of gamepads()) {
       const drive = gamepadDrive(each);
-      if (drive) held.push({ source: `gamepad ${each.index}`, ...drive });
+      read.push({ source: `gamepad ${each.index}`, kind: "gamepad", drive, open: !drive });
     }
+    const held = this.#opened.held(read);
     if (this.pad.sample) held.push(this.pad.sample);
     const chosen = held.find(({ source }) => source === this.#source) ?? held[0] ?? null;
     this.#source = chosen?.source ?? null;
     return chosen;
+  }
+
+  /** Whatever is held has to be let go of, and that be seen, before it counts. */
+  letGo() {
+    this.#opened.clear();
+    this.#begun = { left: null, right: null };
+    this.#source = null;
+    this.pad.release();
   }
 
   /** The poses and buttons of a frame, as fields of ROS messages without headers; only those in `wanted`. */

@@ -2,12 +2,25 @@
 
 /** Where the page at / writes down a stop for the page that comes after it in the same tab. */
 const KEPT = "macs.stop";
+/** The worker of commands says so soon that it has heard of a press. */
+const ECHO_MS = 200;
+const NOTHING = { all: false, wanted: [], known: [] };
+const ON_ITS_WAY = "the stop is on its way";
+const UNHEARD = "THE STOP HAS NOT GONE OUT: what sends it does not answer. Stop the robot itself, and load this page anew";
 
 export class Links extends EventTarget {
   #pictures = new Map();
+  /** key → {at, stamp} of pictures that panels have, and of which it is not known that they were drawn. */
+  #given = new Map();
+  /** How many times the stop was pressed, and of how many of these the worker has heard. */
+  #presses = 0;
+  #heard = 0;
+  #stop = null;
+  #kept = readKept();
 
   constructor(me) {
     super();
+    this.mayStop = me.may.includes("stop");
     const scheme = location.protocol === "https:" ? "wss:" : "ws:";
     const url = `${scheme}//${location.host}/macs`;
     const { port1, port2 } = new MessageChannel();
@@ -20,17 +33,20 @@ export class Links extends EventTarget {
     this.pictureMs = [];
     for (const [name, worker] of [["commands", this.commands], ["pictures", this.sight]]) {
       const text = `the worker of ${name} failed`;
-      worker.onerror = ({ message }) => this.dispatchEvent(new CustomEvent("event", { detail: { text: `${text}: ${message}` } }));
+      worker.onerror = ({ message }) => {
+        this.#tell("event", { text: `${text}: ${message}` });
+        this.#doubt();
+      };
     }
     this.commands.onmessage = ({ data }) => this.#take(data);
     this.sight.onmessage = ({ data }) => this.#see(data);
-    this.commands.postMessage({ op: "begin", url, me, kept: readKept(), sight: port1 }, [port1]);
+    this.commands.postMessage({ op: "begin", url, me, kept: this.#kept, sight: port1 }, [port1]);
     this.sight.postMessage({ op: "begin", url, commands: port2 }, [port2]);
   }
 
-  /** What hands do in this frame. */
-  input(sample, poses) {
-    this.commands.postMessage({ op: "input", at: performance.timeOrigin + performance.now(), sample, poses });
+  /** What hands did in the frame that began at `at`. */
+  input(sample, poses, at) {
+    this.commands.postMessage({ op: "input", at: performance.timeOrigin + at, sample, poses });
   }
 
   aim(target) {
@@ -55,8 +71,16 @@ export class Links extends EventTarget {
     this.commands.postMessage({ op: "control", request });
   }
 
+  /** Written down and shown at once: a press is somebody's also while the worker of commands does not answer. */
   stop() {
-    this.commands.postMessage({ op: "stop" });
+    this.#presses += 1;
+    this.commands.postMessage({ op: "stop", press: this.#presses });
+    if (!this.mayStop) return;
+    const { known } = this.#kept ?? NOTHING;
+    this.#kept = { all: true, wanted: known, known };
+    writeKept({ state: "waiting", kept: this.#kept });
+    this.#tell("stop", { state: "waiting", text: ON_ITS_WAY });
+    setTimeout(() => this.#doubt(), ECHO_MS);
   }
 
   release() {
@@ -73,24 +97,50 @@ export class Links extends EventTarget {
     this.sight.postMessage({ op: "poke" });
   }
 
-  /** Give each panel its newest picture, and ask for the next one. */
+  /** Give each panel its newest picture. */
   showPictures(room, wishes) {
     for (const [key, { bitmap, at, stamp }] of this.#pictures) {
+      this.#pictures.delete(key);
+      this.#given.set(key, { at, stamp });
       const wish = wishes.find((each) => each.key === key);
       const screen = wish && room.screens.get(wish.panel);
       if (screen) screen.show(bitmap, wish.eye);
       else bitmap.close();
+    }
+  }
+
+  /** The pictures that panels were given were drawn: ask for the next ones. */
+  acknowledge() {
+    for (const [key, { at, stamp }] of this.#given) {
       this.sight.postMessage({ op: "shown", key });
       const now = performance.timeOrigin + performance.now();
       this.pictureMs.push({ key, sinceSocket: now - at, sinceStamp: now - stamp });
       if (this.pictureMs.length > 600) this.pictureMs.splice(0, 300);
     }
-    this.#pictures.clear();
+    this.#given.clear();
   }
 
   #take(message) {
-    if (message.op === "stop") writeKept(message);
-    this.dispatchEvent(new CustomEvent(message.op, { detail: message }));
+    if (message.op === "stop") this.#stop = message;
+    else if (message.op === "pressed") this.#heard = message.press;
+    else return this.#tell(message.op, message);
+    // what was said before it heard of a press is not of this press
+    if (this.#heard !== this.#presses || !this.#stop) return;
+    this.#kept = this.#stop.kept;
+    writeKept(this.#stop);
+    this.#tell("stop", this.#stop);
+    this.#stop = null;
+  }
+
+  /** Whether the worker has heard of each press by now; else it is said. */
+  #doubt() {
+    if (this.#heard === this.#presses || !this.mayStop) return;
+    this.#tell("stop", { state: "waiting", text: UNHEARD });
+    this.#tell("event", { text: UNHEARD });
+  }
+
+  #tell(type, detail) {
+    this.dispatchEvent(new CustomEvent(type, { detail }));
   }
 
   #see(message) {
@@ -101,7 +151,7 @@ export class Links extends EventTarget {
       this.sightUp = message;
       this.rates = new Map(message.topics.map((topic) => [topic.key, { ...topic, at: performance.now() }]));
     } else {
-      this.dispatchEvent(new CustomEvent(message.op, { detail: message }));
+      this.#tell(message.op, message);
     }
   }
 }

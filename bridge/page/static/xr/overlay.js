@@ -63,12 +63,12 @@ export class Overlay {
     show(this.stop, me.may.includes("stop"));
     this.event = h("footer", { class: "xr-event", id: "event" });
     this.dialog = this.#settingsDialog();
-    const open = button("open-settings", "small", "Settings", () => this.dialog.showModal());
+    const open = button("open-settings", "small", "Settings", () => this.dialog.show()); // the stop beside it stays
     show(open, true);
     const head = h("header", { class: "xr-top" },
       h("a", { class: "brand", href: "/" }, "macs"), this.targets, this.link, this.control, this.take, this.give, this.back,
       h("span", { class: "xr-space" }), ...Object.values(this.enter), this.none, open, this.stopBar);
-    this.root = h("div", { class: "xr-overlay" }, head, this.pad.element, this.event, this.dialog);
+    this.root = h("div", { class: "xr-overlay" }, head, this.dialog, this.pad.element, this.event);
   }
 
   /** Which ways into XR there are: names of modes. */

@@ -87,6 +87,11 @@ export class Stage {
     addEventListener("resize", () => this.resize());
   }
 
+  /** Whether the browser has taken the graphics away: then nothing is drawn, without an error. */
+  get lost() {
+    return this.renderer.getContext().isContextLost();
+  }
+
   get immersive() {
     return this.renderer.xr.isPresenting;
   }
