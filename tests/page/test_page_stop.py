@@ -115,3 +115,17 @@ async def test_a_token_for_groups_stops_their_robots(start_site: StartSite, tmp_
     await until(lambda: says(page, "#stop-status", "robot 1 not online: stopped on return"))
     await site.agent.start()
     await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
+
+
+async def test_a_stop_holds_on_a_robot_that_starts_anew(site: Site) -> None:
+    """Its program ends after it has confirmed, and comes back holding nothing: it is stopped again."""
+    page = await site.open()
+    await online(page, 1)
+    await page.page.click("#stop")
+    await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
+    await site.agent.stop(signal.SIGKILL)
+    await online(page)
+    await site.agent.start()
+    await online(page, 1)
+    await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
+    assert await page.value("fetch('/view/robots/1/status').then((r) => r.json()).then((s) => s.stopped)") is True

@@ -7,7 +7,7 @@ import pytest
 from tests.page.test_macs_js import ran
 from tests.support.browser import needs_node
 
-PARTS = ("axes", "hold", "freshness", "gestures", "settings", "decode", "clock", "targets", "guards", "opened")
+PARTS = ("axes", "hold", "freshness", "gestures", "settings", "decode", "clock", "targets", "guards", "opened", "halt")
 
 
 @needs_node

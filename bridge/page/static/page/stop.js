@@ -61,6 +61,7 @@ export class Stop {
   /** These robots are online. */
   setRobots(robots) {
     const gone = [...this.online].filter((robot) => !robots.includes(robot));
+    const came = robots.filter((robot) => !this.online.has(robot));
     this.online = new Set(robots);
     gone.forEach((robot) => this.states.delete(robot));
     const left = gone.filter((robot) => this.state.robots.has(robot));
@@ -69,8 +70,9 @@ export class Stop {
       node?.register(this.#named(robots));
     }
     for (const robot of robots) {
-      if (this.all && !this.known.has(robot)) this.wanted.add(robot);
       this.known.add(robot);
+      // also who was known: a program that has started anew holds nothing
+      if (this.all && came.includes(robot) && !this.isStopped(robot)) this.wanted.add(robot);
     }
     this.#send();
   }
@@ -142,7 +144,9 @@ export class Stop {
     if (stopped && this.wanted.delete(robot) && this.pressedAt !== null) state.tookMs = performance.now() - this.pressedAt;
     this.states.set(robot, state);
     // a release from just before the press may be told after it: then the press counts
-    const again = before?.stopped && !stopped && this.all && performance.now() - this.askedAt < CHECK_MS;
+    // and of whom nothing was heard since it came, or since the connection is there again, it is not known that it was released
+    const fresh = performance.now() - this.askedAt < CHECK_MS;
+    const again = !stopped && this.all && (before ? before.stopped && fresh : true);
     if (again) this.wanted.add(robot);
     // somebody has let all of them go on: then newcomers may, too
     if (before?.stopped && !stopped && !this.wanted.size && !this.stopped().length) this.all = false;
@@ -176,7 +180,8 @@ export class Stop {
 
   /** What it says was lost if nothing came for a while, or the robot was away meanwhile: then it is asked. */
   async #check() {
-    const due = [...new Set([...this.wanted, ...this.stopped()])].filter((robot) => {
+    const unknown = this.all ? [...this.online].filter((robot) => !this.states.has(robot)) : [];
+    const due = [...new Set([...this.wanted, ...this.stopped(), ...unknown])].filter((robot) => {
       const at = Math.max(this.askedAt, this.states.get(robot)?.at ?? 0);
       return this.online.has(robot) && performance.now() - at > CHECK_MS;
     });
@@ -285,7 +290,8 @@ export class Stop {
       words.push(`${list(stopped)} stopped${took.length ? ` after ${Math.round(Math.max(...took))} ms` : ""}`);
     }
     if (away.length) words.push(`${list(away)} not online: stopped on return`);
-    if (this.all && !words.length) words.push("no robot is online: each that comes is stopped");
+    const nobody = this.online.size ? "how robots are is not known" : "no robot is online";
+    if (this.all && !words.length) words.push(`${nobody}: each that comes is stopped`);
     return words;
   }
 }

@@ -65,7 +65,7 @@ export class CommandLink {
       done: () => this.#judge(),
     });
     this.clock = new CommandClock(this.headset);
-    this.halt = new Halt(this.headset, me, kept);
+    this.halt = new Halt(this.headset, me, kept, async (robot) => (await ask(`/view/robots/${robot}/status`))?.stopped);
     this.online = [];
     this.#listen();
     this.headset.keepConnecting();

@@ -9,15 +9,22 @@ const TOPIC = "/emergency_stop";
 const TYPE = "std_msgs/Bool";
 const AGAIN_MS = 200;
 const RACE_MS = 1500;
+/** A robot is asked whether it is stopped when for so long nothing was heard of it; so many at a time. */
+const CHECK_MS = 1500;
+const CHECKED_AT_ONCE = 16;
 const TRUE = new Uint8Array([0, 1, 0, 0, 1]);
 const FALSE = new Uint8Array([0, 1, 0, 0, 0]);
 const ANY_GROUP = Array.from({ length: 255 }, (_, at) => at + 1);
 
 export class Halt extends EventTarget {
-  /** `me` is what this token may; `kept` what another page in this tab wrote down: {wanted, known, all}. */
-  constructor(headset, me, kept = null) {
+  /**
+   * `me` is what this token may; `kept` what another page in this tab wrote down: {wanted, known, all}; `ask(robot)` gives what
+   * its status says: whether it is stopped, or undefined.
+   */
+  constructor(headset, me, kept = null, ask = async () => undefined) {
     super();
     this.headset = headset;
+    this.ask = ask;
     this.may = me.may.includes("stop");
     this.named = me.robots;
     this.groups = me.groups === "any" ? ANY_GROUP : me.groups;
@@ -27,13 +34,17 @@ export class Halt extends EventTarget {
     this.all = kept?.all ?? false;
     /** robot → whether it says that it is stopped. */
     this.said = new Map();
+    /** robot → when it was heard of last. */
+    this.heardAt = new Map();
+    this.turn = 0;
     this.state = headset.subscribe(TOPIC, TYPE, {}, (message) => this.#take(message));
     this.command = this.may ? headset.advertise(TOPIC, TYPE) : null;
     this.pressedAt = kept ? performance.now() : -Infinity;
     /** robot → why it does not stop for us. */
     this.why = new Map();
     headset.addEventListener("refused", ({ detail }) => this.#refused(detail));
-    headset.addEventListener("link", ({ detail: { up } }) => (up ? this.#send() : this.said.clear()));
+    headset.addEventListener("link", ({ detail: { up } }) => this.#link(up));
+    setInterval(() => this.check(), CHECK_MS).unref?.();
   }
 
   setOnline(robots) {
@@ -44,11 +55,22 @@ export class Halt extends EventTarget {
       if (gone.length) node?.deregister({ robots: gone.filter((robot) => node.robots.has(robot)) });
       node?.register(this.#whom(robots));
     }
-    for (const robot of robots) {
-      if (this.all && !this.known.has(robot)) this.wanted.add(robot);
-      this.known.add(robot);
-    }
+    for (const robot of robots) this.known.add(robot);
+    this.#wantAll();
     this.#send();
+  }
+
+  /** Without a connection nothing is known of anybody; then each that does not say that it holds is told again. */
+  #link(up) {
+    if (!up) this.said.clear();
+    else this.#wantAll();
+    this.#send();
+  }
+
+  /** Pressed for all is pressed for each that has said nothing since it came: a program that has started anew holds nothing. */
+  #wantAll() {
+    if (!this.all) return;
+    for (const robot of this.known) if (!this.said.has(robot)) this.wanted.add(robot);
   }
 
   /** Stop all. Whether this token may. */
@@ -76,8 +98,23 @@ export class Halt extends EventTarget {
     if (!this.said.has(robot)) this.#say(robot, stopped);
   }
 
+  /** What a robot says is lost at times; also to who was away meanwhile. Then it is asked. */
+  async check(now = performance.now()) {
+    if (!this.headset.connected) return;
+    const heard = (robot) => Math.max(this.pressedAt, this.heardAt.get(robot) ?? -Infinity);
+    const doubted = (robot) => this.wanted.has(robot) || this.said.get(robot) || (this.all && !this.said.has(robot));
+    const due = [...this.online].filter((robot) => doubted(robot) && now - heard(robot) > CHECK_MS);
+    this.turn = due.length > CHECKED_AT_ONCE ? (this.turn + CHECKED_AT_ONCE) % due.length : 0;
+    const asked = [...due.slice(this.turn), ...due.slice(0, this.turn)].slice(0, CHECKED_AT_ONCE);
+    for (const robot of asked) {
+      const before = heard(robot);
+      const stopped = await this.ask(robot);
+      if (typeof stopped === "boolean" && heard(robot) === before && this.online.has(robot)) this.#say(robot, stopped);
+    }
+  }
+
   stopped() {
-    return [...this.said].filter(([, stopped]) => stopped).map(([robot]) => robot);
+    return [...this.said].filter(([, stopped]) => stopped).map(([robot]) => robot).sort((one, other) => one - other);
   }
 
   /** Why none of these may be driven; empty when they may. */
@@ -97,8 +134,10 @@ export class Halt extends EventTarget {
   #say(robot, stopped) {
     const before = this.said.get(robot);
     this.said.set(robot, stopped);
+    this.heardAt.set(robot, performance.now());
     this.why.delete(robot);
     if (stopped) this.wanted.delete(robot);
+    else if (this.all && before === undefined) this.wanted.add(robot);
     if (before && !stopped) {
       // a release from just before the press may be told after it: then the press counts
       if (this.all && performance.now() - this.pressedAt < RACE_MS) this.wanted.add(robot);
@@ -129,12 +168,13 @@ export class Halt extends EventTarget {
     const stopped = this.stopped();
     const open = this.wanted.size > 0 || (this.all && this.known.size === 0);
     if (open && !connected) return { state: "waiting", text: "no connection: the stop is sent as soon as there is one" };
+    if (this.all && !connected) return { state: "waiting", text: "no connection: how robots are is not known" };
     if (this.wanted.size) {
       const why = [...this.wanted].map((robot) => this.why.get(robot)).find(Boolean);
       return { state: "waiting", text: `not confirmed yet by robot ${[...this.wanted].join(", ")}${why ? ` (${why})` : ""}` };
     }
     if (stopped.length) return { state: "stopped", text: `robot ${stopped.join(", ")} stopped` };
-    if (this.all) return { state: "stopped", text: "each robot that comes is stopped" };
+    if (this.all) return { state: this.online.size ? "waiting" : "stopped", text: "each robot that comes is stopped" };
     return { state: "free", text: "" };
   }
 
