@@ -13,6 +13,8 @@ import math
 import secrets
 import threading
 from collections import OrderedDict, deque
+from collections.abc import Collection
+from itertools import islice
 from typing import NamedTuple
 
 from .messages import CommandClock, Metadata
@@ -76,7 +78,7 @@ class _Clock:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.wanted_at = self.asked_at = self.answered_at = -math.inf
+        self.wanted_at = self.asked_at = self.answered_at = self.commanded_at = -math.inf
         self._least = 0.0
         """Time here when it was 0 there, at least; as of ``_compared_at``."""
         self._compared_at = -math.inf
@@ -99,6 +101,10 @@ class _Clock:
         if len(self._open) > self.OPEN:
             self._open.popitem(last=False)
         return number
+
+    def asked(self, number: int) -> bool:
+        """Whether that was asked, and has not been answered."""
+        return number in self._open
 
     def answer(self, number: int, time: int, now: float) -> bool:
         """Whether that was asked. Each question counts once: a repeated answer says nothing."""
@@ -137,8 +143,14 @@ class CommandClocks:
     order."""
 
     SENDERS = 1024
+    """So many that have answered are kept, and as many that have not. Whoever commands is never displaced."""
+    COMMANDS_S = 5.0
+    """So long after a command that was carried out a sender counts as one that commands."""
     EVERY_S = 1.0
     """So often a sender is asked."""
+    LOOKED_AT = 64
+    """At most so many are asked at one time of those that command, and as many of all, each in turn: names that
+    somebody makes up must not take the time of commands."""
     WANTED_S = 60.0
     """So long after its last command or hello."""
     ANSWERED_S = 5.0
@@ -147,9 +159,13 @@ class CommandClocks:
     def __init__(self, max_age_s: float) -> None:
         self.max_age_s = max_age_s
         self._clocks: OrderedDict[str, _Clock] = OrderedDict()
-        """By sender, in the order in which they first said something of a clock."""
+        """By sender; who has not commanded for longest comes first."""
         self._others: OrderedDict[str, _Clock] = OrderedDict()
         """A clock that a sender names and that has not answered: until it has, the one before it counts."""
+        self._commanding: OrderedDict[str, None] = OrderedDict()
+        """Who has commanded and is to be asked: before all others."""
+        self._turn: deque[str] = deque()
+        """Who is looked at next."""
         self._lock = threading.Lock()
 
     def hello(self, sender: str, name: str, now: float) -> CommandClock:
@@ -163,29 +179,58 @@ class CommandClocks:
         """A sender has answered: what to tell it, if its clock has become known by that."""
         with self._lock:
             clock = self._find(sender, said.clock)
-            if clock is None or not isinstance(said.at, int):
+            if clock is None or not isinstance(said.at, int) or not clock.asked(said.question):
+                return None
+            is_new = self._others.get(sender) is clock
+            if is_new and not self._has_place(sender, now):
                 return None
             known = self._known(clock, now)
-            if not clock.answer(said.question, said.at, now):
-                return None
-            if self._others.get(sender) is clock:
+            clock.answer(said.question, said.at, now)
+            if is_new:
                 del self._others[sender]
                 self._clocks[sender] = clock
             return None if known else CommandClock(clock=clock.name, known=True, max_age_s=self.max_age_s)
 
     def due(self, now: float) -> list[tuple[str, CommandClock]]:
-        """Whom to ask now, and what."""
+        """Whom to ask now, and what. A command waits for no more than one of them."""
+        return [(sender, question) for sender in self._looked_at() for question in self._questions(sender, now)]
+
+    def _looked_at(self) -> list[str]:
         with self._lock:
-            for clocks in (self._others, self._clocks):
-                for sender, clock in list(clocks.items()):
-                    if now - clock.wanted_at > self.WANTED_S and not self._known(clock, now):
+            if not self._turn:
+                self._turn.extend(self._clocks)
+                self._turn.extend(self._others)
+            first = [self._commanding.popitem(last=False)[0] for _ in self._few(self._commanding)]
+            return first + [self._turn.popleft() for _ in self._few(self._turn)]
+
+    def _few(self, of: Collection[str]) -> range:
+        return range(min(self.LOOKED_AT, len(of)))
+
+    def _questions(self, sender: str, now: float) -> list[CommandClock]:
+        """What to ask one of them; who has not been wanted for long is forgotten."""
+        due = []
+        with self._lock:
+            for clocks in (self._clocks, self._others):
+                clock = clocks.get(sender)
+                if clock is None:
+                    continue
+                if now - clock.wanted_at > self.WANTED_S:
+                    if not self._known(clock, now):
                         del clocks[sender]
-            return [
-                (sender, self._question(clock, now))
-                for clocks in (self._clocks, self._others)
-                for sender, clock in clocks.items()
-                if now - clock.wanted_at <= self.WANTED_S and now - clock.asked_at >= self.EVERY_S
-            ]
+                elif now - clock.asked_at >= self.EVERY_S:
+                    due.append(self._question(clock, now))
+        return due
+
+    def _has_place(self, sender: str, now: float) -> bool:
+        """Whether one more that has answered can be kept; for it goes who has not commanded for longest."""
+        if sender in self._clocks or len(self._clocks) < self.SENDERS:
+            return True
+        for first in list(islice(self._clocks, self.LOOKED_AT)):
+            if now - self._clocks[first].commanded_at > self.COMMANDS_S:
+                del self._clocks[first]
+                return True
+            self._clocks.move_to_end(first)
+        return False
 
     @property
     def wanted(self) -> bool:
@@ -214,6 +259,8 @@ class CommandClocks:
             return Verdict(_UNTOLD) if told else FINE
         clock = self._meet(sender, name)
         clock.wanted_at = now
+        if now - clock.asked_at >= self.EVERY_S and len(self._commanding) < self.SENDERS:
+            self._commanding[sender] = None
         if clock is not known or not self._known(clock, now):
             return Verdict(_UNKNOWN)
         time = metadata.request_id
@@ -227,6 +274,8 @@ class CommandClocks:
             problem = Refusal("too_old", f"it may be {age_s:.2f} s old, more than {self.max_age_s:g} s")
         if problem is None:
             newest.note(time)
+            clock.commanded_at = now
+            self._clocks.move_to_end(sender)
         return Verdict(problem, max(0.0, age_s))
 
     def _known(self, clock: _Clock, now: float) -> bool:
