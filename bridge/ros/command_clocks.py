@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 
 from bridge.ros.interface import Registrant, Robot
-from macs_zenoh.errors import Refused, WireError
+from macs_zenoh.errors import Refused, UsageError, WireError
 from macs_zenoh.mesh import now_s
 from macs_zenoh.protocol.agent_id import AgentId
-from macs_zenoh.protocol.command_clock import CommandClocks
+from macs_zenoh.protocol.command_clock import NO_CLOCK, CommandClocks
 from macs_zenoh.protocol.guard import Guard
 from macs_zenoh.protocol.messages import ROS, CommandClock, Metadata, decode_data, encode_data
 from macs_zenoh.protocol.reading import Message
@@ -28,7 +29,7 @@ class ClockQuestions:
             guard.on_refused = self._refused
         self._check = check
         self._loop = asyncio.get_running_loop()
-        self._senders: dict[str, Registrant] = {}
+        self._open = True
         self._timer: asyncio.TimerHandle | None = None
 
     def take(self, message: Message) -> None:
@@ -49,7 +50,6 @@ class ClockQuestions:
         else:
             reply = self._clocks.hello(name, said.clock, now_s())
         if reply is not None:
-            self._senders[name] = sender
             self._say(sender, reply)
         if self._timer is None:
             self._timer = self._loop.call_later(LOOK_S, self._look)
@@ -57,23 +57,29 @@ class ClockQuestions:
     def _refused(self, message: Message, kind: str, reason: str) -> None:
         """A command was not carried out. From any thread."""
         self._robot.tell_refused(message, "", kind, reason)
+        if kind == NO_CLOCK and self._timer is None:  # nobody has said hello, and this sender may not for long
+            self._loop.call_soon_threadsafe(self._begin)
 
     def left(self, agent: Registrant) -> None:
         """Whoever has this id next has another clock."""
-        name = str(AgentId(*agent))
-        self._clocks.left(name)
-        self._senders.pop(name, None)
+        self._clocks.left(str(AgentId(*agent)))
 
     def close(self) -> None:
         """Ask no more."""
+        self._open = False
         if self._timer is not None:
             self._timer.cancel()
+
+    def _begin(self) -> None:
+        if self._open and self._timer is None:
+            self._look()
 
     def _look(self) -> None:
         self._timer = self._loop.call_later(LOOK_S, self._look) if self._clocks.wanted else None
         for name, question in self._clocks.due(now_s()):
-            sender = self._senders.get(name)
-            if sender is not None:
+            with suppress(Refused, UsageError):
+                sender = Registrant(*AgentId.parse(name))
+                self._check(sender)
                 self._say(sender, question)
 
     def _say(self, to: Registrant, said: CommandClock) -> None:
