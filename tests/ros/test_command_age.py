@@ -77,10 +77,10 @@ class Site:
 
 
 @asynccontextmanager
-async def driven(peer: Peer, domain: int, path: Path, max_age_s: float) -> AsyncIterator[Site]:
-    """Everything, and a clock that the robot knows."""
+async def driven(peer: Peer, domain: int, path: Path, max_age_s: float, more: str = "") -> AsyncIterator[Site]:
+    """Everything, and a clock that the robot knows. ``more``: of the robot's settings."""
     settings = path / "macs.toml"
-    settings.write_text(f"[robot]\nmax_timed_command_age_s = {max_age_s}\n")
+    settings.write_text(f"[robot]\nmax_timed_command_age_s = {max_age_s}\n{more}")
     heard = await hear(peer, depth=20_000)
     async with AsyncExitStack() as stack:
         endpoint = f"tcp/127.0.0.1:{free_port()}"
