@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, suppress
 
 from msgspec import structs
@@ -55,7 +55,8 @@ def ros_settings(settings: Settings, session_namespace: str = "") -> MeshSetting
 class ZenohRobot:
     """One robot: it joins the mesh when its first node is there, and leaves it after the last."""
 
-    def __init__(self, settings: Settings, robot: RmwZenohRobot, network: RosNetwork) -> None:
+    def __init__(self, settings: Settings, robot: RmwZenohRobot, network: RosNetwork, stop: EmergencyStop) -> None:
+        """``stop`` holds, however often the robot leaves and comes back."""
         own = changed(settings.robot, id=robot.id, group=robot.group)
         self._settings = changed(settings, robot=own)
         self.robot = robot
@@ -63,13 +64,15 @@ class ZenohRobot:
         self._loop = asyncio.get_running_loop()
         self._graph = network.graph(robot.domain)
         self._looked = asyncio.Event()
-        self._stop = EmergencyStop()
-        """It holds, however often the robot leaves and comes back."""
+        self._stop = stop
         self._watching = network.on_change(self._changed)
 
-    async def run(self) -> None:
-        """Be that robot while its nodes live, until the task is cancelled."""
+    async def run(self, before: Collection[asyncio.Future[None]] = ()) -> None:
+        """Be that robot while its nodes live, until the task is cancelled. It begins when those before it have
+        ended."""
         try:
+            if before:
+                await asyncio.wait(before)
             while True:
                 await self._until(lambda: self.is_there)
                 try:
@@ -206,7 +209,10 @@ class _Presented:
         self._settings = settings
         self._networks = networks
         self._tasks: dict[RmwZenohRobot, asyncio.Task[None]] = {}
-        self._ending: set[asyncio.Task[None]] = set()
+        self._ending: dict[asyncio.Task[None], int] = {}
+        """Those that are leaving, and their ids: who has the id now waits for them."""
+        self._stops: dict[int, EmergencyStop] = {}
+        """By id: a stop holds also where the id has become that of other nodes."""
 
     async def __aenter__(self) -> _Presented:
         return self
@@ -221,12 +227,17 @@ class _Presented:
         for robot in [robot for robot in self._tasks if robot not in wanted]:
             task = self._tasks.pop(robot)
             task.cancel()
-            self._ending.add(task)
-            task.add_done_callback(self._ending.discard)
+            self._ending[task] = robot.id
+            task.add_done_callback(self._ended)
         for robot in wanted:
             if robot not in self._tasks:
-                one = ZenohRobot(self._settings, robot, self._networks[robot.session_namespace])
-                self._tasks[robot] = asyncio.ensure_future(one.run())
+                stop = self._stops.setdefault(robot.id, EmergencyStop())
+                one = ZenohRobot(self._settings, robot, self._networks[robot.session_namespace], stop)
+                before = [task for task, its_id in self._ending.items() if its_id == robot.id]
+                self._tasks[robot] = asyncio.ensure_future(one.run(before))
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        del self._ending[task]
 
     async def until(self, something: Awaitable[None]) -> None:
         """Wait for it. Raises what ends a robot for good."""

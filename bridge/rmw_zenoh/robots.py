@@ -25,7 +25,8 @@ def nodes_of(robot: RmwZenohRobot, graph: Graph) -> list[Node]:
 
 class Robots:
     """Robots by rule, as nodes come and go: of a domain in which nodes are in namespaces that end in a number, one for
-    each of those; else one for the domain. Who has an id keeps it, also while it is away.
+    each of those; else one for the domain. Who has an id keeps it, also while it is away: but a domain's robot, whose
+    id is in no name, yields it to a namespace that ends in that number, so that whoever comes first does not matter.
     """
 
     MAX = 256
@@ -47,26 +48,30 @@ class Robots:
         domains: dict[int, set[str]] = {}
         for node in nodes:
             domains.setdefault(node.domain, set()).add(f"/{node.namespace.strip('/').partition('/')[0]}")
-        replaced: set[Place] = set()
-        for domain, namespaces in sorted(domains.items()):
-            numbered = sorted(namespace for namespace in namespaces if _NUMBER.search(namespace))
-            for namespace in numbered or ["/"]:
-                self._take((domain, namespace))
-            if numbered and (domain, "/") not in self._given:
-                replaced.add((domain, "/"))
+        numbered = {
+            domain: {name: int(number[0]) for name in sorted(namespaces) if (number := _NUMBER.search(name))}
+            for domain, namespaces in sorted(domains.items())
+        }
+        for domain, ids in numbered.items():
+            for namespace, robot_id in ids.items():
+                self._take((domain, namespace), robot_id)
+        for domain in [domain for domain, ids in numbered.items() if not ids]:
+            self._take((domain, "/"), self._first_id + domain)
+        replaced = {(domain, "/") for domain, ids in numbered.items() if ids} - set(self._given)
         return [robot for place, robot in self._known.items() if place not in replaced]
 
-    def _take(self, place: Place) -> None:
+    def _take(self, place: Place, robot_id: int) -> None:
         if place in self._known:
             return
         domain, namespace = place
-        number = _NUMBER.search(namespace)
-        robot_id = int(number[0]) if number is not None else self._first_id + domain
-        other = next((robot for robot in self._known.values() if robot.id == robot_id), None)
+        other = next((each for each, robot in self._known.items() if robot.id == robot_id), None)
+        if other is not None and self._yields(other, place):
+            self._known.pop(other)
+            other = None
         if domain > MAX_DOMAIN or not 1 <= robot_id <= MAX_ID:
             problem = f"{robot_id} is no id of a robot"
         elif other is not None:
-            problem = f"id {robot_id} is that of {other.place}"
+            problem = f"id {robot_id} is that of {self._known[other].place}"
         elif len(self._known) >= self.MAX:
             problem = f"there are {self.MAX} robots already"
         else:
@@ -75,3 +80,7 @@ class Robots:
             return
         if len(self._refused) < self.MAX:
             self._refused[place] = problem
+
+    def _yields(self, place: Place, to: Place) -> bool:
+        """Whether a place has its id by its domain alone, and gives it to one that has it in its name."""
+        return place not in self._given and place[1] == "/" and to[1] != "/" and to[0] <= MAX_DOMAIN

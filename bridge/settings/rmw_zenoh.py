@@ -64,7 +64,7 @@ class RmwZenohSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields
     """Each a ``[[rmw_zenoh.robots]]`` table."""
     first_id: AgentId = 1
     """With ``--all``: the id of the robot in ROS domain 0; that of domain 5 is 5 higher. A namespace's robot has the
-    number at the end of its name."""
+    number at the end of its name, also where that would be a domain's."""
     definitions: list[str] = []
     """Folders with ``.msg``, ``.srv`` and ``.action`` files, for types that rosbags does not bring and that the robots
     do not describe."""
