@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
+from typing import ClassVar
+from weakref import WeakValueDictionary
 
 import zenoh
 
@@ -15,7 +17,19 @@ log = logging.getLogger("macs.mesh")
 
 class Loopback:
     """Zenoh calls our own subscriptions back within a put, in the thread that puts. What it would give them is a copy
-    of the payload; `own` has the payload itself meanwhile."""
+    of the payload; `own` has the payload itself meanwhile.
+
+    Our own are all subscriptions of the Zenoh session, also those of other meshes over it: they share one (`of`).
+    """
+
+    _of: ClassVar[WeakValueDictionary[str, Loopback]] = WeakValueDictionary()
+    _of_lock = threading.Lock()
+
+    @classmethod
+    def of(cls, zid: str) -> Loopback:
+        """That of the Zenoh session with this id."""
+        with cls._of_lock:
+            return cls._of.setdefault(zid, cls())
 
     def __init__(self) -> None:
         self.own = threading.local()

@@ -79,7 +79,7 @@ class Mesh:
         self._loop = asyncio.get_running_loop()
         self._loop_thread = threading.get_ident()
         end_on_panics(self._loop)
-        self._loopback = Loopback()
+        self._loopback = Loopback.of(own)
         self.tracing = Tracing(own, self.zid, settings.trace_every)
         """What is traced of what this session puts and receives."""
         self._arrivals = Arrivals(self._loop, self._from_thread, self.drops, self._loopback, self.tracing)
