@@ -77,8 +77,8 @@ async def test_what_a_robot_publishes_is_on_the_table(site: Site) -> None:
             drawn = await headset.value(f"{model}.cloud.geometry.drawRange.count")
             assert 500 < drawn <= 1000, "few of its points"
             await until(lambda: headset.value(f"{model}.joints.group.children.length === 2"))
-            await until(lambda: headset.value("macsXr.telling.battery?.text.includes('V')"))
-            await until(lambda: headset.value("macsXr.telling.texts.get('/level')?.[0] === 'level: data 0.625'"))
+            await until(lambda: headset.value("macsXr.telling.batteries.all(0)[0]?.value.text.includes('V')"))
+            await until(lambda: headset.value("macsXr.telling.texts.all(0)[0]?.value[0] === 'level: data 0.625'"))
             await until(lambda: headset.value(f"Boolean({model}.map?.visible)"))
             await headset.shot("world")
             await headset.value("macsXr.settings.set('layers', ['scan'])")

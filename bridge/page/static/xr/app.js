@@ -15,7 +15,7 @@ import { Room } from "./room.js";
 import { Settings } from "./settings.js";
 import { Stage } from "./stage.js";
 import { Telling } from "./telling.js";
-import { driveTopic, guardOf, pictureKey, targets, wishes } from "./targets.js";
+import { driveTopic, firstOf, guardOf, namedBy, pictureKey, targets, wishes } from "./targets.js";
 import { POSE_TYPES, SHOWN, TWIST } from "./wire-types.js";
 
 const OFFERS_MS = 2000;
@@ -58,6 +58,8 @@ class Scene {
     this.online = [];
     this.members = {};
     this.target = null;
+    /** Who is waited for: another one is not driven instead. */
+    this.named = namedBy(location.hash, keptAs(CHOSEN));
     this.offers = { publishers: {}, subscribers: {} };
     this.wishes = [];
     /** robot → the picture that driving it depends on: {topic, type}. */
@@ -77,12 +79,13 @@ class Scene {
     setInterval(() => this.telling.tick(), 250);
   }
 
-  choose(id) {
+  /** `kept`: somebody chose it, and means it next time. */
+  choose(id, { kept = true } = {}) {
     const target = this.targets.find((each) => each.id === id);
     if (!target || JSON.stringify(target) === JSON.stringify(this.target)) return;
     const other = target.seen !== this.target?.seen;
     this.target = target;
-    keep(CHOSEN, id);
+    if (kept) keep(CHOSEN, id);
     if (other) {
       this.offers = { publishers: {}, subscribers: {} };
       this.room.model.clear();
@@ -99,6 +102,11 @@ class Scene {
     const at = this.targets.findIndex(({ id }) => id === this.target?.id);
     const { length } = this.targets;
     if (length) this.choose(this.targets[(at + by + length) % length].id);
+  }
+
+  /** What is said while nobody is chosen. */
+  get waiting() {
+    return this.named ? `Waiting for ${this.named.replace("/", " ")}` : "No robot is online";
   }
 
   get targets() {
@@ -214,7 +222,7 @@ class Scene {
       stop: () => this.stop(),
       release: () => this.release(),
       control: (action) => this.links.control({ action }),
-      give: () => this.links.control({ action: "give", to: this.telling.state.candidates[0] }),
+      give: (to) => this.links.control({ action: "give", to }),
     };
   }
 
@@ -237,7 +245,6 @@ class Scene {
       after: () => this.step(1),
       take: () => this.links.control({ action: "take" }),
       back: () => this.links.control({ action: "release" }),
-      give: () => this.links.control({ action: "give", to: this.telling.state.candidates[0] }),
       smaller: () => settings.set("scale", Math.max(0.02, settings.get("scale") / 1.6)),
       larger: () => settings.set("scale", Math.min(1, settings.get("scale") * 1.6)),
       flat: () => settings.set("curve", settings.get("curve") > 0 ? 0 : 0.35),
@@ -245,7 +252,9 @@ class Scene {
       hand: () => settings.set("hand", settings.get("hand") === "left" ? "right" : "left"),
       leave: () => this.immersion.leave(),
     };
-    actions[id]?.();
+    const [, to] = /^give (\d+)$/.exec(id) ?? [];
+    if (to) this.links.control({ action: "give", to: Number(to) });
+    else actions[id]?.();
     this.telling.tell();
   }
 
@@ -325,18 +334,20 @@ class Scene {
     this.online = robots;
     this.#askMembers();
     this.#showTargets();
-    if (!this.target && this.targets.length) {
-      const wanted = /^#robot\/(\d+)$/.exec(location.hash);
-      const kept = wanted ? `robot/${wanted[1]}` : keptAs(CHOSEN);
-      this.choose(this.targets.some(({ id }) => id === kept) ? kept : this.targets[0].id);
-    }
+    this.#chooseFirst();
+  }
+
+  #chooseFirst() {
+    const id = this.target ? null : firstOf(this.targets, this.named);
+    if (id) this.choose(id, { kept: false });
   }
 
   #showTargets() {
     const shown = this.targets;
     const lost = this.target && !shown.some(({ id }) => id === this.target.id);
     if (lost) shown.push({ ...this.target, label: `${this.target.label} · lost` });
-    this.overlay.setTargets(shown, this.target?.id);
+    if (!this.target && this.named) shown.unshift({ id: this.named, label: `${this.waiting} …` });
+    this.overlay.setTargets(shown, this.target?.id ?? this.named);
   }
 
   /** Which robots are in which group. */
@@ -344,8 +355,9 @@ class Scene {
     const mesh = await get("/view/mesh");
     if (!mesh?.robots) return;
     this.members = Object.fromEntries(mesh.robots.map(({ id, group }) => [id, group]));
+    this.#chooseFirst(); // a group that was named is known only now
     this.#showTargets();
-    if (this.target?.groups.length || this.target?.id.startsWith("group/")) this.choose(this.target.id);
+    if (this.target?.groups.length || this.target?.id.startsWith("group/")) this.choose(this.target.id, { kept: false });
   }
 
   async #askOffers() {

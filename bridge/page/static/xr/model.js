@@ -148,7 +148,7 @@ export class Model {
       this[name].userData.has = false;
       this[name].geometry.setDrawRange(0, 0);
     }
-    this.map?.removeFromParent();
+    this.#dropMap(this.map);
     this.map = null;
     this.pose = null;
     this.fromPose = false;
@@ -201,10 +201,15 @@ export class Model {
     setPlace(this.map, origin);
     this.map.renderOrder = -0.5;
     this.world.add(this.map);
-    before?.removeFromParent();
-    before?.geometry.dispose();
-    before?.material.uniforms.map.value.dispose();
-    before?.material.dispose();
+    this.#dropMap(before);
+  }
+
+  /** The graphics card keeps what is not given back. */
+  #dropMap(map) {
+    map?.removeFromParent();
+    map?.geometry.dispose();
+    map?.material.uniforms.map.value.dispose();
+    map?.material.dispose();
   }
 
   #frames(frames) {

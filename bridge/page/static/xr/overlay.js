@@ -52,7 +52,7 @@ export class Overlay {
     this.none = h("span", { class: "muted", id: "no-xr" }, "no headset here: on a screen");
     this.control = h("span", { class: "muted", id: "control" });
     this.take = button("take", "small", "Take control", () => on.control("take"));
-    this.give = button("give", "small", "Give", () => on.give());
+    this.give = button("give", "small", "Give", () => on.give(Number(this.give.value)));
     this.back = button("give-back", "small", "Give it back", () => on.control("release"));
     this.stop = button("stop", "stop", "", () => on.stop());
     this.stop.title = "Stop all robots (Escape)";
@@ -91,11 +91,13 @@ export class Overlay {
     const reached = state.roundTripMs === null ? "connected" : `${digits(state.roundTripMs)} ms`;
     say(this.link, state.connected ? reached : "connection lost");
     const whose = state.holder ? `${state.holder} ${state.holder === "you" ? "have" : "has"} control` : "nobody has control";
-    say(this.control, state.exclusive ? whose : "");
+    const unknown = state.unknown.length ? `robot ${state.unknown.join(", ")} does not say who has control` : "";
+    say(this.control, unknown || (state.exclusive ? whose : ""));
     show(this.take, state.exclusive && state.holder === null);
     show(this.back, state.exclusive && state.holder === "you");
     show(this.give, state.exclusive && state.holder === "you" && state.candidates.length > 0);
-    if (state.candidates.length) say(this.give, `Give to headset ${state.candidates[0]}`);
+    this.give.value = state.candidates[0] ?? "";
+    if (state.candidates.length) say(this.give, `Give to headset ${this.give.value}`);
     this.pad.show({ ...state, ...pad });
   }
 

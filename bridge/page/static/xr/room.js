@@ -101,7 +101,7 @@ export function statusRows({ state, stop, battery, picture, event, values }) {
     { label: "Gateway", value: link[0], tone: link[1] },
     { label: "Pictures", value: picture.text, tone: picture.tone },
     { label: "Driving", value: driving(state), tone: state.held ? "good" : state.barred ? "bad" : "muted" },
-    { label: "Control", value: control(state), tone: state.holder === "you" ? "good" : state.holder ? "warn" : undefined },
+    { label: "Control", value: control(state), tone: state.unknown.length ? "bad" : state.holder === "you" ? "good" : state.holder ? "warn" : undefined },
   ];
   if (battery) rows.push({ label: "Battery", value: battery.text, tone: battery.tone });
   if (stop.text) rows.push({ label: "Stop", value: stop.text, tone: "bad" });
@@ -121,6 +121,7 @@ function driving(state) {
 }
 
 function control(state) {
+  if (state.unknown.length) return `robot ${state.unknown.join(", ")} does not say`;
   if (!state.exclusive) return "not exclusive";
   if (state.holder === null) return "nobody has it";
   return state.holder === "you" ? `you, for ${digits(state.secondsLeft)} s` : `${state.holder} has it`;

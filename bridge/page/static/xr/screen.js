@@ -10,6 +10,8 @@ const CAPTION_M = 0.075;
 const EDGE_M = 0.018;
 const LEAST_SCALE = 0.3;
 const MOST_SCALE = 4;
+/** The colour of a panel before its first picture. */
+const EMPTY = 0x05070a;
 
 export class Screen {
   constructor(key, { topic, width = 1.3, curve = 0.35 }) {
@@ -25,8 +27,8 @@ export class Screen {
     this.picture = null;
     this.group = new Group();
     this.group.userData.grabs = this;
-    this.material = new MeshBasicMaterial({ color: 0x05070a, toneMapped: false });
-    this.rightMaterial = new MeshBasicMaterial({ color: 0x05070a, toneMapped: false });
+    this.material = new MeshBasicMaterial({ color: EMPTY, toneMapped: false });
+    this.rightMaterial = new MeshBasicMaterial({ color: EMPTY, toneMapped: false });
     this.left = new Mesh(undefined, this.material);
     this.right = new Mesh(undefined, this.rightMaterial);
     this.frame = new Mesh(undefined, new MeshBasicMaterial({ color: 0x1a2430, toneMapped: false }));
@@ -56,7 +58,13 @@ export class Screen {
 
   /** Whether the right eye has a topic of its own. */
   setOther(other) {
+    if (other === Boolean(this.other)) return;
     this.other = other;
+    if (this.rightMaterial.map !== this.material.map) drop(this.rightMaterial.map);
+    // each eye of two topics has a texture of its own: before its first picture, none
+    this.rightMaterial.map = other ? null : this.material.map;
+    this.rightMaterial.color.set(this.rightMaterial.map ? 0xffffff : EMPTY);
+    this.rightMaterial.needsUpdate = true;
   }
 
   setCurve(curve) {
@@ -94,9 +102,9 @@ export class Screen {
 
   dispose() {
     this.group.removeFromParent();
+    for (const map of new Set([this.material.map, this.rightMaterial.map])) drop(map);
     for (const mesh of [this.left, this.right, this.frame]) {
       mesh.geometry.dispose();
-      mesh.material.map?.dispose();
       mesh.material.dispose();
     }
     this.caption.dispose();
@@ -107,7 +115,7 @@ export class Screen {
     let texture = material.map;
     const other = texture && (texture.image.width !== picture.width || texture.image.height !== picture.height);
     if (!texture || other) {
-      texture?.dispose();
+      drop(texture);
       texture = new Texture();
       texture.colorSpace = SRGBColorSpace;
       texture.minFilter = texture.magFilter = LinearFilter;
@@ -158,6 +166,12 @@ export class Screen {
       this.veil.bend(width, height, curve, before);
     }
   }
+}
+
+/** A texture, with the picture that is its own. */
+function drop(texture) {
+  texture?.image?.close?.();
+  texture?.dispose();
 }
 
 function drawVeil(context, width, height, text) {

@@ -13,6 +13,7 @@ import { persisted, soon } from "./asking.js";
 import { Frames, cloud, joints, map, poseOf, scan, stampMs } from "./decode.js";
 import { Freshness } from "./freshness.js";
 import { Poke } from "./poke.js";
+import { bounded } from "./sizes.js";
 
 const SILENCE_MS = 3000;
 const RETRY_MS = [50, 100, 200, 500, 1000];
@@ -168,8 +169,11 @@ export class SightLink {
     this.commands.postMessage({ key: one.key, at, late: one.freshness.ageMs(now) });
   }
 
-  #bitmap(one, picture) {
-    if (one.type.endsWith("/CompressedImage")) return createImageBitmap(new Blob([picture.data]), BITMAP);
+  async #bitmap(one, picture) {
+    if (one.type.endsWith("/CompressedImage")) {
+      bounded(picture.data);
+      return createImageBitmap(new Blob([picture.data]), BITMAP);
+    }
     const { width, height, step, encoding, data } = picture;
     const pixels = decoded({ data, width, height, step, encoding, bigEndian: picture.is_bigendian });
     return createImageBitmap(new ImageData(pixels, width, height), BITMAP);

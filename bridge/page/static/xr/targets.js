@@ -23,6 +23,18 @@ export function targets(online, members, me) {
   return found;
 }
 
+/** Which one is chosen by itself: who was named, once it is there; the first only where nobody was. null: none yet. */
+export function firstOf(targets, named) {
+  const found = named ? targets.find(({ id }) => id === named) : targets[0];
+  return found?.id ?? null;
+}
+
+/** Who is named by an address that ends in `#robot/7`, or else was kept: `robot/7`, `group/5`; empty: nobody. */
+export function namedBy(hash, kept) {
+  const [, inHash] = /^#(robot\/\d{1,5})$/.exec(hash) ?? [];
+  return inHash ?? (/^(robot|group)\/\d{1,5}$/.test(kept ?? "") ? kept : "");
+}
+
 /**
  * The picture that driving depends on: {topic, type}, or null where none is meant. `before` is what it was. Pictures that end
  * do not end that: it stays until somebody chooses another one, or none. `type` is "" while nobody has offered the chosen one; `anew`:

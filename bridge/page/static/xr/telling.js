@@ -1,6 +1,7 @@
 /** What is known, told in words and colours: on the boards, below the pictures, and on the screen. */
 
 import { digits } from "../page/dom.js";
+import { Aged } from "./aged.js";
 import { quality, statusRows } from "./room.js";
 
 /** Before the worker of commands has said anything. */
@@ -19,7 +20,9 @@ const NOTHING = {
   secondsLeft: 0,
   deadmanS: null,
   drops: {},
+  unknown: [],
   maxAgeS: null,
+  clockless: [],
 };
 const REPEATED_MS = 5000;
 
@@ -28,8 +31,8 @@ export class Telling {
     this.scene = scene;
     this.state = NOTHING;
     this.stop = { state: "free", text: "" };
-    this.battery = null;
-    this.texts = new Map();
+    this.batteries = new Aged();
+    this.texts = new Aged();
     this.last = { text: "", at: 0 };
     const { links } = scene;
     links.addEventListener("state", ({ detail }) => this.#take(detail));
@@ -45,7 +48,7 @@ export class Telling {
 
   /** Of another robot nothing is known. */
   clear() {
-    this.battery = null;
+    this.batteries.clear();
     this.texts.clear();
   }
 
@@ -57,14 +60,15 @@ export class Telling {
     this.scene.overlay.tell(text);
   }
 
-  setBattery({ percentage, voltage }) {
+  setBattery({ topic, percentage, voltage }) {
     const part = Number.isFinite(percentage) ? `${Math.round(percentage * 100)} % · ` : "";
     const tone = percentage > 0.4 ? "good" : percentage > 0.2 ? "warn" : "bad";
-    this.battery = { text: `${part}${digits(voltage)} V`, tone: Number.isFinite(percentage) ? tone : undefined };
+    const value = { text: `${part}${digits(voltage)} V`, tone: Number.isFinite(percentage) ? tone : undefined };
+    this.batteries.note(topic, value, performance.now());
   }
 
   setText(topic, lines) {
-    this.texts.set(topic, lines.map((line) => `${topic.split("/").pop()}: ${line}`));
+    this.texts.note(topic, lines.map((line) => `${topic.split("/").pop()}: ${line}`), performance.now());
   }
 
   /** All of it, as it is now. */
@@ -104,15 +108,33 @@ export class Telling {
     const limits = [
       state.deadmanS ? `dead-man ${state.deadmanS} s` : "",
       state.maxAgeS ? `commands at most ${state.maxAgeS} s old` : "",
+      state.clockless.length ? `robot ${state.clockless.join(", ")} does not compare clocks` : "",
     ].filter(Boolean);
-    const values = [...(limits.length ? [limits.join(" · ")] : []), ...[...this.texts.values()].flat()];
-    const rows = { state, stop, battery: this.battery, picture: this.#picture(now), event: this.last.text, values };
+    const values = [...(limits.length ? [limits.join(" · ")] : []), ...this.#texts(now)];
+    const rows = { state, stop, battery: this.#battery(now), picture: this.#picture(now), event: this.last.text, values };
     scene.room.status.set({
-      title: scene.target?.label ?? "No robot is online",
+      title: scene.target?.label ?? scene.waiting,
       badge: badge(state),
       rows: statusRows(rows),
       buttons: [],
     });
+  }
+
+  #topics(shown) {
+    return this.scene.wishes.filter((wish) => wish.shown === shown).map(({ topic }) => topic);
+  }
+
+  #battery(now) {
+    this.batteries.keep(this.#topics("battery"));
+    const [found] = this.batteries.all(now);
+    if (!found) return null;
+    const { value, age } = found;
+    return age ? { text: `${value.text} · ${age}`, tone: "muted" } : value;
+  }
+
+  #texts(now) {
+    this.texts.keep(this.#topics("text"));
+    return this.texts.all(now).flatMap(({ value, age }) => (age ? value.map((line) => `${line} · ${age}`) : value));
   }
 
   /** How old the picture is that driving depends on. */
@@ -149,12 +171,12 @@ export class Telling {
   }
 
   #control() {
-    const { exclusive, holder, candidates } = this.state;
+    const { exclusive, holder, candidates } = this.state; // who is named on a button gets it, whoever comes meanwhile
     if (holder !== "you") return [{ id: "take", label: "Take control", off: !exclusive || holder !== null }];
     const [other] = candidates;
     return [
       { id: "back", label: "Give back" },
-      { id: "give", label: other === undefined ? "Give" : `Give to ${other}`, off: other === undefined },
+      { id: `give ${other ?? ""}`, label: other === undefined ? "Give" : `Give to ${other}`, off: other === undefined },
     ];
   }
 }
