@@ -121,6 +121,7 @@ class _Show:
                 until = time.monotonic() + DRIVE_S
             await asyncio.sleep(1 / COMMANDS_HZ)
         await commands.publish(self.types.serialize(COMMANDS[1], {}), agents=[self.robot])
+        await poses.standing()  # or it leaves before its last command has arrived
         moved_m = math.dist(start, poses.now)
         if moved_m < MOVED_M:
             raise Unreachable(COMMANDS[0], f"{sent} commands moved the robot by {moved_m:.2f} m only")
@@ -144,6 +145,17 @@ class _Poses:
         stamp, position = message["header"]["stamp"], message["pose"]["position"]
         self.ages_ms.append((time.time() - stamp["sec"] - stamp["nanosec"] / 1e9) * 1000)
         self.now = (position["x"], position["y"])
+
+    async def standing(self) -> None:
+        """Wait until two poses are the same. Raises Unreachable when it goes on for ever."""
+        deadline, before, count = time.monotonic() + PATIENCE_S, self.now, len(self.ages_ms)
+        while time.monotonic() < deadline:
+            await asyncio.sleep(1 / COMMANDS_HZ)
+            if len(self.ages_ms) > count:
+                if self.now == before:
+                    return
+                before, count = self.now, len(self.ages_ms)
+        raise Unreachable(COMMANDS[0], "the robot does not stop when it is told to")
 
     async def follow(self, subscription: Subscription) -> None:
         async for message in subscription:
