@@ -221,8 +221,7 @@ def _text(
 
 
 def _nobody(elsewhere: Mapping[str, int]) -> str:
-    others = ", ".join(f"{count} in {name!r} (--namespace {name})" for name, count in sorted(elsewhere.items()))
-    return "nobody is online" + (f" here; {others}" if others else "")
+    return f"nobody is online{robots.here(elsewhere)}"
 
 
 def _shown_infrastructure(rows: list[dict[str, Any]]) -> list[Block]:

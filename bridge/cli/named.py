@@ -92,7 +92,8 @@ def looking(args: argparse.Namespace, work: Callable[[Looking], Awaitable[int]])
             def ask(robot: int, verb: str) -> Awaitable[bytes]:
                 return operator.ask(robot, verb, timeout_s=args.wait)
 
-            return await work(Looking(lambda: online, ask, chosen, args.wait))
+            elsewhere = "" if online else robots.here(await operator.elsewhere())
+            return await work(Looking(lambda: online, ask, chosen, args.wait, elsewhere))
 
     return running.until_stopped(run, interrupted=running.INTERRUPTED)
 

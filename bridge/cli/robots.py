@@ -11,7 +11,7 @@ import asyncio
 import json
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Collection
+from collections.abc import AsyncIterator, Collection, Mapping
 from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -51,6 +51,12 @@ def chosen_caller(args: argparse.Namespace, settings: OperatorSettings) -> Agent
     """Who ``--as`` names, else who the settings are for; whom nobody named asks as ``operator/0``."""
     principal: Principal = args.principal or Principal("operator", settings.id or 0)
     return AgentId(*principal.agent) if principal.kind else AgentId(OPERATOR, 0)
+
+
+def here(elsewhere: Mapping[str, int]) -> str:
+    """What follows "nobody is online", where others are in other namespaces."""
+    others = ", ".join(f"{count} in {name!r} (--namespace {name})" for name, count in sorted(elsewhere.items()))
+    return f" here; {others}" if others else ""
 
 
 class Operator:

@@ -50,7 +50,7 @@ class Clock:
 
 class Looking:
     """The robots that somebody sees. ``known`` are those online, ``ask(robot, verb)`` asks one; ``timeout_s`` bounds
-    each answer."""
+    each answer; ``elsewhere`` follows "none is online"."""
 
     def __init__(
         self,
@@ -58,8 +58,10 @@ class Looking:
         ask: Callable[[int, str], Awaitable[bytes]],
         chosen: Chosen,
         timeout_s: float,
+        elsewhere: str = "",
     ) -> None:
         self._known = known
+        self._elsewhere = elsewhere
         self._call = ask
         self.chosen = chosen
         self.timeout_s = timeout_s
@@ -77,10 +79,11 @@ class Looking:
         online = self.online()
         for robot in self.chosen.robots:
             if robot not in online:
-                raise Unreachable(f"robot {robot}", "it is not online (macs ls)")
+                raise Unreachable(f"robot {robot}", f"it is not online{self._elsewhere} (macs ls)")
         if not online:
             named = ", ".join(map(str, self.chosen.groups))
-            raise Unreachable(f"a robot of group {named}" if named else "any robot", "none is online (macs ls)")
+            who = f"a robot of group {named}" if named else "any robot"
+            raise Unreachable(who, f"none is online{self._elsewhere} (macs ls)")
         return online
 
     def only(self) -> list[int]:

@@ -84,6 +84,10 @@ async def test_a_namespace_is_a_mesh_of_its_own(endpoint: str) -> None:
         assert [agent["id"] for agent in await macs("ls", "--json", "-e", endpoint, "--namespace", "site1")] == [7]
         _, shown, _ = await ended("ls", "-e", endpoint)
         assert shown.startswith("nobody is online here; 1 in 'site1' (--namespace site1)\n")
+        for argv in (["topic", "list"], ["service", "list"], ["topic", "info", "/pose", "--robot", "7"]):
+            code, _, errors = await ended(*argv, "-e", endpoint)
+            assert code == 1
+            assert "online here; 1 in 'site1' (--namespace site1) (macs ls)" in errors
 
 
 @pytest.mark.alone
