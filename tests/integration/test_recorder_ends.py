@@ -107,6 +107,22 @@ async def test_one_that_ends_at_once_does_not_stay(tmp_path: Path, monkeypatch: 
         assert (await site.post("start"))[0] == 200
 
 
+async def test_what_has_only_begun_is_not_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording is one when it records: until then the state has none."""
+    ready, seen = Child.ready, list[object]()
+
+    async with served(tmp_path) as site:
+
+        async def looked_at(self: Child) -> None:
+            seen.append((await site.state())["recording"])
+            await ready(self)
+
+        monkeypatch.setattr(Child, "ready", looked_at)
+        assert (await site.post("start"))[0] == 200
+        assert (await site.state())["recording"] is not None
+    assert seen == [None]
+
+
 async def test_what_is_said_of_the_ring_stays_when_a_recording_begins(tmp_path: Path) -> None:
     """Another's problem is not forgotten."""
     async with served(tmp_path, "--ring", "30s") as site:

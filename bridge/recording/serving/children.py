@@ -73,6 +73,11 @@ class Child:
             ready.cancel()
 
     @property
+    def is_ready(self) -> bool:
+        """Whether it does its work."""
+        return self._ready.is_set()
+
+    @property
     def problem(self) -> str:
         """Why it ended, where it should not have; empty where it ended in order, or goes on."""
         code = self._process.returncode

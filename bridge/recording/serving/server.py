@@ -14,7 +14,7 @@ import socket
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeGuard, TypeVar
 
 import msgspec
 from aiohttp import web
@@ -166,9 +166,9 @@ class Recorder:
         files = await asyncio.to_thread(self._folder.listed, being_written)
         free = await asyncio.to_thread(shutil.disk_usage, self._folder.path)
         return {
-            "recording": {"name": self._file, **self._recording.progress} if self._recording is not None else None,
-            "ring": self._ring.progress if self._ring is not None else None,
-            "replay": self._replayed if self._replay is not None else None,
+            "recording": {"name": self._file, **self._recording.progress} if _is_ready(self._recording) else None,
+            "ring": self._ring.progress if _is_ready(self._ring) else None,
+            "replay": self._replayed if _is_ready(self._replay) else None,
             "problem": "; ".join(self._problems.values()),
             "files": files,
             "bytes": await asyncio.to_thread(lambda: self._folder.bytes),
@@ -297,6 +297,11 @@ class Recorder:
         if problem and not self._closing:
             self._problems[what] = problem
             log.error("%s", problem)
+
+
+def _is_ready(child: Child | None) -> TypeGuard[Child]:
+    """Whether it does its work: what has only begun is not shown as if it recorded."""
+    return child is not None and child.is_ready
 
 
 def _take_over(path: Path) -> None:
