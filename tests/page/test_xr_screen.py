@@ -52,7 +52,7 @@ async def test_what_is_not_drawn_is_not_shown(gate: Gate) -> None:
     await until(lambda: headset.value("Boolean(window.macsXr)"))
     ways = {
         LOSE: "lose.restoreContext()",
-        "macsXr.stage.render = () => { throw new Error('it fails'); }": "delete macsXr.stage.render",
+        "macsXr.stage.render = () => { throw new Error('it fails'); }; 0": "delete macsXr.stage.render",
     }
     for away, back in ways.items():
         await headset.frame()
