@@ -86,6 +86,16 @@ WAYS = {
 }
 
 
+WHY = {
+    "headset_off": {"the headset is off"},
+    "menu_opened": {"the headset is off"},
+    "scene_hangs": {"the headset stood still"},
+    "no_robot": {"another robot was chosen"},
+    "xr_ends": {"the headset is off", "the headset was put on or off", "the headset stood still"},
+}
+"""What ends it, and nothing that a busy machine does meanwhile."""
+
+
 async def test_who_wears_it_no_more_has_let_go(site: Site) -> None:
     """Taken off, its menu opened, hung, the robot given up, XR left: each ends with a zero, and nothing drives that
     was not taken hold of anew."""
@@ -95,10 +105,19 @@ async def test_who_wears_it_no_more_has_let_go(site: Site) -> None:
         await headset.enter()
         take, let_go = by_grip(headset)
         for name, (away, back) in WAYS.items():
-            await headset.drives(heard, take, let_go)
-            await headset.value(away)
-            await until(lambda: heard.last == 0.0)
-            after = len(heard.speeds)
+            for _ in range(8):  # on a busy machine the scene stands still at times, which ends it as well
+                await headset.drives(heard, take, let_go)
+                await headset.value(away)
+                await until(lambda: heard.last == 0.0)
+                after = len(heard.speeds)
+                await until(lambda: headset.state("held === false"))
+                why = await headset.state("why")
+                if why in WHY[name] or name == "xr_ends":
+                    break
+                await headset.value(back)
+                await let_go()
+                await until(lambda: headset.state("barred === ''"))
+            assert why in WHY[name], name
             if back:
                 await headset.value(back)
                 await until(lambda: headset.state("barred === ''"))
