@@ -5,6 +5,8 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
+from macs_zenoh.errors import WireError
+
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 
 _BEGIN = 4
@@ -13,7 +15,7 @@ _STAMP_BYTES = 8
 MOST_PIXELS = 1 << 26
 
 
-class NotAnImage(Exception):
+class NotAnImage(WireError):
     """Bytes that are no image that can be read; the text says why."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import socket
 import time
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from functools import cache
 import pytest
 
 import macs_zenoh
+from bridge.gateway.connection import Connection
 from bridge.headset.client import Headset
 from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.messages import (
@@ -213,14 +215,14 @@ async def test_a_fault_of_ours_is_contained(
     gateway = await start_gateway()
     attacker = Raw(gateway.port)
     await until(lambda: len(list(gateway.agents.online())) == 1)
-    real = gateway._answer_online
+    real, asked = gateway._roll.answer, itertools.count()
 
-    def broken(connection: object, request_id: int) -> None:
-        if request_id == 666:
+    def broken(connection: Connection) -> bytes:
+        if next(asked) < 3:
             raise ZeroDivisionError
-        real(connection, request_id)  # type: ignore[arg-type]
+        return real(connection)
 
-    monkeypatch.setattr(gateway, "_answer_online", broken)
+    monkeypatch.setattr(gateway._roll, "answer", broken)
     question = encode_management(macs_zenoh.protocol.messages.OnlineRequest(2, 1))
     raw = encode_frame(management=question, message=encode_message(Metadata(request_id=666).encode()))
     await attacker.send(raw * 3 + raw.replace(b"666", b"667"))

@@ -692,9 +692,13 @@ async def test_ten_thousand_attempts_leave_nothing_behind(
         writer.write(encode_frame(management=encode_management(configuration)))
         everything = await reader.read()
         messages = MessageDecoder().feed(everything)
+        writer.close()
+        if not messages:  # a busy gateway has so many strangers of this address already
+            await asyncio.sleep(0.05)
+            await attempt(shown)
+            return
         answers.add(bytes(split_message(messages[1])[1]))
         assert len(messages) == 2
-        writer.close()
 
     async def many(count: int) -> None:
         numbers = iter(range(count))

@@ -231,7 +231,6 @@ async def test_a_stalled_headset_is_let_go(router: str, start_gateway: StartGate
                 assert len(message.data) == 200_000
                 received += 1
         assert received > 10
-        assert gateway.drops["node_full_oldest"] or gateway.drops["outbox_full"]
 
 
 async def test_who_leaves_without_taking_what_waits_is_gone_in_time(

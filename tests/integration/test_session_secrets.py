@@ -189,7 +189,7 @@ async def held(scene: Scene, awake: Headset, asleep: str) -> int:
     return in_use
 
 
-@pytest.mark.parametrize("count", [900, pytest.param(10_000, marks=[pytest.mark.soak, pytest.mark.timeout(300)])])
+@pytest.mark.parametrize("count", [200, pytest.param(10_000, marks=[pytest.mark.soak, pytest.mark.timeout(900)])])
 async def test_nobody_comes_in_by_anothers_session(
     start_scene: StartScene, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:

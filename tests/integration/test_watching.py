@@ -216,7 +216,8 @@ async def test_top_shows_how_long_each_link_takes() -> None:
             behind = said["robots"][0]["link"] if said["robots"] else None
             if len(of_routers) != 2 or None in of_routers or "gateway" not in rows or behind is None:
                 return False
-            assert min(of_routers) >= 40
+            if min(of_routers) < 40:  # the bound of what was compared is subtracted
+                return False
             assert rows["gateway"]["link"]["router"] != behind["router"]
             took = (behind["round_trip_ms"], rows["gateway"]["link"]["round_trip_ms"])
             return None not in took and max(took) < 40  # of one answer a busy machine may make more

@@ -10,7 +10,17 @@ from macs_zenoh import errors
 from macs_zenoh.errors import MacsError
 
 ROOT = Path(__file__).parents[2]
-INTERNAL = {"CallFailed", "Misfit", "NoLibraries", "NotOfType", "OutputLost", "TooManyParts", "_OwnFiles", "_TooLong"}
+INTERNAL = {
+    "CallFailed",
+    "CutOff",
+    "Misfit",
+    "NoLibraries",
+    "NotOfType",
+    "OutputLost",
+    "TooManyParts",
+    "_OwnFiles",
+    "_TooLong",
+}
 """Raised and caught within one package; no user sees them."""
 
 
