@@ -32,7 +32,8 @@ log = logging.getLogger("macs.ros")
 AGAIN_S = 1.0
 """Pause before another robot is asked again for what it does not have yet, or refuses."""
 ROBOTS = 64
-"""So many robots are mirrored at one time: whoever is in a group is asked again and again, and a group is open."""
+"""So many robots are mirrored at one time for their group alone: whoever is in a group is asked again and again, and a
+group is open. Those that a rule names by id come beside them."""
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 
@@ -43,6 +44,10 @@ class Mirrors:
         self._robot = robot
         self._agent = agent
         self._of: dict[int, list[_Mirrored]] = {}
+        self._by_group: set[int] = set()
+        """Those of them that no rule names by id."""
+        self._waiting: dict[int, list[MirrorRule]] = {}
+        """Robots that there was no room for and what of them is wanted, the first first."""
         self._watching = agent.on_presence(self._presence)
 
     def close(self) -> None:
@@ -55,23 +60,37 @@ class Mirrors:
         if other.type != ROS or other.id == self._robot.agent_id:
             return
         self._end(other.id)
-        if not online or not any(rule.means(other.id, other.group) for rule in self._robot.rules.settings.mirror):
-            return
-        if len(self._of) >= ROBOTS:
-            why = f"{ROBOTS} robots are mirrored already"
-            self._robot.drops.note("not_mirrored", str(AgentId(ROS, other.id)), why)
-        else:
-            begun = self._of[other.id] = []
-            for rule in self._robot.rules.settings.mirror:
-                if rule.means(other.id, other.group):
-                    kinds: tuple[tuple[type[_Mirrored], list[str]], ...] = (
-                        (MirroredTopic, rule.topics),
-                        (MirroredService, rule.services),
-                    )
-                    for kind, names in kinds:
-                        begun += [kind(self._robot, self._agent, rule, other.id, name) for name in names]
+        self._waiting.pop(other.id, None)
+        rules = [rule for rule in self._robot.rules.settings.mirror if rule.means(other.id, other.group)]
+        if online and rules:
+            if any(rule.by_id for rule in rules) or self._has_room:
+                self._begin(other.id, rules)
+            else:
+                self._waiting[other.id] = rules
+                why = f"{ROBOTS} robots are mirrored already"
+                self._robot.drops.note("not_mirrored", str(AgentId(ROS, other.id)), why)
+        while self._waiting and self._has_room:
+            first = next(iter(self._waiting))
+            self._begin(first, self._waiting.pop(first))
+
+    @property
+    def _has_room(self) -> bool:
+        return len(self._by_group) < ROBOTS
+
+    def _begin(self, other: int, rules: list[MirrorRule]) -> None:
+        begun = self._of[other] = []
+        if not any(rule.by_id for rule in rules):
+            self._by_group.add(other)
+        for rule in rules:
+            kinds: tuple[tuple[type[_Mirrored], list[str]], ...] = (
+                (MirroredTopic, rule.topics),
+                (MirroredService, rule.services),
+            )
+            for kind, names in kinds:
+                begun += [kind(self._robot, self._agent, rule, other, name) for name in names]
 
     def _end(self, other: int) -> None:
+        self._by_group.discard(other)
         for mirrored in self._of.pop(other, ()):
             mirrored.close()
 

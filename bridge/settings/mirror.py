@@ -53,6 +53,11 @@ class MirrorRule(Section, frozen=True, kw_only=True, forbid_unknown_fields=True)
         if not re.fullmatch(r"(/[A-Za-z_]\w*)+", shown, re.ASCII) or shown == "/x":
             raise self._wrong("as", f"{self.name!r} makes no other full name of /x")
 
+    @property
+    def by_id(self) -> bool:
+        """Whether it names one robot, and no group that anybody may be in."""
+        return self.source.startswith("ros/")
+
     def means(self, robot: int, group: int) -> bool:
         """Whether a robot is one of those."""
         kind, _, number = self.source.partition("/")
