@@ -32,6 +32,9 @@ from macs_zenoh.sections import changed
 
 log = logging.getLogger("macs.ros")
 
+STOPPED_WITHIN_S = 10.0
+"""So long leaving may take, with every robot of many: one that cannot be left ends with the program."""
+
 SUMMARY = "robots that run rmw_zenoh, with nothing installed on them"
 
 
@@ -63,7 +66,9 @@ def run(args: argparse.Namespace) -> int:
         settings = changed(settings, rmw_zenoh=changed(settings.rmw_zenoh, robots=[robot]))
     if not settings.rmw_zenoh.robots and not args.all:
         raise UsageError("which robots? Give --id, or [[rmw_zenoh.robots]] in --settings, or --all")
-    return running.until_stopped(lambda: _serve(settings, look=args.all, dry_run=args.dry_run))
+    return running.until_stopped(
+        lambda: _serve(settings, look=args.all, dry_run=args.dry_run), within_s=STOPPED_WITHIN_S
+    )
 
 
 async def _serve(settings: Settings, *, look: bool, dry_run: bool) -> int:

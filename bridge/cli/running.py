@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import logging
 import os
 import signal
@@ -29,6 +30,9 @@ STOPS = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVT
 """Signals that end a program unless it takes them, and that it can take. One that ends by them must end as by Ctrl-C,
 else the last command to a robot stays. One that was ignored when the program started stays so: that is ``nohup``."""
 
+OVERDUE_S = 2.0
+"""A program that is to end within a time ends at once by another signal so long after the first."""
+
 INTERRUPTED = 130
 """The exit code, as with any program that Ctrl-C ends, of one that was to find or do something: nobody must take it
 for a confirmation."""
@@ -44,21 +48,27 @@ def switch_soon() -> None:
     sys.setswitchinterval(SWITCH_S)
 
 
-def until_stopped(work: Callable[[], Coroutine[Any, Any, int]], *, interrupted: int = 0) -> int:
+def until_stopped(
+    work: Callable[[], Coroutine[Any, Any, int]], *, interrupted: int = 0, within_s: float | None = None
+) -> int:
     """Run ``work`` to its end and return its exit code; SIGINT and those of `STOPS` cancel it. For who serves until it
     is stopped that is a success; for others ``interrupted`` is the exit code then.
 
-    A second Ctrl-C ends the process at once, for whoever does not want to wait for a clean close.
+    A second Ctrl-C ends the process at once, for whoever does not want to wait for a clean close. ``within_s``: so
+    long after it was told to stop the process ends in any case and says where it hung, also where a library keeps all
+    of Python waiting; and another signal ends it at once when it is overdue.
     """
     loop = _new_loop()
     try:
         asyncio.set_event_loop(loop)
-        return loop.run_until_complete(_stoppable(work, interrupted))
+        return loop.run_until_complete(_stoppable(work, interrupted, within_s))
     finally:
         loop.run_until_complete(_end_what_is_left())
         loop.run_until_complete(loop.shutdown_asyncgens())
         asyncio.set_event_loop(None)
         loop.close()
+        if within_s is not None:
+            faulthandler.cancel_dump_traceback_later()
 
 
 async def _end_what_is_left() -> None:
@@ -74,32 +84,49 @@ async def _end_what_is_left() -> None:
             log.debug("%s ended with %r", task.get_name(), error)  # nobody waits for it any more
 
 
-async def _stoppable(work: Callable[[], Coroutine[Any, Any, int]], interrupted: int) -> int:
+async def _stoppable(work: Callable[[], Coroutine[Any, Any, int]], interrupted: int, within_s: float | None) -> int:
     loop = asyncio.get_running_loop()
     task = loop.create_task(work())
+    stopped = False
+
+    def stop() -> None:
+        nonlocal stopped
+        task.cancel()
+        if within_s is not None and not stopped:
+            faulthandler.dump_traceback_later(within_s, exit=True)  # by a thread that needs no turn of Python's
+            loop.call_later(OVERDUE_S, _end_by_signals, loop)
+        stopped = True
 
     def interrupt() -> None:
         loop.add_signal_handler(signal.SIGINT, os._exit, INTERRUPTED)
-        task.cancel()
+        stop()
 
     loop.add_signal_handler(signal.SIGINT, interrupt)
     # Not twice as for Ctrl-C: under systemd a child of `macs up` gets one SIGTERM from each of the two.
     for name in STOPS:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
-            loop.add_signal_handler(number, task.cancel)
+            loop.add_signal_handler(number, stop)
     if os.environ.pop(STOP_WITH_STDIN, None):
-        loop.add_reader(sys.stdin.fileno(), _stop_at_end_of_stdin, loop, task)
+        loop.add_reader(sys.stdin.fileno(), _stop_at_end_of_stdin, loop, stop)
     try:
         return await task
     except asyncio.CancelledError:
         return interrupted
 
 
-def _stop_at_end_of_stdin(loop: asyncio.AbstractEventLoop, task: asyncio.Task[int]) -> None:
+def _end_by_signals(loop: asyncio.AbstractEventLoop) -> None:
+    """From now on the kernel ends this process by each of them, whatever Python does."""
+    for name in STOPS:
+        number = getattr(signal, name, None)
+        if number is not None and loop.remove_signal_handler(number):
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _stop_at_end_of_stdin(loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:
     if not os.read(sys.stdin.fileno(), 4096):
         loop.remove_reader(sys.stdin.fileno())
-        task.cancel()
+        stop()
 
 
 def _new_loop() -> asyncio.AbstractEventLoop:

@@ -42,6 +42,7 @@ from macs_zenoh.protocol.rmw_zenoh.keyexpr import (
 from macs_zenoh.protocol.rmw_zenoh.qos import SERVICES, Durability, History, Qos, Reliability
 
 from .declared import Subscription
+from .heartbeat import Heartbeat
 from .leaving import leave
 from .opening import open_session
 from .panics import call, unwatched, watched
@@ -259,6 +260,7 @@ class RosPublisher:
         self.gid = gid_of(token)
         self._numbers = itertools.count(1)
         self._lock = threading.Lock()
+        self._heartbeat: Heartbeat | None = None
         qos, reliable = endpoint.qos, endpoint.qos.reliability != Reliability.BEST_EFFORT
         waits = reliable and qos.history == History.KEEP_ALL
         options: dict[str, Any] = {
@@ -268,9 +270,9 @@ class RosPublisher:
             "reliability": zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT,
         }
         if qos.durability == Durability.TRANSIENT_LOCAL:
-            if reliable:
+            if reliable:  # numbered; the heartbeat is ours
                 options["sample_miss_detection"] = zenoh.ext.MissDetectionConfig(
-                    heartbeat=None, sporadic_heartbeat=HEARTBEAT_S
+                    heartbeat=None, sporadic_heartbeat=None
                 )
             self._publisher = call(
                 zenoh.ext.declare_advanced_publisher,
@@ -280,17 +282,23 @@ class RosPublisher:
                 publisher_detection=True,
                 **options,
             )
+            if reliable:
+                self._heartbeat = Heartbeat(network.session, endpoint.key, self._publisher, HEARTBEAT_S)
         else:
             self._publisher = network.session.declare_publisher(endpoint.key, **options)
-        self._declared = Subscription(self._publisher, network.session.liveliness().declare_token(token))
+        told = [self._heartbeat] if self._heartbeat is not None else []
+        self._declared = Subscription(*told, self._publisher, network.session.liveliness().declare_token(token))
 
     def publish(self, cdr: bytes) -> None:
         """Put a message. From any thread. Raises NoCdr."""
         if not looks_like_cdr(cdr):
             raise NoCdr(self.endpoint.topic)
         with self._lock:  # numbers go out in their order
-            attached = encode_attachment(next(self._numbers), time.time_ns(), self.gid)
+            number = next(self._numbers)
+            attached = encode_attachment(number, time.time_ns(), self.gid)
             call(self._publisher.put, cdr, attachment=attached)
+            if self._heartbeat is not None:
+                self._heartbeat.note(number - 1)  # Zenoh counts from 0
 
     def close(self) -> None:
         """Publish no more."""

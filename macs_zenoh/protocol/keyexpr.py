@@ -200,6 +200,11 @@ def sources(key: str, source: str = "") -> str:
     return f"{key}/{_SOURCES}{source}/**" if source else f"{key}/{_SOURCES}**"
 
 
+def heartbeat(key: str, zid: str, entity: int) -> str:
+    """The heartbeat of one reliable source of a key."""
+    return f"{key}/{_SOURCES}{zid}/{entity}/_"
+
+
 def source_of(key: str) -> tuple[str, str]:
     """The data's key and the source that a heartbeat's key names; both are empty for other keys."""
     data_key, _, source = key.removesuffix("/_").rpartition(f"/{_SOURCES}")
