@@ -128,4 +128,5 @@ async def test_a_stop_holds_on_a_robot_that_starts_anew(site: Site) -> None:
     await site.agent.start()
     await online(page, 1)
     await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
-    assert await page.value("fetch('/view/robots/1/status').then((r) => r.json()).then((s) => s.stopped)") is True
+    said = "fetch('/view/robots/1/status').then((r) => r.json()).then((s) => s.stopped === true)"
+    await until(lambda: page.value(said))

@@ -101,7 +101,7 @@ export function statusRows({ state, stop, battery, picture, event, values }) {
     { label: "Gateway", value: link[0], tone: link[1] },
     { label: "Pictures", value: picture.text, tone: picture.tone },
     { label: "Driving", value: driving(state), tone: state.held ? "good" : state.barred ? "bad" : "muted" },
-    { label: "Control", value: control(state), tone: state.unknown.length ? "bad" : state.holder === "you" ? "good" : state.holder ? "warn" : undefined },
+    { label: "Control", value: control(state), tone: controlTone(state) },
   ];
   if (battery) rows.push({ label: "Battery", value: battery.text, tone: battery.tone });
   if (stop.text) rows.push({ label: "Stop", value: stop.text, tone: "bad" });
@@ -118,6 +118,12 @@ export function quality(ms, good, bad) {
 function driving(state) {
   if (state.held) return `${state.speed.linear.toFixed(2)} m/s · ${state.speed.angular.toFixed(2)} rad/s`;
   return state.barred ? `off: ${state.barred}` : "hold grip or pinch";
+}
+
+function controlTone({ unknown, holder }) {
+  if (unknown.length) return "bad";
+  if (holder === "you") return "good";
+  return holder ? "warn" : undefined;
 }
 
 function control(state) {

@@ -2,11 +2,15 @@
 
 /**
  * [{id, label, robots, groups, members, seen}]: `robots` and `groups` name those that commands are for, `members` are all robots
- * that are meant by that, `seen` is the one whose pictures are shown. `members` tells the group of each robot: {robot: group}; `me` what the token may.
+ * that are meant by that, `seen` is the one whose pictures are shown.
+ * `members` tells the group of each robot: {robot: group}; `me` what the token may.
  */
 export function targets(online, members, me) {
   const mine = me.robots === "any" ? online : online.filter((robot) => me.robots.includes(robot));
-  const found = mine.map((robot) => ({ id: `robot/${robot}`, label: `Robot ${robot}`, robots: [robot], groups: [], members: [robot], seen: robot }));
+  const found = mine.map((robot) => {
+    const alone = { robots: [robot], groups: [], members: [robot], seen: robot };
+    return { id: `robot/${robot}`, label: `Robot ${robot}`, ...alone };
+  });
   const groups = new Map();
   for (const robot of online) {
     const group = members[robot] ?? 0;
