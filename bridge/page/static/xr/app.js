@@ -74,6 +74,7 @@ class Scene {
     this.links.settings(this.settings.values);
     for (const name of ["curve", "scale", "layers"]) this.room.follow(name, this.settings.get(name));
     this.immersion.look();
+    this.telling.tell();
     this.stage.renderer.setAnimationLoop((time, frame) => this.#frame(time, frame ?? null));
     setInterval(() => this.#askOffers(), OFFERS_MS);
     setInterval(() => this.telling.tick(), 250);
