@@ -7,8 +7,8 @@ import gc
 import json
 import logging
 import os
+import sys
 import time
-import tracemalloc
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -174,7 +174,7 @@ async def come_back(scene: Scene, secret: str) -> int:
 
 
 async def held(scene: Scene, awake: Headset, asleep: str) -> int:
-    """The memory in use, when the owners have taken the news of who has left: what waits of that is bounded."""
+    """The blocks of memory in use when the owners have taken the news of who has left: what waits of that is bounded."""
     await until(lambda: len(scene.gateway.agents) == 2)
     for _ in range(2):  # the second time says that what came the first time has arrived
         await come_back(scene, asleep)
@@ -185,11 +185,10 @@ async def held(scene: Scene, awake: Headset, asleep: str) -> int:
     while awake.waiting:
         await awake.receive(PATIENCE_S)
     gc.collect()
-    in_use, _ = tracemalloc.get_traced_memory()
-    return in_use
+    return sys.getallocatedblocks()
 
 
-@pytest.mark.parametrize("count", [200, pytest.param(10_000, marks=[pytest.mark.soak, pytest.mark.timeout(900)])])
+@pytest.mark.parametrize("count", [1_000, pytest.param(10_000, marks=[pytest.mark.soak, pytest.mark.timeout(900)])])
 async def test_nobody_comes_in_by_anothers_session(
     start_scene: StartScene, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
@@ -209,18 +208,13 @@ async def test_nobody_comes_in_by_anothers_session(
     try:
         before_count = count // 4
         tried = await try_them_all(scene, before_count, secrets)
-        tracemalloc.start()
         settling = count // 10
         tried += await try_them_all(scene, settling, secrets, before_count)
         before = await held(scene, awake, other)
-        first = tracemalloc.take_snapshot()
         tried += await try_them_all(scene, count - before_count - settling, secrets, before_count + settling)
         after = await held(scene, awake, other)
-        for difference in tracemalloc.take_snapshot().compare_to(first, "lineno")[:12]:
-            print(difference)
-        tracemalloc.stop()
-        print(f"{count} attempts: {after - before} bytes more")
-        assert after - before < 1 << 20  # news of who has left that waits for the owners
+        print(f"{count} attempts in {time.monotonic() - began:.0f} s: {after - before} blocks more")
+        assert after - before < 6_000  # news of who has left that waits for the owners
         assert len(scene.seen) == 1, scene.seen
         assert next(iter(scene.seen))[0] == SessionOpened.manager
         assert scene.seen.total() == tried
