@@ -174,7 +174,7 @@ async def come_back(scene: Scene, secret: str) -> int:
 
 
 async def held(scene: Scene, awake: Headset, asleep: str) -> int:
-    """The blocks of memory in use when the owners have taken the news of who has left: what waits of that is bounded."""
+    """The blocks of memory in use when the owners have heard who has left: what waits of that is bounded."""
     await until(lambda: len(scene.gateway.agents) == 2)
     for _ in range(2):  # the second time says that what came the first time has arrived
         await come_back(scene, asleep)
