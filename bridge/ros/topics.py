@@ -192,12 +192,12 @@ class PublisherNode(TopicNode):
         return None
 
     def _publish(self, cdr: bytes, publisher: Publisher | None, *, again: bool = False) -> Exception | None:
-        """What failed, counted unless it is tried ``again``."""
+        """What failed, counted unless it is tried ``again`` over a way that is lost."""
         try:
             assert publisher is not None
             publisher.publish(cdr)
         except Exception as error:  # noqa: BLE001 - the middleware's, whatever it is
-            if not again:
+            if not (again and isinstance(error, CutOff)):
                 self.robot.drops.note("failed", self.topic, f"ROS did not publish: {error}")
             return error
         return None
@@ -264,6 +264,8 @@ class PublisherNode(TopicNode):
                     self._say_stop(publisher, why, level, times + 1, until)
 
             self.robot.alarms.at(now + STOP_AGAIN_S, say)
+        else:
+            log.error("%s: %s; the stop message could not be published", self.topic, why)
 
     def status(self) -> NodeStatus:
         return structs.replace(super().status(), control=self._control_status(), deadman=self._deadman_status())

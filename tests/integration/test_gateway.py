@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import math
 import struct
-from contextlib import AsyncExitStack, suppress
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
 
 import pytest
 
 import macs_zenoh
+from bridge.headset.client import Headset
 from macs_zenoh.errors import ConfigError
 from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.messages import (
@@ -205,32 +209,71 @@ async def test_registrations_reach_robots_that_come_later(
             assert topics == {"/pose", "/scan"}
 
 
-async def test_a_stalled_headset_is_let_go(router: str, start_gateway: StartGateway, connect: Connect) -> None:
-    """A headset that stops reading is disconnected after its time; its neighbour gets everything in order."""
-    gateway = await start_gateway(write_timeout_s=0.5, outbox_bytes=1 << 20)
+@asynccontextmanager
+async def camera(router: str, *watching: Headset) -> AsyncIterator[Callable[[], Awaitable[None]]]:
+    """A robot's, whose pictures these headsets want. What is given puts the next picture, and waits until the first of
+    them has it, with nothing left out before it."""
+    metadata = Metadata(1, 1, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__image", "sensor_msgs/Image").encode()
+    management = encode_management(StreamData({"2": [headset.id for headset in watching]}))
+
+    async def add(call: macs_zenoh.Call) -> bytes:
+        return b""
+
+    async with macs_zenoh.join("ros", id=1, settings=patient(router)) as robot:
+        robot.serve("add_node", add)
+        streams, numbers = Streams(robot), itertools.count(1)
+        images, *_ = [await each.subscribe("/image", "sensor_msgs/Image", agents=[1]) for each in watching]
+
+        def put(number: int) -> None:
+            message = encode_message(metadata, number.to_bytes(4, "little") + bytes(50_000))
+            streams.publish("nd__image", encode_frame(1, management=management, message=message))
+
+        async def came() -> int:
+            message = await asyncio.wait_for(images.__anext__(), PATIENCE_S)
+            return int.from_bytes(message.data[:4], "little")
+
+        async def show() -> None:
+            put(number := next(numbers))
+            while (found := await came()) == 0:
+                pass
+            assert found == number
+
+        first = asyncio.create_task(came())
+        while not first.done():  # until the registration is there, nobody listens
+            put(0)
+            await asyncio.wait([first], timeout=0.1)
+        yield show
+
+
+async def test_a_stalled_headset_loses_by_itself(router: str, start_gateway: StartGateway, connect: Connect) -> None:
+    """Of what a headset that stops reading does not take the oldest is dropped and counted; its neighbour gets
+    everything in order."""
+    gateway = await start_gateway()
     neighbour, stalled = await connect(gateway), await connect(gateway)
     stalled.pause()
-    async with macs_zenoh.join("ros", id=1, settings=patient(router)) as robot:
-        metadata = Metadata(1, 1, 0, StreamData.manager, NodeType.SUBSCRIBER, "nd__image", "sensor_msgs/Image")
-        management = encode_management(StreamData({"2": [neighbour.id, stalled.id]}))
-        image = encode_frame(1, management=management, message=encode_message(metadata.encode(), bytes(200_000)))
+    async with camera(router, neighbour, stalled) as show:
+        connection = gateway.agents.find(2, stalled.id)
+        while connection.all_drops()["node_full_oldest"] < 10:
+            await show()
+        assert connection.all_drops().keys() == {"node_full_oldest"}
+        assert not gateway.agents.find(2, neighbour.id).all_drops()
 
-        async def add(call: macs_zenoh.Call) -> bytes:
-            return b""
 
-        robot.serve("add_node", add)
-        images = await neighbour.subscribe("/image", "sensor_msgs/Image", agents=[1])
-        await stalled.subscribe("/image", "sensor_msgs/Image", agents=[1])
-        left = asyncio.Event()
-        robot.on_presence(lambda agent, online: left.set() if agent.id == stalled.id and not online else None)
-        received = 0
-        while not left.is_set():
-            Streams(robot).publish("nd__image", image)
-            with suppress(asyncio.TimeoutError):  # until the registration is there, nobody listens
-                message = await asyncio.wait_for(images.__anext__(), 0.1)
-                assert len(message.data) == 200_000
-                received += 1
-        assert received > 10
+async def test_a_stalled_headset_is_let_go(router: str, start_gateway: StartGateway, connect: Connect) -> None:
+    """A headset that stops reading is disconnected after its time, and not before; its neighbour goes on."""
+    gateway = await start_gateway(write_timeout_s=0.5)
+    neighbour, stalled = await connect(gateway), await connect(gateway)
+    stalled.pause()
+    async with camera(router, neighbour, stalled) as show:
+        connection = gateway.agents.find(2, stalled.id)
+        while connection._writer.paused_at is None:
+            await show()
+        paused_at = connection._writer.paused_at
+        while gateway.agents.find(2, stalled.id) is not None:
+            await show()
+        assert time.monotonic() - paused_at >= 0.5
+        assert (await neighbour.online()).unity_agent_ids == [neighbour.id]
+        await show()
 
 
 async def test_who_leaves_without_taking_what_waits_is_gone_in_time(
