@@ -14,6 +14,8 @@ Ask = Callable[[str, bytes], Awaitable[bytes]]
 VERB = "definitions"
 ROUNDS = 64
 """So often a robot is asked for what had no place in its last answer."""
+MOST_BYTES = 8 << 20
+"""And for no more when it has told so much; a robot with hundreds of types has a quarter of it."""
 
 
 async def definitions(ask: Ask, types: Iterable[str] = ()) -> DefinitionsReply:
@@ -37,6 +39,8 @@ async def definitions(ask: Ask, types: Iterable[str] = ()) -> DefinitionsReply:
         rest = waiting[TYPES_AT_ONCE:]
         left = [name for name in answer.left if name not in found]
         if len(found) == before and not rest:  # it has no more to tell
+            break
+        if sum(len(each.text) for each in found.values()) > MOST_BYTES:
             break
         waiting = list(dict.fromkeys([*rest, *left]))
         if not waiting:

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Collection, Mapping
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
@@ -20,16 +19,16 @@ import msgspec
 from bridge.principal import Principal
 from bridge.settings import OperatorSettings
 from macs_zenoh.config import MeshSettings
-from macs_zenoh.errors import MacsError, Refused, TooLong, Unreachable
+from macs_zenoh.errors import MacsError, Refused, Unreachable, WireError
 from macs_zenoh.protocol import keyexpr, ping
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import AgentInfo, Directory
+from macs_zenoh.protocol.json_fields import answered
 from macs_zenoh.protocol.keyexpr import LEASE, NAME, PING, PRESENCE
-from macs_zenoh.protocol.limits import ANSWER_BYTES
 from macs_zenoh.protocol.messages import OPERATOR, ROS, Metadata
 from macs_zenoh.protocol.named import Named, Names
 from macs_zenoh.protocol.ping import Pong
-from macs_zenoh.protocol.routers import Router
+from macs_zenoh.protocol.routers import Router, router_of
 from macs_zenoh.protocol.routing import call
 from macs_zenoh.protocol.wire import Layout
 
@@ -124,8 +123,7 @@ class Operator:
             return linked
         found = {router.zid: router for router in linked}
         for _, answer in await self._mesh.ask_all(keyexpr.ROUTERS, timeout_s=timeout_s):
-            with suppress(msgspec.MsgspecError):
-                router = msgspec.json.decode(answer, type=Router)
+            if (router := router_of(answer)) is not None:
                 found[router.zid] = router
         return sorted(found.values(), key=lambda router: router.zid)
 
@@ -227,9 +225,7 @@ async def _opened(opening: asyncio.Task[Mesh], settings: MeshSettings, patience_
 def read(answer: bytes, kind: type[_T]) -> tuple[dict[str, Any], _T]:
     """A robot's answer as it is, and as far as it is known here. Raises Unreachable: it makes no sense."""
     try:
-        if len(answer) > ANSWER_BYTES:
-            raise TooLong("an answer", len(answer), ANSWER_BYTES)
-        document = json.loads(answer)
+        document = answered("an answer", answer)
         return document, msgspec.convert(document, kind)
-    except (TooLong, ValueError, RecursionError, msgspec.ValidationError) as error:
+    except (WireError, msgspec.ValidationError) as error:
         raise Unreachable("the robot", f"its answer makes no sense: {error}") from error

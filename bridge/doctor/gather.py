@@ -24,7 +24,9 @@ from macs_zenoh.mesh import Mesh, configuration
 from macs_zenoh.protocol import endpoints, keyexpr
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.keyexpr import LEASE, NAME, PING, PRESENCE
+from macs_zenoh.protocol.limits import ROUTER_BYTES
 from macs_zenoh.protocol.rmw_zenoh.keyexpr import BadToken, Node, every_token, parse_token
+from macs_zenoh.protocol.routers import Router, router_of
 
 from . import transport
 from .facts import Endpoint, Facts, Own, Program, RouterInfo, Session
@@ -204,12 +206,11 @@ class Probe:
         """What the admin space tells of all routers; of the one at this endpoint also with whom it is linked."""
         found = []
         for _, answer in await mesh.ask_all(keyexpr.ROUTERS, timeout_s=self._timeout_s):
-            try:
-                found.append(_router_info(msgspec.json.decode(answer)))
-            except (msgspec.DecodeError, KeyError, TypeError):
-                continue  # a router of another kind
+            if (told := router_of(answer)) is not None:
+                found.append(_router_info(told))
         graphs = await mesh.ask_all(keyexpr.router_links(router), timeout_s=self._timeout_s)
-        linked = sorted({part for _, graph in graphs for part in graph.decode().split('"') if _is_zid(part)})
+        drawn = [graph.decode(errors="replace") for _, graph in graphs if len(graph) <= ROUTER_BYTES]
+        linked = sorted({part for graph in drawn for part in graph.split('"') if _is_zid(part)})
         for info in found:
             if info.zid == router:
                 info.routers = linked
@@ -259,17 +260,17 @@ def _is_zid(text: str) -> bool:
     return bool(text) and set(text) <= set("0123456789abcdef")
 
 
-def _router_info(answer: dict[str, Any]) -> RouterInfo:
+def _router_info(told: Router) -> RouterInfo:
     sessions = [
         Session(
-            zid=session["peer"],
-            whatami=session["whatami"],
-            shared_memory=bool(session.get("shm")),
-            address=next((link["dst"] for link in session["links"]), ""),
+            zid=session.peer,
+            whatami=session.whatami,
+            shared_memory=bool(session.shm),
+            address=next((link.dst for link in session.links), ""),
         )
-        for session in answer["sessions"]
+        for session in told.sessions
     ]
-    return RouterInfo(zid=answer["zid"], version=answer["version"], sessions=sessions)
+    return RouterInfo(zid=told.zid, version=told.version, sessions=sessions)
 
 
 def _programs(endpoints: list[Endpoint]) -> list[Program]:

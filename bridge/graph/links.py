@@ -6,12 +6,10 @@ import asyncio
 import time
 from contextlib import suppress
 
-import msgspec
-
 from macs_zenoh.errors import MacsError
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol import keyexpr
-from macs_zenoh.protocol.routers import Router, Trips
+from macs_zenoh.protocol.routers import Router, Trips, router_of
 
 TIMED = 16
 """So many routers are timed at one look."""
@@ -32,8 +30,7 @@ class Routers:
         if not self._mesh.settings.namespace:
             with suppress(MacsError):
                 for _, answer in await self._mesh.ask_all(keyexpr.ROUTERS, timeout_s=ANSWER_S):
-                    with suppress(msgspec.MsgspecError):
-                        router = msgspec.json.decode(answer, type=Router)
+                    if (router := router_of(answer)) is not None:
                         told[router.zid] = router
         self.trips.keep(told)
         for zid in sorted(told)[:TIMED]:  # one after the other: they would wait for each other

@@ -15,12 +15,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import os
 from collections.abc import Awaitable, Callable
 from typing import Any, NamedTuple
 
-from macs_zenoh.errors import CallTimeout, MacsError, Refused, Unreachable, WireError
+import msgspec
+
+from macs_zenoh.errors import BadJson, CallTimeout, MacsError, Refused, Unreachable, WireError
 from macs_zenoh.protocol.messages import ActionVerb
 from macs_zenoh.timeouts import within
 
@@ -148,14 +149,19 @@ class ActionClient(Node):
         return goal
 
     async def goals(self, robot: int, *, timeout_s: float = 5.0) -> list[dict[str, Any]]:
-        """The goals that the robot knows of this headset and its group: goal (hex), status, owner, finished."""
+        """The goals that the robot knows of this headset and its group: goal (hex), status, owner, finished.
+
+        Raises Unreachable, CallTimeout, BadJson.
+        """
         request_id = self._next_request
         answer: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         self._lists[request_id] = answer
         try:
             await self.tell(robot, ActionVerb.LIST, b"")
-            found: list[dict[str, Any]] = json.loads(await _within(answer, self.spec.tos_name, timeout_s))
-            return found
+            told = await _within(answer, self.spec.tos_name, timeout_s)
+            return msgspec.json.decode(told, type=list[dict[str, Any]])
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+            raise BadJson("a list of goals", str(error)) from error
         finally:
             del self._lists[request_id]
 

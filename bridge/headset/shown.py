@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import base64
-import json
 from typing import Any
+
+import msgspec
 
 from macs_zenoh.errors import WireError
 from macs_zenoh.protocol.keyexpr import type_name
@@ -57,6 +58,6 @@ def shown_message(message: Incoming, *, full: bool) -> dict[str, Any]:
 def json_or_text(data: bytes) -> Any:
     """What an answer says, whether it is JSON or not."""
     try:
-        return json.loads(data)
-    except ValueError:
+        return msgspec.json.decode(data)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return data.decode(errors="replace")

@@ -86,7 +86,7 @@ class Definitions:
             told = await definitions(ask, [whole])
         except MacsError:
             return None  # an existing program, or one that does not answer in time
-        return schemas.schema(name, told.definitions)
+        return await asyncio.to_thread(schemas.schema, name, told.definitions)  # as much as a robot likes to tell
 
     async def _of_everybody(self, name: str) -> str | None:
         if name in _SERVICES:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
-from macs_zenoh.errors import MacsError, Refused, TooLong, Unreachable
+from macs_zenoh.errors import MacsError, Refused, Unreachable, WireError
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.protocol.limits import ANSWER_BYTES
+from macs_zenoh.protocol.json_fields import answered
 from macs_zenoh.protocol.messages import ROS, UNITY, Metadata
 from macs_zenoh.protocol.rights import Grant
 from macs_zenoh.protocol.routing import call
@@ -86,16 +85,10 @@ class Robots:
                 del self._asked[key]
 
     async def _ask_json(self, robot: int, verb: str) -> dict[str, Any]:
-        answer = await self.ask(robot, verb)
         try:
-            if len(answer) > ANSWER_BYTES:
-                raise TooLong("an answer", len(answer), ANSWER_BYTES)
-            document = json.loads(answer)
-        except (TooLong, ValueError, RecursionError) as error:
+            return answered("an answer", await self.ask(robot, verb))
+        except WireError as error:
             raise Unreachable(f"robot {robot}", f"its answer makes no sense: {error}") from error
-        if not isinstance(document, dict):
-            raise Unreachable(f"robot {robot}", "its answer makes no sense: it is no object")
-        return document
 
 
 def may_see(visitor: Grant, robot: int, group: int) -> bool:

@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from msgspec import Struct
+
 import macs_zenoh
 from bridge.recording import LIBRARY
 from bridge.recording.disk import Disk, Plan
@@ -23,8 +25,9 @@ from bridge.recording.ring import Ring
 from bridge.settings.record import is_allowed
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings
-from macs_zenoh.errors import ConfigError, Refused, UsageError
+from macs_zenoh.errors import ConfigError, Refused, UsageError, WireError
 from macs_zenoh.protocol.keyexpr import type_name
+from macs_zenoh.protocol.messages import decode_data
 from macs_zenoh.serving import Call
 from macs_zenoh.versions import installed
 
@@ -76,6 +79,12 @@ class Report:
     lost: Counter[str] = field(default_factory=Counter)
     free_bytes: int = 0
     reason: str = ""
+
+
+class Asked(Struct, frozen=True):
+    """What the verb ``record`` is asked."""
+
+    action: str = "status"
 
 
 class Recording:
@@ -247,9 +256,8 @@ class Recording:
         """The verb ``record``: ``{"action": "write"}`` writes the ring, ``"status"`` tells, ``"stop"`` ends. What is
         more than to tell is for those whom ``[record] allow`` names."""
         try:
-            request = json.loads(call.data or b"{}")
-            action = request.get("action", "status")
-        except (ValueError, AttributeError) as error:
+            action = decode_data(Asked, call.data or b"{}").action
+        except WireError as error:
             raise Refused('say {"action": "status"}, "write" or "stop"') from error
         if action in ("write", "stop") and not is_allowed(self._order.allow, call.sender_type, call.sender_id):
             raise Refused(f"{call.sender_type}/{call.sender_id} may not: [record] allow does not name it")

@@ -159,7 +159,7 @@ class SharedStop:
             if len(cdr) > STATE_BYTES:
                 raise msgspec.DecodeError(f"{len(cdr)} bytes")
             state = msgspec.json.decode(read_text(cdr), type=StopState)
-        except (ValueError, msgspec.MsgspecError) as error:
+        except (ValueError, msgspec.MsgspecError, RecursionError) as error:
             self._robot.drops.note("bad_stop_state", self._topic + AGENTS, f"this is no state of an agent: {error}")
             return
         if state.session == self._robot.stop.session:

@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Struct
 
 from ..errors import BadField, BadJson, TooLong
-from .limits import ANSWER_BYTES, JSON_FIELDS, JSON_PARTS, METADATA_BYTES, NESTING
+from .limits import ANSWER_BYTES, ANSWER_PARTS, JSON_FIELDS, JSON_PARTS, METADATA_BYTES, NESTING
 
 StructT = TypeVar("StructT", bound=Struct)
 
@@ -24,11 +24,21 @@ def judged(what: str, data: bytes | bytearray | memoryview, max_bytes: int) -> b
     if len(data) > max_bytes:
         raise TooLong(what, len(data), max_bytes)
     data = bytes(data)
-    if len(data) > METADATA_BYTES and max_bytes < ANSWER_BYTES:
-        for parts in (data.count(b":"), data.count(b"[") + data.count(b"{")):
-            if parts > JSON_PARTS:
-                raise BadJson(what, f"it has {parts} parts, at most {JSON_PARTS} are allowed")
+    if len(data) > METADATA_BYTES:
+        keys, nested, most = data.count(b":"), data.count(b"[") + data.count(b"{"), JSON_PARTS
+        if max_bytes >= ANSWER_BYTES:
+            keys, most = keys + nested + data.count(b","), ANSWER_PARTS
+        if (parts := max(keys, nested)) > most:
+            raise BadJson(what, f"it has {parts} parts, at most {most} are allowed")
     return data
+
+
+def answered(what: str, answer: bytes) -> dict[str, Any]:
+    """The object in an answer that one asked for oneself, its keys as they are. Raises TooLong, BadJson.
+
+    It is what other readers of JSON take as well: no number that is none, no half of a character.
+    """
+    return _object(what, judged(what, answer, ANSWER_BYTES))
 
 
 def snake_object(what: str, data: bytes) -> dict[str, Any]:
@@ -38,14 +48,19 @@ def snake_object(what: str, data: bytes) -> dict[str, Any]:
 
 def json_object(what: str, data: bytes) -> dict[str, Any]:
     """The object in ``data``, its keys as they are. Raises BadJson."""
+    value = _object(what, data)
+    if len(value) > JSON_FIELDS:
+        raise BadJson(what, f"{len(value)} keys, at most {JSON_FIELDS} are allowed")
+    return value
+
+
+def _object(what: str, data: bytes) -> dict[str, Any]:
     try:
         value = msgspec.json.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BadJson(what, str(error)) from error
     if not isinstance(value, dict):
         raise BadJson(what, f"an object was expected, not {type(value).__name__}")
-    if len(value) > JSON_FIELDS:
-        raise BadJson(what, f"{len(value)} keys, at most {JSON_FIELDS} are allowed")
     if data.count(b"[") + data.count(b"{") > NESTING and is_deep(value):
         raise BadJson(what, f"more than {NESTING} objects and lists in each other")
     return value

@@ -41,6 +41,12 @@ REQUEST_BYTES = 64 << 10
 ANSWER_BYTES = 1 << 20
 """JSON in an answer that one asked for oneself: 65 535 ids, or all that a robot offers."""
 
+ANSWER_PARTS = 128 << 10
+"""Keys and items in it, as far as colons, commas and brackets tell."""
+
+ROUTER_BYTES = 4 << 20
+"""What a router tells of itself: of each session about 300 bytes."""
+
 REASON_CHARACTERS = 500
 """Of a reason that is passed on to a person."""
 

@@ -12,6 +12,7 @@ from ..config import MeshSettings
 from ..errors import BadJson, TooLong
 from .credit import Credit
 from .limits import REQUEST_BYTES
+from .messages import Count
 from .wire import Buffer, encode_message, split_message
 
 MOST_AWAY = 1000
@@ -73,15 +74,15 @@ class Pong(msgspec.Struct, frozen=True, kw_only=True):
     id_slots: int = 0
     group_slots: int = 0
     """Slots in its frame headers: the same on a whole mesh."""
-    drops: dict[str, int] = {}
+    drops: dict[str, Count] = {}
     """What its session lost since it started, by name."""
-    now: dict[str, int] = {}
+    now: dict[str, Count] = {}
     """What is so at this moment and should not be, by name: ``waiting_for_id`` connections of a gateway."""
     address: str = ""
     """Where headsets reach it, as HOST:PORT, when it is a gateway."""
     away: list[tuple[int, int]] = []
     """(type, id) of agents of a gateway that it has not heard of for a while, though they are connected."""
-    link_bytes: tuple[int, int] | None = None
+    link_bytes: tuple[Count, Count] | None = None
     """What its links to routers have sent and received since they came about, as its kernel counts."""
 
 
@@ -124,7 +125,7 @@ class GatewayTold(msgspec.Struct, frozen=True):
     """What a gateway answers to `AGENTS`: its agents, and what was lost and refused there, by name."""
 
     agents: list[GatewayAgent] = []
-    lost: dict[str, int] = {}
+    lost: dict[str, Count] = {}
 
 
 def encode_told(agents: Iterable[GatewayAgent], lost: Mapping[str, int]) -> bytes:

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 
 from msgspec import UNSET, Struct, UnsetType, field
 
-from .messages import AgentId, AgentType, Functionality
+from .messages import AgentId, AgentType, Count, Functionality
 
 STATUS = "RobotStatus"
 """Manager of a request for a robot's state; its data is ignored."""
@@ -28,7 +28,7 @@ class DeadManStatus(Struct, frozen=True):
 
     silence_s: float | None = None
     commander: str | None = None
-    trips: int = 0
+    trips: Count = 0
     last: str = ""
 
 
@@ -44,8 +44,8 @@ class GoalStatus(Struct, frozen=True):
 class CarriedStatus(Struct, frozen=True):
     """Messages of a topic since somebody registered it, their bytes of CDR, and how long ago the last one was."""
 
-    messages: int = 0
-    bytes: int = 0
+    messages: Count = 0
+    bytes: Count = 0
     age_s: float | None = None
 
 
@@ -71,7 +71,7 @@ class StopStatus(Struct, frozen=True):
     by: str = ""
     pressed: list[str] = []
     seconds: float = 0
-    times: int = 0
+    times: Count = 0
     history: list[str] = []
 
 
@@ -82,7 +82,7 @@ class RobotStatus(Struct, frozen=True):
     stopped: bool
     stop: StopStatus
     nodes: list[NodeStatus]
-    drops: dict[str, int] = {}
+    drops: dict[str, Count] = {}
     ros_domain: int | None = None
     beside: str | UnsetType = UNSET
     """What its agent cannot do for its safety, where that is a program beside the robot."""

@@ -9,9 +9,16 @@ from collections.abc import Collection, Mapping
 import msgspec
 
 from .directory import published
+from .limits import ROUTER_BYTES
 
 KEPT = 5
 """Of so many last round trips the least counts: what came on top of it was a wait, and of nobody's link."""
+
+
+class RouterLink(msgspec.Struct, frozen=True):
+    """A link of such a session."""
+
+    dst: str = ""
 
 
 class RouterSession(msgspec.Struct, frozen=True):
@@ -19,6 +26,8 @@ class RouterSession(msgspec.Struct, frozen=True):
 
     peer: str = ""
     whatami: str = ""
+    shm: bool | None = None
+    links: list[RouterLink] = []
 
 
 class Router(msgspec.Struct, frozen=True):
@@ -43,6 +52,16 @@ class Router(msgspec.Struct, frozen=True):
     def release(self) -> str:
         """``1.10.2`` of ``v1.10.2-release built with rustc …``."""
         return self.version.partition(" ")[0].partition("-")[0].removeprefix("v")
+
+
+def router_of(answer: bytes) -> Router | None:
+    """What a router tells of itself; None where that makes no sense: others may answer as well."""
+    if len(answer) > ROUTER_BYTES:
+        return None
+    try:
+        return msgspec.json.decode(answer, type=Router)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return None
 
 
 class Trips:

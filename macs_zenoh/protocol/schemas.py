@@ -7,6 +7,7 @@ text of one message and of all that it needs, as MCAP's registry has ``ros2msg``
 from __future__ import annotations
 
 import re
+from collections import deque
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -18,6 +19,8 @@ TYPES_AT_ONCE = 256
 """So many types one request may name."""
 TEXT_BYTES = 128 << 10
 """One definition; those that exist have at most 10 KiB."""
+SCHEMA_BYTES = 256 << 10
+"""One schema, with all that it needs; those that exist have a tenth of that."""
 TELL_BYTES = ANSWER_BYTES * 3 // 4
 """So much text is in one answer; JSON writes a line's end in two bytes."""
 
@@ -98,23 +101,20 @@ def text_of(name: str, definitions: Mapping[str, Definition]) -> str | None:
 
 
 def schema(name: str, definitions: Mapping[str, Definition]) -> str | None:
-    """The ``ros2msg`` text of a message type with all that it needs; None when a part of it is not known."""
-    own = text_of(name, definitions)
-    if own is None:
-        return None
-    pieces, seen = [own.rstrip("\n")], {name}
-    waiting = needs(name, own)
+    """The ``ros2msg`` text of a message type with all that it needs; None when a part of it is not known, or it is
+    longer than such a text may be."""
+    pieces: list[str] = []
+    waiting, named, room = deque([name]), {name}, SCHEMA_BYTES
     while waiting:
-        needed = waiting.pop(0)
-        if needed in seen:
-            continue
-        seen.add(needed)
+        needed = waiting.popleft()
         text = text_of(needed, definitions)
-        if text is None:
+        package, _, short = needed.partition("/msg/")
+        if text is None or (pieces and not short) or (room := room - len(text)) < 0:
             return None
-        package, _, short = needed.split("/")
-        pieces.append(f"{_RULE}\nMSG: {package}/{short}\n{text.rstrip(chr(10))}")
-        waiting += needs(needed, text)
+        pieces.append((f"{_RULE}\nMSG: {package}/{short}\n" if pieces else "") + text.rstrip("\n"))
+        more = [each for each in needs(needed, text) if each not in named]
+        named.update(more)
+        waiting += more
     return "\n".join(pieces) + "\n"
 
 

@@ -10,11 +10,12 @@ import itertools
 import math
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import msgspec
 
 from ..errors import BadField, BadJson, TooLong
+from .messages import Count
 
 PREFIX = b"macs: trace "
 """How a ping begins that asks for traces; JSON follows it (`TraceRequest`)."""
@@ -51,6 +52,10 @@ class TraceRequest(msgspec.Struct, frozen=True):
     after: int = 0
 
 
+Ns = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
+"""Since 1970, by some clock."""
+
+
 class Point(NamedTuple):
     """A message was here: the point's name, nanoseconds since 1970, and whose clock that is."""
 
@@ -67,14 +72,14 @@ class Report(msgspec.Struct, frozen=True, array_like=True):
     mark: int
     key: str
     way: str
-    points: list[tuple[str, int, str]]
+    points: list[tuple[str, Ns, str]]
 
 
 class TraceAnswer(msgspec.Struct, frozen=True):
     """What a program has noted. ``missed``: reports that nobody asked for in time."""
 
     reports: list[Report] = []
-    missed: int = 0
+    missed: Count = 0
 
 
 def encode_request(request: TraceRequest) -> bytes:

@@ -403,6 +403,36 @@ async def test_a_hostile_robot_takes_the_mesh_from_nobody(
     await until(known)
 
 
+HALF = {"nodes": [{"name": "\ud800", "control": {"holder": "unity/5"}}], "drops": {"\udfff": 1}}
+
+
+@pytest.mark.parametrize(
+    "said", [HALF, {"drops": {"a": float("nan")}}, {"more": float("inf")}, {"more": [[[[{}]]]] * 40_000}]
+)
+async def test_what_no_browser_could_read_is_told_to_none(
+    start_gateway: StartGateway,
+    session: aiohttp.ClientSession,
+    asked: Asked,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    said: dict[str, Any],
+) -> None:
+    """Half a character or a number that is none, in what one robot says, costs that robot, and is no fault of ours."""
+    one = Browser(session, await start_gateway(web_port=0))
+    for name, value in said.items():
+        monkeypatch.setitem(STATUS, name, value)
+    await until(lambda: one.told("/view/mesh"))
+
+    async def answered() -> bool:
+        robots = (await one.told("/view/mesh"))["robots"]
+        return len(robots) == 2 and asked.counts[5, "status"] > 1
+
+    await until(answered)
+    told = await one.told("/view/robots/5/status")
+    assert "makes no sense" in told["error"]
+    assert not [record for record in caplog.records if record.exc_info]
+
+
 async def test_a_group_s_token_sees_the_robots_of_its_group(
     start_gateway: StartGateway, router: str, session: aiohttp.ClientSession, tmp_path: Path
 ) -> None:

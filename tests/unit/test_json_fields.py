@@ -11,6 +11,7 @@ import pytest
 from macs_zenoh.errors import BadField, BadJson, TooLong, WireError
 from macs_zenoh.protocol import json_fields, messages
 from macs_zenoh.protocol.limits import (
+    ANSWER_BYTES,
     CONFIGURATION_BYTES,
     JSON_FIELDS,
     MANAGEMENT_BYTES,
@@ -159,3 +160,35 @@ def test_json_that_is_passed_on_is_judged_like_that_which_is_read() -> None:
         filled(b"0,", 31 << 20),
     ):
         assert not messages.is_json_object(memoryview(data))
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"[]",
+        b"NaN",
+        b'{"a":NaN}',
+        b'{"a":-Infinity}',
+        b'{"a":1e999}',
+        b'{"a":"\\ud800"}',
+        b'{"\xff":1}',
+        b'{"a":1%s}' % (b"0" * 5000),
+        b'{"a":%s}' % (b"[" * 100_000),
+        b'{"a":%s0%s}' % (b"[" * NESTING, b"]" * NESTING),
+        filled(b"[],", ANSWER_BYTES),
+        filled(b"0,", ANSWER_BYTES),
+        filled(b'"":0,', ANSWER_BYTES, b"{", b'"":0}'),
+        filled(b"0,", ANSWER_BYTES + 100),
+    ],
+    ids=lambda answer: answer[:20].decode(errors="replace"),
+)
+def test_an_answer_is_read_as_others_would_read_it(answer: bytes) -> None:
+    """What somebody answers is passed on as JSON, to pages and programs: it has to be some, and of a size."""
+    with pytest.raises(WireError):
+        json_fields.answered("an answer", answer)
+
+
+def test_an_answer_may_be_long() -> None:
+    """All ids that there are, and all that a robot with thousands of topics offers."""
+    said = {"ids": list(range(1, 1 << 16)), "camelCase": {f"/topic_{n}": "sensor_msgs/msg/Image" for n in range(5000)}}
+    assert json_fields.answered("an answer", msgspec.json.encode(said)) == said

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from macs_zenoh.protocol.directory import published
-from macs_zenoh.protocol.routers import KEPT, Router, RouterSession, Trips, between
+from macs_zenoh.protocol.limits import ROUTER_BYTES
+from macs_zenoh.protocol.routers import KEPT, Router, RouterLink, RouterSession, Trips, between, router_of
 
 
 def test_the_least_of_the_last_few_trips_counts() -> None:
@@ -40,3 +41,31 @@ def test_a_router_tells_who_is_behind_it() -> None:
     """Routers are links, others are sessions, as they are known in keys."""
     router = Router("aa", "v1.10.2-x", sessions=[RouterSession("bb", "router"), RouterSession("cc", "client")])
     assert (router.linked, router.behind) == (["bb"], {published("cc")})
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"",
+        b"\xff",
+        b"[]",
+        b"{}",
+        b'{"zid":1}',
+        b'{"zid":"\xff"}',
+        b'{"zid":"a","sessions":[{"peer":[]}]}',
+        b'{"zid":"a","x":%s}' % (b"[" * 100_000),
+        b'{"zid":"a","x":"%s"}' % (b"x" * ROUTER_BYTES),
+    ],
+    ids=lambda answer: answer[:30].decode(errors="replace"),
+)
+def test_who_answers_as_a_router_is_read_as_one_or_not_at_all(answer: bytes) -> None:
+    """Whoever reaches a router without rules can answer where routers tell of themselves."""
+    assert router_of(answer) is None
+
+
+def test_a_router_is_read_as_it_tells() -> None:
+    """Fields that are not known are left out."""
+    told = b'{"zid":"aa","version":"v1","sessions":[{"peer":"bb","whatami":"router","shm":false,"weight":null,'
+    told += b'"links":[{"src":"tcp/1","dst":"tcp/2"}]}],"locators":["tcp/3"],"plugins":{}}'
+    session = RouterSession("bb", "router", False, [RouterLink("tcp/2")])
+    assert router_of(told) == Router("aa", "v1", ["tcp/3"], [session])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from macs_zenoh.protocol.schemas import Definition, definitions_in, full_type, needs, schema, text_of
+from macs_zenoh.protocol.schemas import SCHEMA_BYTES, Definition, definitions_in, full_type, needs, schema, text_of
 
 POSE = "# where it is\nPoint position  # [m]\nQuaternion orientation\n"
 POINT = "float64 x\nfloat64 y\nfloat64 z\n"
@@ -93,3 +93,22 @@ def test_full_names() -> None:
     assert full_type("a/B") == "a/msg/B"
     assert full_type("a/B", "srv") == "a/srv/B"
     assert full_type("a/msg/B", "srv") == "a/msg/B"
+
+
+def test_names_that_are_none_have_no_schema() -> None:
+    """A robot may say that a type needs one whose name has four parts, and tell that as well."""
+    for name in ("a/b/c/d", "a/srv/B", "a/b/", "a"):
+        known = {"a/msg/A": Definition(f"{name} x\n"), full_type(name): Definition("bool y\n"), name: Definition("")}
+        assert schema("a/msg/A", known) is None, name
+
+
+def test_a_schema_has_a_size() -> None:
+    """Each of a thousand types that need all others is looked at once, and no more is put together than may be."""
+    names = [f"a/msg/T{number}" for number in range(1000)]
+    text = "".join(f"T{number} f\n" for number in range(1000))
+    assert schema(names[0], dict.fromkeys(names, Definition(text))) is None
+    some = dict.fromkeys(names[:100], Definition(text[: text.index("T100")]))
+    whole = schema(names[0], some)
+    assert whole is not None
+    assert whole.count("MSG: ") == 99
+    assert schema("a/msg/A", {"a/msg/A": Definition("#" * (SCHEMA_BYTES + 1))}) is None
