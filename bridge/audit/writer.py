@@ -13,6 +13,7 @@ import fcntl
 import logging
 import os
 import re
+import stat
 import threading
 import time
 from collections import deque
@@ -23,7 +24,7 @@ from typing import Any
 from macs_zenoh.errors import ConfigError
 from macs_zenoh.protocol.audit_chain import Link, last_link, torn_bytes
 
-from .notes import NO_AUDIT, TEXT, Audit
+from .notes import NO_AUDIT, TEXT, Audit, Shares
 
 log = logging.getLogger("macs.audit")
 
@@ -39,7 +40,7 @@ _MODE = 0o640
 Note = dict[str, Any]
 
 
-def open_audit(path: str | None, program: str, max_bytes: int, keep: int, on_lost: Callable[[int], None]) -> Audit:
+def open_audit(path: str | None, program: str, max_bytes: int, keep: int, on_lost: Callable[[str], None]) -> Audit:
     """The record that settings ask for. Raises ConfigError when it cannot be written."""
     if path is None:
         return NO_AUDIT
@@ -47,7 +48,8 @@ def open_audit(path: str | None, program: str, max_bytes: int, keep: int, on_los
 
 
 class AuditFile:
-    """The record in a file. ``on_lost`` is called with how many notes were lost, in any thread."""
+    """The record in a file. ``on_lost`` is called for each note that is not kept, in any thread: ``audit_lost`` for
+    want of a file, ``audit_left_out`` since there were too many of the same."""
 
     def __init__(
         self,
@@ -56,7 +58,7 @@ class AuditFile:
         *,
         max_bytes: int = 16 << 20,
         keep: int = 20,
-        on_lost: Callable[[int], None] = lambda count: None,
+        on_lost: Callable[[str], None] = lambda name: None,
     ) -> None:
         """Open it, and note that ``program`` has started. Raises ConfigError."""
         self._path = path
@@ -66,6 +68,7 @@ class AuditFile:
         self._on_lost = on_lost
         self._notes: deque[Note] = deque()
         self._lost = 0
+        self._shares = Shares()
         self._failing = False
         self._closing = False
         self._link: Link | None = None
@@ -86,6 +89,7 @@ class AuditFile:
 
     def record(self, event: str, by: Mapping[str, str], what: str = "", result: str = "done") -> None:
         """As `Audit` says."""
+        now = time.monotonic()
         note: Note = {
             "time": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="milliseconds"),
             "program": self._program,
@@ -95,12 +99,13 @@ class AuditFile:
             "result": result[:TEXT],
         }
         with self._wake:
-            if len(self._notes) < WAITING:
-                self._notes.append(note)
+            left_out = self._shares.take(event, by, result, now)
+            if left_out is not None and len(self._notes) < WAITING:
+                self._notes.append(note | ({"left_out": left_out} if left_out else {}))
                 self._wake.notify()
                 return
-            self._lost += 1
-        self._on_lost(1)
+            self._lost += left_out is not None
+        self._on_lost("audit_lost" if left_out is not None else "audit_left_out")
 
     def troubles(self) -> dict[str, int]:
         """As `Audit` says."""
@@ -202,6 +207,9 @@ class AuditFile:
 
     def _open(self) -> None:
         fd = os.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, _MODE)
+        if not stat.S_ISREG(os.fstat(fd).st_mode):  # as /dev/null, which takes all and has nothing
+            os.close(fd)
+            raise OSError(errno.EINVAL, "is no file")
         if self._fd >= 0:
             os.close(self._fd)
         self._fd = fd
@@ -270,6 +278,8 @@ def older_files(path: Path) -> list[Path]:
 
 
 def _tail_of(path: Path) -> bytes:
+    if not path.is_file():  # a FIFO, say, for which one would wait for ever
+        return b""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
         return file.read()

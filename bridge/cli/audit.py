@@ -56,6 +56,8 @@ def run(args: argparse.Namespace) -> int:
     verifier = Verifier(args.seen if args.audit_verb == "verify" else ())
     for path in _all(args.files):
         try:
+            if not path.is_file() and path.exists():  # a FIFO, say, for which one would wait for ever
+                raise ConfigError(str(path), "is no file")
             with path.open("rb") as file:
                 verifier.read(str(path), file)
         except OSError as error:

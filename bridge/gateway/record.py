@@ -51,5 +51,6 @@ class Record:
         """Write what waits; blocks for a second at the most."""
         self._audit.close()
 
-    def _not_whole(self, count: int) -> None:
-        self._losses.once("audit_lost", "the record of who did what is not whole", count=count, level=logging.ERROR)
+    def _not_whole(self, name: str) -> None:
+        level = logging.ERROR if name == "audit_lost" else logging.WARNING
+        self._losses.once(name, "the record of who did what is not whole", level=level)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import os
+import stat
 import struct
 from array import array
 from collections import OrderedDict
@@ -66,6 +67,18 @@ class Unfinished(BadBag):
         super().__init__(path, f"it has no index ({why}); if nobody writes it any more: macs bag repair {path}")
 
 
+def opened(path: Path) -> BinaryIO:
+    """A file to read. Raises ConfigError: there is none, or something for which one might wait for ever."""
+    try:
+        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    except OSError as error:
+        raise ConfigError(str(path), error.strerror or str(error)) from error
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise ConfigError(str(path), "is no file")
+    return file
+
+
 class Bag:
     """A finished file, open for reading. Raises Unfinished, BadBag, ConfigError where there is no such file."""
 
@@ -84,10 +97,7 @@ class Bag:
         """Where the data ends and the index begins."""
         self._cache_bytes = cache_bytes
         self._cache: OrderedDict[int, bytes] = OrderedDict()
-        try:
-            self._file: BinaryIO = self.path.open("rb")
-        except OSError as error:
-            raise ConfigError(str(path), error.strerror or str(error)) from error
+        self._file = opened(self.path)
         try:
             self._open()
         except BaseException:
@@ -176,7 +186,7 @@ class Bag:
         for _ in range(4):
             fields.u32()
         self.start_ns, self.end_ns = fields.u64(), fields.u64()
-        self.counts = dict(struct.iter_unpack("<HQ", fields.take(fields.u32())))
+        self.counts = dict(fields.numbers())
 
     def metadata(self) -> list[tuple[str, dict[str, str]]]:
         """The file's own names and values. Raises BadBag."""
@@ -294,7 +304,7 @@ class Bag:
 
     def _record(self, at: int) -> tuple[int, bytes]:
         """Opcode and content of the record there. Raises ValueError."""
-        head = self._read(at, 9)
+        head = self._read(at, 9) if at < self.size else b""
         if len(head) < 9:
             raise ValueError("a record is cut off")
         opcode, length = HEAD.unpack(head)

@@ -23,6 +23,7 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")
+_PAIR = struct.Struct("<HQ")
 
 
 class SchemaRecord(NamedTuple):
@@ -120,6 +121,13 @@ class Fields:
             found[name] = inner.text()
         return found
 
+    def numbers(self) -> list[tuple[int, int]]:
+        """Pairs of a number of two bytes and one of eight."""
+        data = self.take(self.u32())
+        if len(data) % _PAIR.size:
+            raise ValueError("a table is cut off")
+        return list(_PAIR.iter_unpack(data))
+
     @property
     def is_empty(self) -> bool:
         """Whether nothing is left."""
@@ -141,7 +149,7 @@ def channel_record(data: bytes | memoryview) -> ChannelRecord:
 def chunk_record(data: bytes) -> ChunkRecord:
     fields = Fields(data)
     start_ns, end_ns, offset, length = fields.u64(), fields.u64(), fields.u64(), fields.u64()
-    channels = frozenset(channel for channel, _ in struct.iter_unpack("<HQ", fields.take(fields.u32())))
+    channels = frozenset(channel for channel, _ in fields.numbers())
     fields.u64()
     compression = fields.text()
     fields.u64()

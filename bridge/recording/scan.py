@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from bridge.recording import bag
 from bridge.recording.bag import MAGIC, MAX_RECORD_BYTES, BadBag
 from bridge.recording.mcap_records import DATA_END, MAX_CHUNK_BYTES, Chunk, Fields, read_chunk, records_in
-from macs_zenoh.errors import ConfigError
 
 _HEAD = struct.Struct("<BQ")
 
@@ -31,10 +31,7 @@ class Found(NamedTuple):
 
 def opened(path: Path) -> BinaryIO:
     """The file, behind the magic bytes. Raises ConfigError, BadBag."""
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        raise ConfigError(str(path), error.strerror or str(error)) from error
+    file = bag.opened(path)
     if file.read(len(MAGIC)) != MAGIC:
         file.close()
         raise BadBag(path, "it is no MCAP file")

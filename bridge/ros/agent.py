@@ -119,7 +119,7 @@ class RobotAgent:
             f"robot {agent.id}",
             settings.audit_max_bytes,
             settings.audit_files,
-            lambda count: robot.drops.note("audit_lost", "", "the record of who did what is not whole", count),
+            lambda name: robot.drops.note(name, "", "the record of who did what is not whole"),
         )
         self.nodes = InterfaceNodes(robot, max_nodes=settings.max_nodes)
         self.checked = CheckedSettings(session, robot.rules, robot.drops)

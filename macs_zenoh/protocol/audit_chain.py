@@ -14,6 +14,7 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 FIRST = -1
+LINES = 1 << 53
 
 
 class Link(NamedTuple):
@@ -43,8 +44,10 @@ def parse(raw: bytes) -> dict[str, Any] | None:
         row = json.loads(raw)
     except (ValueError, RecursionError):
         return None
-    whole = isinstance(row, dict) and type(row.get("n")) is int and isinstance(row.get("previous"), str)
-    return row if whole else None
+    if not isinstance(row, dict) or not isinstance(row.get("previous"), str):
+        return None
+    number = row.get("n")
+    return row if type(number) is int and 0 <= number < LINES else None
 
 
 def last_link(data: bytes) -> Link | None:

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from bridge.audit import AuditFile, who
+from bridge.audit.notes import Shares
 from bridge.audit.writer import WAITING, older_files
 from bridge.headset.client import Headset
 from macs_zenoh.errors import ConfigError, MacsError
@@ -201,8 +202,8 @@ async def test_a_full_disk(small_disk: Path, caplog: pytest.LogCaptureFixture) -
     """Notes are taken at once all the same; they wait, then are lost and counted; with room again all is told."""
     path, lost = small_disk / "audit.jsonl", [0]
 
-    def count(more: int) -> None:
-        lost[0] += more
+    def count(name: str) -> None:
+        lost[0] += name == "audit_lost"
 
     audit = AuditFile(path, "p", on_lost=count)
     (small_disk / "filler").write_bytes(bytes(100 << 10))
@@ -246,10 +247,38 @@ async def test_what_is_no_record_is_left_alone(tmp_path: Path) -> None:
     """A file with something else in it is refused, not written to; so is a folder that is not there."""
     other = tmp_path / "notes.txt"
     other.write_text("my notes\n")
-    for path in (other, tmp_path / "nowhere" / "audit.jsonl"):
+    os.mkfifo(fifo := tmp_path / "fifo")
+    (nothing := tmp_path / "nothing").symlink_to("/dev/null")  # where it would be lost without a word
+    for path in (other, tmp_path / "nowhere" / "audit.jsonl", fifo, nothing, tmp_path):
         with pytest.raises(ConfigError):
             AuditFile(path, "p")
     assert other.read_text() == "my notes\n"
+    code, _, errors = await ended("audit", "verify", str(fifo))
+    assert (code, "is no file" in errors) == (2, True)
+
+
+async def test_who_does_the_same_all_day_pushes_nothing_out(tmp_path: Path) -> None:
+    """What others did stays, and so does what is done with the emergency stop; it is told how much was left out."""
+    path, left_out = tmp_path / "audit.jsonl", [0]
+
+    def count(name: str) -> None:
+        left_out[0] += name == "audit_left_out"
+
+    audit = AuditFile(path, "p", max_bytes=64 << 10, keep=30, on_lost=count)
+    audit.record("joined", who("unity/1", "10.0.0.1:40000"))
+    for number in range(40_000):
+        audit.record("refused", who(address=f"10.0.0.9:{number}"), "address_not_allowed", "it is not in gateway.allow")
+        if number % 100 == 0:
+            await asyncio.sleep(0)
+    audit.record("stop", who("unity/2", "10.0.0.9:40001"), "/emergency_stop")
+    await until(lambda: not audit._notes)
+    audit.close()
+    lines = lines_of(path)
+    assert [line["event"] for line in lines if line["event"] != "refused"] == ["started", "joined", "stop", "stopped"]
+    refused = sum(line["event"] == "refused" for line in lines)
+    assert refused + left_out[0] == 40_000
+    assert refused < 2 * Shares.AT_ONCE
+    assert (await verified(path))[0] == 0
 
 
 async def test_each_kind_of_tampering(tmp_path: Path) -> None:

@@ -107,3 +107,11 @@ def test_the_traces_of_a_kill_are_no_fault() -> None:
 def test_a_chain_that_begins_late_is_told() -> None:
     """Older files are removed by the settings: that is no fault."""
     assert found(record(9)[4:]) == [(Kind.BEGINS_LATE, 1)]
+
+
+@pytest.mark.parametrize("number", ["9" * 4299, "-1", "1e3", "true", str(1 << 53)])
+def test_numbers_that_no_chain_comes_to_are_no_line(number: str) -> None:
+    """Whoever writes one into the file neither ends who verifies, nor who goes on writing behind it."""
+    line = b'{"n":%s,"previous":""}\n' % number.encode()
+    assert last_link(line) is None
+    assert (Kind.UNREADABLE, 2) in found([record(2)[0], line, record(2)[1]])

@@ -21,8 +21,9 @@ from rosbags.highlevel import AnyReader
 from bridge.recording import repair as repairing
 from bridge.recording.bag import BadBag, Bag, Unfinished
 from bridge.recording.disk import Disk, Plan
-from bridge.recording.mcap_file import COMPRESSIONS, McapFile
+from bridge.recording.mcap_file import COMPRESSIONS, MAGIC, McapFile
 from bridge.recording.rosbag2 import ros_name
+from bridge.recording.serving.folder import Folder
 from bridge.recording.streams import (
     command_topic,
     qos_of,
@@ -161,6 +162,44 @@ def test_what_is_no_recording_is_told(tmp_path: Path, content: bytes, error: typ
     with pytest.raises(error) as raised:
         Bag(path)
     assert str(path) in str(raised.value)
+
+
+def test_an_index_that_makes_no_sense_is_told(tmp_path: Path) -> None:
+    """A table of half a row, and metadata at an offset that no file has: one such file ends nobody who lists them."""
+    whole = write(tmp_path / "a.mcap", 3).read_bytes()
+    data_end = whole.rindex(struct.pack("<BQ", 15, 4))
+    header = whole[:data_end]
+
+    def file(name: str, *records: tuple[int, bytes]) -> Path:
+        summary = b"".join(struct.pack("<BQ", opcode, len(data)) + data for opcode, data in records)
+        end = header + struct.pack("<BQI", 15, 4, 0)
+        footer = struct.pack("<BQQQI", 2, 20, len(end), 0, 0) + MAGIC
+        path = tmp_path / name
+        path.write_bytes(end + summary + footer)
+        return path
+
+    numbers = struct.pack("<QHIIIIQQ", 0, 0, 0, 0, 0, 0, 0, 0)
+    with pytest.raises(Unfinished):
+        Bag(file("half.mcap", (11, numbers + struct.pack("<I", 7) + bytes(7))))
+    name = struct.pack("<I", 1) + b"x"
+    far = (13, struct.pack("<QQ", (1 << 64) - 1, 9) + name)
+    chunk = (8, struct.pack("<QQQQIQIQQ", 0, 9, (1 << 64) - 5, 9, 0, 0, 0, 0, 0))
+    with Bag(file("far.mcap", (11, numbers + bytes(4)), far, chunk)) as bag:
+        with pytest.raises(BadBag):
+            bag.metadata()
+        with pytest.raises(BadBag):
+            list(bag.messages())
+    told = {each["name"]: each["state"] for each in Folder(tmp_path).listed(())}
+    assert told == {"a.mcap": "whole", "half.mcap": "unfinished", "far.mcap": "bad"}
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+    """A FIFO with the name of a recording, which nobody ever writes to."""
+    path = tmp_path / "a.mcap"
+    os.mkfifo(path)
+    for read in (Bag, repairing.problems, lambda path: repairing.repair(path, tmp_path / "b.mcap")):
+        with pytest.raises(ConfigError, match="is no file"):
+            read(path)
 
 
 def test_every_damaged_byte_is_survived(tmp_path: Path) -> None:
