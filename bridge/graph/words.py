@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from macs_zenoh.errors import MissingExtra, UsageError
+from macs_zenoh.plain import plain
 
 FieldPath = tuple[str | int, ...]
 """Names of fields and numbers of items, one inside the other."""
@@ -77,9 +78,11 @@ def as_yaml(value: Any, *, flow: bool = False) -> str:
 
 
 def as_csv(value: Any) -> str:
-    """Every value of a message in the order of its definition, with commas between them."""
+    """Every value of a message in the order of its definition, with commas between them, in one line: what would
+    break it is written as an escape."""
     line = io.StringIO()
-    csv.writer(line, lineterminator="").writerow(_flat(value))
+    cells = (plain(item) if isinstance(item, str) else item for item in _flat(value))
+    csv.writer(line, lineterminator="").writerow(cells)
     return line.getvalue()
 
 

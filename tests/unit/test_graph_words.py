@@ -57,6 +57,16 @@ def test_messages_are_shown_as_ros2cli_does() -> None:
     assert as_csv(message) == '1,2,,1.5,"a,b",True'
 
 
+def test_what_others_say_stays_in_its_line() -> None:
+    """A message that is one line is one, whatever is in it: programs and people take the next one for another's."""
+    hostile = {"data": "x\n---\n# robot 8\rdata: 1\u2028\x1b[2J\x85y"}
+    for line in (as_csv(hostile), as_csv("a\nb"), as_yaml(hostile, flow=True)):
+        assert len(line.splitlines()) == 1, line
+    for said in (hostile, hostile["data"], [hostile["data"]]):
+        for line in as_yaml(said).splitlines()[1:]:
+            assert line[:1] in ("", " "), line
+
+
 def test_one_field_is_found_by_its_path() -> None:
     """Fields inside fields, items of lists, and in one line what there is instead of a wrong one."""
     message = {"transforms": [{"header": {"frame_id": "odom"}}, {}]}
