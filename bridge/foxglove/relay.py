@@ -20,12 +20,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import aiohttp
-from aiohttp import WSMsgType, web
+from aiohttp import WSCloseCode, WSMsgType, web
 
 from bridge.recording.streams import split_topic
 from bridge.tokens.watch import Watch
-from macs_zenoh.errors import Unreachable
+from macs_zenoh.errors import BadJson, Unreachable, WireError
 from macs_zenoh.losses import Losses
+from macs_zenoh.protocol.addresses import of_peer
+from macs_zenoh.protocol.credit import Credit
+from macs_zenoh.protocol.json_fields import json_object, judged
 from macs_zenoh.protocol.messages import UNITY, AddNode, NodeType, node_name
 from macs_zenoh.protocol.origins import host_problem, origin_problem
 from macs_zenoh.protocol.rights import ANY, EVERY_NAME, OPEN, Grant
@@ -34,9 +37,13 @@ from macs_zenoh.protocol.websocket import TOKEN_SUBPROTOCOL
 log = logging.getLogger("macs.foxglove")
 
 SUBPROTOCOLS = ("foxglove.sdk.v1",)
-CLIENTS = 32
+CLIENTS, CLIENTS_PER_ADDRESS = 32, 24
 MESSAGE_BYTES = 16 << 20
 """Of a client."""
+TEXT_BYTES = 256 << 10
+"""Of what a client says besides the data of topics and calls."""
+MESSAGES_PER_S = 1000.0
+"""Of a client. Who sends more is closed: what would wait here is commands that have become old."""
 TOLD_BYTES = 256 << 20
 """Of the SDK: pictures and clouds."""
 CHANNELS = 256
@@ -53,6 +60,7 @@ class _Client:
 
     grant: Grant
     shown: str | None
+    host: str
     here: web.WebSocketResponse
     channels: dict[int, str] = field(default_factory=dict)
     services: dict[int, str] = field(default_factory=dict)
@@ -126,15 +134,17 @@ class Relay:
         problem = self._why_not_see(grant)
         if problem is not None:
             return web.json_response({"error": problem}, status=403)
-        if len(self._clients) >= CLIENTS:
-            return web.json_response({"error": f"{CLIENTS} look already"}, status=503)
+        host = of_peer(request.remote or "?")
+        from_there = sum(client.host == host for client in self._clients)
+        if len(self._clients) >= CLIENTS or from_there >= CLIENTS_PER_ADDRESS:
+            return web.json_response({"error": f"{len(self._clients)} look already"}, status=503)
         here = web.WebSocketResponse(
             protocols=SUBPROTOCOLS, heartbeat=20.0, compress=False, max_msg_size=MESSAGE_BYTES
         )
         if not here.can_prepare(request):
             return web.json_response({"error": "a WebSocket is wanted here"}, status=426)
         await here.prepare(request)
-        client = _Client(grant, shown if self._tokens is not None else None, here)
+        client = _Client(grant, shown if self._tokens is not None else None, host, here)
         self._clients.add(client)
         try:
             await self._both_ways(client)
@@ -196,15 +206,22 @@ class Relay:
             client.services[service["id"]] = service["name"]
 
     async def _up(self, client: _Client, there: Any) -> None:
+        credit = Credit(MESSAGES_PER_S, time.monotonic())
         async for message in client.here:
-            if message.type == WSMsgType.BINARY and message.data:
+            if not credit.take(1, time.monotonic()):
+                problem = f"more than {MESSAGES_PER_S:g} messages a second"
+                self.drops.once("flooded", "%s is closed: it sends %s", client.host, problem)
+                await client.here.close(code=WSCloseCode.POLICY_VIOLATION, message=problem.encode())
+            elif message.type == WSMsgType.BINARY and message.data:
                 await self._binary(client, there, message.data)
             elif message.type == WSMsgType.TEXT:
                 try:
-                    said = json.loads(message.data)
+                    said = json_object("a message", judged("a message", message.data.encode(), TEXT_BYTES))
                     op = said["op"]
-                except (ValueError, TypeError, KeyError, RecursionError):
-                    self.drops.once("bad_json", "a client says what is no message of Foxglove's")
+                    if not isinstance(op, str):
+                        raise BadJson("a message", "its op is no text")
+                except (WireError, KeyError) as error:
+                    self.drops.once("bad_json", "a client says what is no message of Foxglove's: %s", error)
                     continue
                 if op == "advertise":
                     said["channels"] = await self._advertised(client, said)

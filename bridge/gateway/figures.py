@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from time import monotonic
@@ -20,12 +19,6 @@ from .site import Site
 
 if TYPE_CHECKING:
     from .server import Gateway
-
-
-GOOD_S = 0.5
-"""So long an answer is given again: of many agents it takes the loop longer than many frames."""
-OPEN_METRICS = "application/openmetrics-text"
-"""Who accepts this in whatever version is answered in it: one answer for all who do."""
 
 
 def watched(gateway: Gateway) -> Watched:
@@ -97,19 +90,12 @@ def add_figures(site: Site) -> None:
     """Answer who watches, at the web port: figures and diagnostics to who shows a token where one is wanted, to all
     others whether the gateway lives and is ready."""
     answers = Answers(watched(site.gateway))
-    kept: dict[tuple[str, str], tuple[float, Answered]] = {}
 
     def written(said: Answered) -> web.Response:
         return web.Response(status=said.status, body=said.body, headers={"Content-Type": said.media_type})
 
     async def for_visitors(request: web.Request, visitor: Grant) -> web.StreamResponse:
-        accept = OPEN_METRICS if OPEN_METRICS in request.headers.get("Accept", "") else ""
-        about, now = (request.path, accept), monotonic()
-        at, said = kept.get(about, (-math.inf, None))
-        if said is None or now - at > GOOD_S:
-            said = answers.answer(request.path, accept)
-            kept[about] = now, said
-        return written(said)
+        return written(answers.fresh(request.path, request.headers.get("Accept", ""), monotonic()))
 
     async def for_all(request: web.Request) -> web.StreamResponse:
         return written(answers.answer(request.path))

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 from typing import NamedTuple
 
 from .exposition import Exposition, MissingPrometheus
 from .watched import Watched
 
 TEXT, JSON = "text/plain; charset=utf-8", "application/json"
+OPEN_METRICS = "application/openmetrics-text"
+"""Who accepts this in whatever version is answered in it: one answer for all who do."""
+GOOD_S = 0.5
+"""So long an answer is given again: of many agents it takes a loop longer than many frames."""
 
 
 class Answered(NamedTuple):
@@ -28,6 +33,7 @@ class Answers:
         self._watched = watched
         self._exposition: Exposition | None = None
         self._missing = ""
+        self._kept: dict[tuple[str, str], tuple[float, Answered]] = {}
         try:
             self._exposition = Exposition()
         except MissingPrometheus as missing:
@@ -37,6 +43,18 @@ class Answers:
         """Raise MissingPrometheus where figures cannot be written."""
         if self._exposition is None:
             raise MissingPrometheus
+
+    def fresh(self, path: str, accept: str, now: float) -> Answered:
+        """The same as `answer`, as it is or was a moment ago: who asks all the time costs no more than who asks now
+        and then."""
+        if path not in ("/metrics", "/diagnostics"):
+            return self.answer(path)
+        about = path, OPEN_METRICS if OPEN_METRICS in accept else ""
+        at, said = self._kept.get(about, (-math.inf, None))
+        if said is None or now - at > GOOD_S:
+            said = self.answer(*about)
+            self._kept[about] = now, said
+        return said
 
     def answer(self, path: str, accept: str = "") -> Answered:
         """What this path says; 404 for others."""

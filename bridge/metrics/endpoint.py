@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 
@@ -26,8 +27,8 @@ PORT = 9447
 """Unless another one is said."""
 REQUEST_BYTES = 8 << 10
 REQUEST_S = 5.0
-AT_ONCE = 16
-"""Connections; who comes beyond that is closed."""
+AT_ONCE, AT_ONCE_EACH = 16, 8
+"""Connections, in all and of one address; who comes beyond that is closed."""
 
 _REASONS = {
     200: "OK",
@@ -47,7 +48,8 @@ class Endpoint:
         self._answers = answers
         own = socket.gethostname().lower()
         self._names = frozenset({own, f"{own}.local"})
-        self._open: set[asyncio.Task[None]] = set()
+        self._open: dict[asyncio.Task[None], str] = {}
+        """By who answers, whose address it is."""
         self._servers: list[asyncio.Server] = []
         self.port = 0
 
@@ -68,16 +70,17 @@ class Endpoint:
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         assert task is not None
-        if len(self._open) >= AT_ONCE:
+        host = str((writer.get_extra_info("peername") or "?")[0])
+        if len(self._open) >= AT_ONCE or list(self._open.values()).count(host) >= AT_ONCE_EACH:
             writer.transport.abort()
             return
-        self._open.add(task)
+        self._open[task] = host
         try:
             await within(self._serve(reader, writer), REQUEST_S)
         except (OSError, asyncio.TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             writer.transport.abort()
         finally:
-            self._open.discard(task)
+            self._open.pop(task, None)
             with suppress(OSError):
                 writer.close()
 
@@ -101,7 +104,7 @@ class Endpoint:
         if (problem := host_problem(headers.get("host", "").strip(), self._names)) is not None:
             return Answered(403, f"{problem}\n".encode(), TEXT)  # a web page may have had a name lead here
         try:
-            return self._answers.answer(words[1].partition("?")[0], headers.get("accept", "").strip())
+            return self._answers.fresh(words[1].partition("?")[0], headers.get("accept", "").strip(), time.monotonic())
         except Exception:
             log.exception("answering %s failed", words[1][:80])
             return Answered(503, b"this failed, see the log of the program\n", TEXT)

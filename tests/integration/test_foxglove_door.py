@@ -8,7 +8,7 @@ import os
 import ssl
 import struct
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,9 @@ import pytest
 pytest.importorskip("foxglove", reason="needs the extra foxglove: pip install 'macs-zenoh[foxglove]'")
 
 import macs_zenoh
+from bridge.foxglove import relay as door
 from bridge.foxglove.live import Live
-from bridge.foxglove.relay import Relay, own_certificate
+from bridge.foxglove.relay import TEXT_BYTES, Relay, own_certificate
 from bridge.recording.recorder import Wanted
 from bridge.tokens import store
 from bridge.tokens.watch import Watch
@@ -240,6 +241,10 @@ async def test_bad_input_costs_that_message(tmp_path: Path) -> None:
             "1",
             "[]",
             '{"op": 1}',
+            '{"op": []}',
+            '{"op": {"a": 1}}',
+            '{"op": "subscribe", "x": ["%s"]}' % ("x" * TEXT_BYTES),
+            '{"op": "advertise", "channels": [%s]}' % ("[]," * 80_000 + "1"),
             '{"op": "advertise"}',
             '{"op": "advertise", "channels": [1, {}]}',
         ):
@@ -256,3 +261,44 @@ async def test_bad_input_costs_that_message(tmp_path: Path) -> None:
 
         await until(arrived, every_s=0.1)
         assert set(site.robot.commands) == {b"\0\1\0\0good"}
+
+
+async def test_who_floods_is_closed(tmp_path: Path) -> None:
+    """What waits of a flood would be carried out late; whoever else publishes goes on."""
+    async with (
+        started(tmp_path, publish=True, with_tokens=False) as site,
+        site.client() as good,
+        site.client() as flooding,
+    ):
+        await good.send_str(json.dumps({"op": "advertise", "channels": [channel(1, "/7/cmd_vel")]}))
+
+        async def flood() -> None:
+            with suppress(ConnectionError):
+                while not flooding.closed:
+                    await flooding.send_bytes(published(1, b"bad"))
+
+        task = asyncio.ensure_future(flood())
+        while (message := await asyncio.wait_for(flooding.receive(), 60)).type != aiohttp.WSMsgType.CLOSE:
+            assert message.type in (aiohttp.WSMsgType.TEXT, aiohttp.WSMsgType.BINARY), message
+        assert message.data == aiohttp.WSCloseCode.POLICY_VIOLATION
+        await asyncio.wait_for(task, 60)
+
+        async def arrived() -> bool:
+            await good.send_bytes(published(1, b"good"))
+            return bool(site.robot.commands)
+
+        await until(arrived, every_s=0.1)
+        assert set(site.robot.commands) == {b"\0\1\0\0good"}
+
+
+async def test_one_address_does_not_take_all_places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who comes from elsewhere finds one."""
+    monkeypatch.setattr(door, "CLIENTS_PER_ADDRESS", 2)
+    async with started(tmp_path, publish=False, with_tokens=False) as site, site.client(), site.client():
+        assert await site.status() == 503
+        elsewhere = aiohttp.TCPConnector(local_addr=("127.0.0.2", 0))
+        async with (
+            aiohttp.ClientSession(connector=elsewhere) as session,
+            session.ws_connect(f"ws://127.0.0.1:{site.port}/", protocols=[SUBPROTOCOL]) as socket,
+        ):
+            assert (await said(socket, "serverInfo"))["name"] == "macs-zenoh"

@@ -18,6 +18,7 @@ import pytest
 
 from bridge.gateway import figures
 from bridge.headset.client import Headset
+from bridge.metrics import answers
 from bridge.tokens import store
 from macs_zenoh.protocol.messages import Configuration, encode_management
 from macs_zenoh.protocol.rights import Rights
@@ -86,7 +87,11 @@ async def test_router_and_gateway_tell_who_watches() -> None:
 
         await until(not_ready, every_s=0.05)
         assert (await get(f"{where}/healthz"))[0] == 200
-        assert figure((await get(f"{where}/metrics"))[1], "macs_linked") == 0
+
+        async def told() -> bool:  # figures are good for a moment
+            return figure((await get(f"{where}/metrics"))[1], "macs_linked") == 0
+
+        await until(told, every_s=0.05)
         assert any(f"router {endpoint} lost; reconnecting" in line for line in gateway.log)
         assert any(re.search(rf"router {endpoint} connected \([0-9a-f]{{8}}\)", line) for line in gateway.log)
         assert any(re.search(r"client [0-9a-f]{8} at tcp/127\.0\.0\.1:\d+ is linked", line) for line in router.log)
@@ -124,6 +129,20 @@ async def test_what_is_no_request_costs_nothing() -> None:
         await until(answered, every_s=0.05)
 
 
+async def test_one_address_does_not_take_all_places() -> None:
+    """Whoever watches is told, whatever somebody else holds open; and who asks all the time is told what was so."""
+    async with Program("router", "-l", f"tcp/127.0.0.1:{free_port()}", "--metrics", "127.0.0.1:0") as router:
+        host, port = told_at(router).removeprefix("http://").split(":")
+        held = [await asyncio.open_connection(host, int(port)) for _ in range(40)]
+        watching = aiohttp.TCPConnector(local_addr=("127.0.0.2", 0), force_close=True)
+        async with aiohttp.ClientSession(connector=watching) as session:
+            for _ in range(5):
+                async with session.get(f"http://{host}:{port}/metrics") as response:
+                    assert response.status == 200
+        for _, writer in held:
+            writer.close()
+
+
 async def test_a_token_is_wanted_where_the_port_wants_one(start_gateway: StartGateway, tmp_path: Any) -> None:
     """Figures and diagnostics are for who shows one; whether it lives and is ready is for all."""
     path, secret = tmp_path / "tokens.json", new_secret(b"x" * 32)
@@ -150,7 +169,7 @@ async def test_who_asks_again_and_again_is_told_the_same(
     monkeypatch.setattr(gateway, "carried", lambda: worked_out.update(["metrics"]) or carried())
     monkeypatch.setattr(gateway.mesh, "tells", lambda: worked_out.update(["diagnostics"]) or tells())
     monkeypatch.setattr(figures, "monotonic", lambda: now[0])
-    accepted = ("", *(f"{figures.OPEN_METRICS}; version={number}.0.0; escaping=x{number}" for number in range(5)))
+    accepted = ("", *(f"{answers.OPEN_METRICS}; version={number}.0.0; escaping=x{number}" for number in range(5)))
     for times in (1, 2):
         for accept in accepted:
             status, text = await get(f"{where}/metrics", Accept=accept)
@@ -158,7 +177,7 @@ async def test_who_asks_again_and_again_is_told_the_same(
             assert text.endswith("# EOF\n") is bool(accept)
             assert json.loads((await get(f"{where}/diagnostics", Accept=accept))[1])["program"] == "gateway"
         assert worked_out == {"metrics": 2 * times, "diagnostics": 2 * times}
-        now[0] += figures.GOOD_S + 0.01
+        now[0] += answers.GOOD_S + 0.01
 
 
 async def test_a_thousand_agents_make_no_more_figures(
