@@ -82,7 +82,7 @@ class Awareness:
 
     ``counters`` counts what was sent by `Outcome.counter`, and what arrived: ``received``, ``unregistered`` (sent here
     by name, and nobody here takes this type), ``repeated``, ``bad_message``, ``last_values`` (asked for and news),
-    ``too_large``, ``name_taken_twice``.
+    ``too_large``, ``name_taken_twice``, ``too_many_names`` (tokens of names and types).
     """
 
     KEYS = 4096
@@ -239,8 +239,10 @@ class Awareness:
     def _expected(self, receiver: str, message_type: str) -> Outcome:
         if receiver and receiver not in self.names:
             return Outcome.NO_SUCH_AGENT
-        takers = [receiver] if receiver else [name for name in self.names.takers(message_type) if name != self.name]
-        taken = any(self.names.takes(name, message_type) for name in takers)
+        if receiver:
+            taken = self.names.takes(receiver, message_type)
+        else:
+            taken = any(name != self.name for name in self.names.takers(message_type))
         return Outcome.SENT if taken else Outcome.NOT_REGISTERED
 
     def _why_not(self, receiver: str) -> Outcome:
@@ -421,7 +423,9 @@ class Awareness:
 
     def _token(self, key: str, alive: bool) -> None:
         with self._lock:
-            name = self.names.token(key, alive)
+            ignored, name = self.names.ignored, self.names.token(key, alive)
+        if self.names.ignored != ignored:
+            self._lose("too_many_names", "", "more names, or types of one, than are remembered")
         if name is None:
             return
         self._changed.set()

@@ -100,7 +100,9 @@ class Presence:
             self._handling = asyncio.get_running_loop().call_soon(self._handle)
         if self.directory.ignored and not self._complained:
             self._complained = True
-            log.warning("a session has more than %d agents: the rest is ignored (logged once)", Directory.PER_SESSION)
+            what = "more than %d agents of a session, %d sessions for one agent, or %d in all"
+            most = Directory.PER_SESSION, Directory.PER_AGENT, Directory.IN_ALL
+            log.warning(f"{what}: the rest is ignored (logged once)", *most)
         self._tell()
 
     def close(self) -> None:

@@ -130,7 +130,7 @@ class Presses:
         if header.agent_type != ROS:
             return ()
         groups = set(header.groups)
-        members = (agent.id for agent in self._directory if agent.type == ROS and agent.group in groups)
+        members = (agent.id for agent in self._directory.of_type(ROS) if agent.group in groups)
         online = (robot for robot in header.ids if (ROS, robot) in self._directory)
         return {*online, *(members if groups else ())}
 

@@ -35,6 +35,9 @@ log = logging.getLogger("macs.awareness")
 REPORT_S = 1.0
 """How often counters that have changed are published."""
 
+TELL_S = 0.1
+"""How soon after one change modules are told who is there."""
+
 PENDING_BYTES = 64 << 20
 """What may wait between the ROS thread and the loop."""
 
@@ -61,6 +64,7 @@ class Gateway:
         self._types: frozenset[str] = frozenset()
         self._link_task: asyncio.Task[None] | None = None
         self._activation: asyncio.Task[None] | None = None
+        self._telling: asyncio.TimerHandle | None = None
         self._broken: asyncio.Future[None] = self._loop.create_future()
 
     @property
@@ -109,6 +113,8 @@ class Gateway:
                 with suppress(asyncio.CancelledError, MacsError):
                     await task
         self._broken.cancel()
+        if self._telling is not None:
+            self._telling.cancel()
 
     async def failed(self) -> None:
         """Wait until the gateway cannot go on, and raise why."""
@@ -245,6 +251,12 @@ class Gateway:
         self.node.say_undelivered(receiver, message_type, outcome.value)
 
     def _agents_changed(self) -> None:
+        """Tell it soon, and of many changes once: each telling costs what all agents cost."""
+        if self._telling is None:
+            self._telling = self._loop.call_later(TELL_S, self._say_agents)
+
+    def _say_agents(self) -> None:
+        self._telling = None
         self.node.say_agents(json.dumps(self._link.others(), ensure_ascii=False))
 
     async def _report(self) -> None:

@@ -29,6 +29,9 @@ AT_ONCE = 16
 TRUTH_S = 2.0
 """How long answers are not believed that leave out what we hold ourselves: a busy router may answer nothing."""
 
+HOLDERS = 16
+"""Sessions that lease the same block, as far as they are remembered: where parts of a mesh meet there are two."""
+
 AGAIN_S = 2.0
 """Pause after an attempt in vain to lease a block."""
 
@@ -149,7 +152,10 @@ class Leases:
     def _token(self, key: str, alive: bool) -> None:
         if (lease := LEASE.parse(key)) is not None:
             holders = self._holders.setdefault(lease.block, set())
-            (holders.add if alive else holders.discard)(lease.zid)
+            if not alive:
+                holders.discard(lease.zid)
+            elif len(holders) < HOLDERS:
+                holders.add(lease.zid)
             self._look()
 
     def _look(self) -> None:
@@ -171,16 +177,16 @@ class Leases:
 
     def _start_taking(self) -> asyncio.Task[None]:
         if self._taking is None:
-            self._taking = asyncio.get_running_loop().create_task(self._take_ahead())
+            told, self.exhausted = self.exhausted, False  # who waits is told what this attempt finds, not the last one
+            self._taking = asyncio.get_running_loop().create_task(self._take_ahead(told))
         return self._taking
 
-    async def _take_ahead(self) -> None:
+    async def _take_ahead(self, told: bool) -> None:
         missing = self._wanting + LOW - len(self._free)
         try:
             await self.take(min(AT_ONCE, 1 + missing // BLOCK_SIZE))
-            self.exhausted = False
         except Unreachable as error:
-            if not self.exhausted:
+            if not told:
                 log.warning("no more ids: %s", error)
             self.exhausted = True
         except Exception:  # whatever it was, who waits for an id must not wait for ever

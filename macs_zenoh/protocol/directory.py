@@ -96,16 +96,21 @@ class Directory:
 
     PER_SESSION = 16 << 10
     """Agents of one Zenoh session: a gateway has as many as it has connections."""
+    PER_AGENT = 16
+    """Sessions that claim the same one: where parts of a mesh meet there are two."""
+    IN_ALL = 128 << 10
+    """Claims of all; there are 64 Ki ids."""
 
     def __init__(self, grace_s: float = 2.0) -> None:
         self.grace_s = grace_s
         self.ignored = 0
-        """Tokens that were too many of one session."""
+        """Tokens that were too many: of one session, for one agent, or of all."""
         self._claims: dict[tuple[int, int], dict[str, AgentInfo]] = {}
         self._ids: dict[int, set[int]] = {}
         self._contested: set[tuple[int, int]] = set()
         self._doubtful: set[AgentInfo] = set()
         self._tokens_of: Counter[str] = Counter()
+        self._tokens = 0
         self._linked = True
         self._settled_at = 0.0
 
@@ -165,7 +170,8 @@ class Directory:
         if agent is None:
             return []
         if alive:
-            if self._tokens_of[agent.zid] >= self.PER_SESSION and agent.zid not in self._claims.get(agent.key, {}):
+            claims = self._claims.get(agent.key, {})
+            if agent.zid not in claims and self._is_full(agent, len(claims)):
                 self.ignored += 1
                 return []
             return self._claim(agent)
@@ -192,6 +198,13 @@ class Directory:
         self._doubtful.clear()
         return changes
 
+    def _is_full(self, agent: AgentInfo, claims: int) -> bool:
+        """Whether there is no room for one more claim on an agent that has so many: each costs a look at all of them,
+        and who makes up sessions has no end of them."""
+        if claims >= self.PER_AGENT or self._tokens >= self.IN_ALL:
+            return True
+        return self._tokens_of.get(agent.zid, 0) >= self.PER_SESSION
+
     def _current(self, key: tuple[int, int]) -> AgentInfo:
         claims = self._claims[key]
         if len(claims) == 1:
@@ -214,7 +227,9 @@ class Directory:
         before = self._current(agent.key) if claims else None
         replaced = before is not None and before.zid == agent.zid and before.epoch != agent.epoch
         self._doubtful.discard(agent)
-        self._tokens_of[agent.zid] += agent.zid not in claims
+        if agent.zid not in claims:
+            self._tokens_of[agent.zid] += 1
+            self._tokens += 1
         claims[agent.zid] = agent
         if len(claims) > 1:
             self._contested.add(agent.key)
@@ -230,6 +245,7 @@ class Directory:
             return []  # already replaced, e.g. by the same agent in another group
         before = self._current(agent.key)
         del claims[agent.zid]
+        self._tokens -= 1
         self._tokens_of[agent.zid] -= 1
         if not self._tokens_of[agent.zid]:
             del self._tokens_of[agent.zid]

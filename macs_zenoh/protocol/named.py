@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from enum import Enum
 from typing import Annotated, NamedTuple, TypeVar
 
@@ -121,7 +121,16 @@ class Names:
     Without grace: who has lost the way to the others cannot reach them, and their tokens come back with the link.
     """
 
+    NAMES = 4096
+    TYPES, TYPES_IN_ALL = 512, 16 << 10
+    """Types of each name; a robot's modules take tens."""
+    SESSIONS = 16
+    """That say the same."""
+
     def __init__(self) -> None:
+        self.ignored = 0
+        """Tokens that were too many."""
+        self._types = 0
         self._claims: dict[str, dict[str, Named]] = {}
         self._wanted: dict[str, dict[str, set[str]]] = {}
 
@@ -156,11 +165,13 @@ class Names:
         """The message types that an agent takes."""
         return sorted(self._wanted.get(name, ()))
 
-    def takers(self, message_type: str) -> list[str]:
+    def takers(self, message_type: str) -> Iterator[str]:
         """Everybody who takes a message type."""
-        return [name for name in sorted(self._claims) if self.takes(name, message_type)]
+        return (name for name, types in self._wanted.items() if message_type in types and name in self._claims)
 
     def _claim(self, agent: Named, alive: bool) -> str | None:
+        if alive and self._is_full(self._claims, agent.name, self.NAMES, agent.zid):
+            return None
         claims = self._claims.setdefault(agent.name, {})
         before = dict(claims)
         if alive:
@@ -172,12 +183,24 @@ class Names:
             del self._claims[agent.name]
         return agent.name if changed else None
 
+    def _is_full(self, table: Mapping[str, Collection[str]], key: str, most: int, zid: str = "") -> bool:
+        """Whether there is no room for one more in a table, or for one more session that says the same."""
+        found = table.get(key)
+        full = len(table) >= most if found is None else bool(zid) and zid not in found and len(found) >= self.SESSIONS
+        self.ignored += full
+        return full
+
     def _want(self, name: str, message_type: str, zid: str, alive: bool) -> str | None:
+        known = self._wanted.get(name, {})
+        most = self.TYPES if self._types < self.TYPES_IN_ALL else 0
+        if alive and (self._is_full(self._wanted, name, self.NAMES) or self._is_full(known, message_type, most, zid)):
+            return None
         types = self._wanted.setdefault(name, {})
         zids = types.setdefault(message_type, set())
         before = bool(zids)
         (zids.add if alive else zids.discard)(zid)
         after = bool(zids)
+        self._types += after - before
         if not zids:
             del types[message_type]
         if not types:

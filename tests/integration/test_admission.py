@@ -12,7 +12,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from bridge.gateway import Gateway
+from bridge.gateway import Gateway, leases
 from bridge.gateway.admission import Churn
 from bridge.gateway.leases import Leases
 from bridge.headset import frames
@@ -24,6 +24,7 @@ from macs_zenoh.protocol.keyexpr import LEASE, PING
 from macs_zenoh.protocol.messages import ROS, UNITY, Configuration, Welcome, decode_data, encode_management
 from macs_zenoh.protocol.wire import encode_frame, split_message
 from tests.support.given import StartGateway
+from tests.support.local import patient
 from tests.support.programs import Program, free_port
 from tests.support.waiting import PATIENCE_S, until
 
@@ -145,6 +146,28 @@ async def test_when_there_are_no_ids_a_newcomer_is_closed(start_gateway: StartGa
         await until(lambda: len(gateway.agents) == 255)
         async with crowd(gateway.port, 1) as late:
             assert late[0].id == agents[7].id
+
+
+async def test_whoever_held_all_blocks_keeps_nobody_out_when_he_has_gone(
+    start_gateway: StartGateway, router: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who comes while there are no ids is closed; who comes when there are some again waits for them, and is served,
+    though the last attempt to have more was in vain."""
+    monkeypatch.setattr(leases, "AGAIN_S", 0.1)
+    gateway: Gateway = await start_gateway(block=0)
+    async with await Mesh.open(patient(router)) as mesh:
+        held = [mesh.declare_token(LEASE.of(block=block, zid="0")) for block in range(1, 256)]
+        await until(lambda: len(gateway._leases._holders) == 256)
+        async with crowd(gateway.port, 255):
+            reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port)
+            assert await asyncio.wait_for(reader.read(), PATIENCE_S) == b""
+            writer.close()
+            for token in held:
+                token.close()
+            await until(lambda: sum(map(bool, gateway._leases._holders.values())) == 1)
+            await until(lambda: gateway._leases._taking is None)
+            async with crowd(gateway.port, 1) as late:
+                assert late[0].id >= 256
 
 
 async def test_changing_groups_is_no_departure(start_gateway: StartGateway) -> None:

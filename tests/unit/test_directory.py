@@ -289,6 +289,29 @@ def test_one_session_cannot_fill_the_directory() -> None:
     assert not directory.token(key(AgentInfo(2, 3, 0, "a")), True, 0.0)
 
 
+def test_sessions_that_somebody_makes_up_are_few() -> None:
+    """Of those that claim one agent so many count, and of all claims together; who was there before stays, and room is
+    made by those that end."""
+    directory = Directory()
+    directory.token(key(ROBOT), True, 0.0)
+    for number in range(100):
+        directory.token(key(ROBOT._replace(zid=f"b{number:04x}")), True, 0.0)
+    assert len(directory.claimants(1, 7)) == Directory.PER_AGENT
+    assert directory.get(1, 7) == ROBOT
+    assert directory.ignored == 101 - Directory.PER_AGENT
+    directory.token(key(ROBOT._replace(zid="b0000")), False, 0.0)
+    directory.token(key(ROBOT._replace(zid="c")), True, 0.0)
+    assert "c" in {agent.zid for agent in directory.claimants(1, 7)}
+    directory = Directory()
+    directory.IN_ALL = 50
+    for number in range(60):
+        directory.token(key(AgentInfo(2, number + 1, 0, f"{number:04x}")), True, 0.0)
+    assert len(directory) == 50
+    assert directory.token(key(AgentInfo(2, 1, 3, "0000")), True, 0.0)  # another group, the same claim
+    directory.token(key(AgentInfo(2, 1, 3, "0000")), False, 0.0)
+    assert directory.token(key(AgentInfo(2, 60, 0, "ff")), True, 0.0)
+
+
 def test_who_sleeps_is_online_and_does_not_leave() -> None:
     """Asleep and awake again is told as that and as nothing else, in whatever order the token before it ends; who does
     not wake up leaves once."""

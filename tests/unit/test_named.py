@@ -104,11 +104,11 @@ def test_types_are_taken_by_names() -> None:
         names.token(WANTED.of(name="a", message_type="std_msgs/String", zid=zid), True)
     assert names.takes("a", "std_msgs/String")
     assert names.types("a") == names.types("a") == ["std_msgs/String"]
-    assert names.takers("std_msgs/String") == ["a"]
+    assert list(names.takers("std_msgs/String")) == ["a"]
     assert names.token(WANTED.of(name="a", message_type="std_msgs/String", zid="1"), False) is None
     assert names.token(WANTED.of(name="a", message_type="std_msgs/String", zid="2"), False) == "a"
     assert not names.takes("a", "std_msgs/String")
-    assert names.takers("std_msgs/String") == []
+    assert list(names.takers("std_msgs/String")) == []
 
 
 def test_a_rate_is_kept_per_type_and_receiver() -> None:
@@ -211,3 +211,28 @@ def test_an_envelope_is_small_and_flat() -> None:
     ):
         with pytest.raises(WireError):
             named.decode(encode_message(envelope, b"data"))
+
+
+def test_names_and_types_are_bounded() -> None:
+    """One name has so many types, one type so many sessions, all together so many; those that are known stay, and go
+    when their tokens do."""
+    names = Names()
+    for number in range(Names.TYPES + 10):
+        names.token(WANTED.of(name="greedy", message_type=f"t{number}", zid="1"), True)
+    assert len(names.types("greedy")) == Names.TYPES
+    assert names.ignored == 10
+    assert names.token(WANTED.of(name="modest", message_type="t", zid="2"), True) == "modest"
+    for number in range(Names.SESSIONS + 5):
+        names.token(WANTED.of(name="modest", message_type="t", zid=f"{number:x}f"), True)
+        names.token(NAME.of(name="modest", type=1, id=7, zid=f"{number:x}f"), True)
+    assert len(names.claimants("modest")) == Names.SESSIONS
+    for name in range(200):
+        for number in range(100):
+            names.token(WANTED.of(name=f"n{name}", message_type=f"t{number}", zid="3"), True)
+    assert sum(len(names.types(name)) for name in ("greedy", "modest", *(f"n{n}" for n in range(200)))) == (
+        Names.TYPES_IN_ALL
+    )
+    for number in range(Names.TYPES):
+        names.token(WANTED.of(name="greedy", message_type=f"t{number}", zid="1"), False)
+    assert names.types("greedy") == []
+    assert names.token(WANTED.of(name="late", message_type="t", zid="4"), True) == "late"
