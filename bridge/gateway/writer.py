@@ -152,10 +152,11 @@ class Writer:
     def flush(self) -> None:
         """Write what was gathered, in one go."""
         with self._lock:
-            gathered, self._gathered, self._gathered_bytes = self._gathered, [], 0
+            gathered, self._gathered = self._gathered, []
+            size, self._gathered_bytes = self._gathered_bytes, 0
             if self._to_keep:
                 self._keep_gathered()
-            self.write(gathered)
+            self.write(gathered, size)
 
     def _keep_gathered(self) -> None:
         """Number what is written now: with the lock, since who writes past the loop counts as well."""
@@ -173,14 +174,15 @@ class Writer:
             small = type(message) is memoryview and len(message) <= COPY_BYTES
             self.kept.put(bytes(message) if small else message, len(message))
 
-    def write(self, chunks: list[Chunk]) -> None:
-        """Write at once, behind what is left of a message that went past the loop."""
+    def write(self, chunks: list[Chunk], size: int | None = None) -> None:
+        """Write at once, ``size`` bytes together, behind what is left of a message that went past the loop."""
         with self._lock:
+            size = sum(map(len, chunks)) if size is None else size
             rest, self._rest = self._rest, b""
             if rest:
-                chunks = [rest, *chunks]
+                chunks, size = [rest, *chunks], size + len(rest)
             if chunks and not self._transport.is_closing():
-                self.written_bytes += sum(map(len, chunks))
+                self.written_bytes += size
                 self._transport.writelines(joined(chunks) if self._joins and len(chunks) > 1 else chunks)
 
     def pause(self) -> None:
