@@ -203,7 +203,7 @@ class Connection(asyncio.BufferedProtocol):
         took_s = time.monotonic() - began
         if took_s > TURN_S:
             self._read_bytes = max(LEAST_READ_BYTES, int(self._read_bytes * TURN_S / took_s))
-        elif took_s < TURN_S / 2 and self._read_bytes < MOST_READ_BYTES:
+        elif took_s < TURN_S / 2 and nbytes >= self._read_bytes // 2 and self._read_bytes < MOST_READ_BYTES:
             self._read_bytes *= 2
         rounds = self._memory.rounds
         if (turn_s := rounds.spend(self.host, self._share, took_s)) and not self._transport.is_closing():
