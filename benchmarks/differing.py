@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from .cases import RawZenoh, rate, size_text
 from .figures import Figure
-from .plan import KIB, MIB, QUIET_S, Plan, Run, in_turn
+from .plan import KIB, MIB, QUIET_S, RELAYS, Plan, Run, in_rotation, in_turn
 from .processes import Program, ProgramFailed, Stage
 
 SIZES = (64, KIB, 64 * KIB)
@@ -72,13 +72,15 @@ def differing(stage: Stage, plan: Plan) -> Iterator[Figure]:
     """Number, request id and length differ in each message, to one headset, two in turn, ten."""
     router = stage.router()
     near, far = stage.gateway(router), stage.gateway(router)
-    relay = stage.relay()
-    paths = {"relay": (relay, relay), "one gateway": (near, near), "two gateways": (near, far)}
+    relays = [stage.relay() for _ in range(RELAYS)]
+    paths = {"one gateway": (near, near), "two gateways": (near, far)}
     zenoh = RawZenoh.start(stage, router, direct=False)
     for receivers, each, sizes in ((1, False, SIZES), (2, True, SIZES), (10, False, (64, 64 * KIB, MIB))):
+        plain = [connect(stage, "relay", port, port, receivers) for port in relays]
         lines = [connect(stage, path, *ports, receivers) for path, ports in paths.items()]
         for size in sizes:
-            runs = {line.path: run_of(plan, line, size, each=each) for line in lines}
+            runs = {"relay": in_rotation([run_of(plan, line, size, each=each) for line in plain])}
+            runs |= {line.path: run_of(plan, line, size, each=each) for line in lines}
             if receivers == 1:
                 runs["raw Zenoh"] = zenoh.run(plan, size, plan.count(size))
             values = in_turn(plan.rounds, runs)
@@ -89,7 +91,7 @@ def differing(stage: Stage, plan: Plan) -> Iterator[Figure]:
                 yield rate(name, size, rates, baseline, "plain relay", at_least=bound)
                 if raw is not None:
                     yield rate(name, size, rates, raw, "raw Zenoh")
-        for line in lines:
+        for line in (*plain, *lines):
             line.sender.stop()
             line.receiver.stop()
     robot, alone = robot_line(stage, near), connect(stage, "headset", near, near, 1)
