@@ -357,26 +357,14 @@ def twenty_thousand_tokens(target: Target) -> None:
 
 @attack(2, "mesh")
 def one_agent_of_many_sessions(target: Target) -> None:
-    """20 000 presence tokens for the robot and for a headset, each as another session's, again and again."""
-    _made_up(target, f"macs/live/ros/{target.robot}/0", "macs/live/unity/4000/0")
-
-
-@attack(2, "mesh")
-def one_block_of_many_sessions(target: Target) -> None:
-    """20 000 leases of the gateway's block, each as another session's and younger than the gateway's."""
-    _made_up(target, "macs/block/0")
-
-
-def _made_up(target: Target, *claimed: str) -> None:
-    """Whatever is claimed is somebody's already, so these ids are greater than any: it is not given up."""
+    """20 000 presence tokens for one headset, each as another session's, again and again."""
     number = 0
     with session(target) as mesh:
         while target.running():
             tokens = []
-            for _ in range(20_000 // len(claimed)):
+            for _ in range(20_000):
                 number += 1
-                for key in claimed:
-                    tokens.append(mesh.liveliness().declare_token(f"{key}/ffffffff{number:024x}"))
+                tokens.append(mesh.liveliness().declare_token(f"macs/live/unity/4000/0/{number:032x}"))
                 if not target.running():
                     return
             for token in tokens:
