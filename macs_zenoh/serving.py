@@ -11,6 +11,7 @@ from .mesh import Mesh, Subscription
 from .protocol.agent_id import AgentId
 from .protocol.guard import Gate
 from .protocol.keyexpr import CALL, type_name
+from .protocol.limits import CALL_BYTES
 from .protocol.messages import Metadata
 from .protocol.wire import Layout, parse_frame
 
@@ -49,7 +50,8 @@ class Served:
             at_once = None if first is None else lambda key, payload: first(self._read(verb, key, payload))
             me = self._me()
             own = CALL.every(type=me.type, id=me.id, verb=verb)
-            return mesh.serve(own, answer, stand_in=stand_in, first=at_once, gate=self._gate)
+            most_bytes = None if first is None else CALL_BYTES  # what is done at once is done where all are read
+            return mesh.serve(own, answer, stand_in=stand_in, first=at_once, gate=self._gate, most_bytes=most_bytes)
 
         declared = declare()
         handle = Handle(lambda: self._end(handle))

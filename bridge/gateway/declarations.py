@@ -13,6 +13,7 @@ from macs_zenoh.errors import Refused
 from macs_zenoh.mesh import Mesh, Subscription
 from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.keyexpr import CALL
+from macs_zenoh.protocol.limits import CALL_BYTES
 from macs_zenoh.protocol.messages import ROS, UNITY, AddNode, GoneAgent, RemoveNode, decode_data
 from macs_zenoh.protocol.registrations import AgentKey, check_own
 from macs_zenoh.protocol.routing import inbox
@@ -51,7 +52,10 @@ class AgentDeclarations:
         declared = [self._mesh.subscribe(inbox(kind, agent_id), self._delivery.inbox)]
         if kind == ROS:
             calls = CALL.every(type=ROS, id=agent_id)
-            declared.append(self._mesh.serve(calls, lambda key, payload: self._called(connection, key, payload)))
+            called = self._mesh.serve(
+                calls, lambda key, payload: self._called(connection, key, payload), most_bytes=CALL_BYTES
+            )
+            declared.append(called)
         self._declared[connection.key] = declared
 
     def undeclare(self, agent: AgentKey) -> None:

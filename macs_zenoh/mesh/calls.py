@@ -5,14 +5,16 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
+import threading
 from collections.abc import Callable
+from functools import partial
 
 import msgspec
 import zenoh
 
 from macs_zenoh.errors import CallTimeout, HeldByAnother, MacsError, NotServed, OutOfRange, Refused, Unreachable
 from macs_zenoh.protocol.guard import Admits
-from macs_zenoh.protocol.limits import REASON_CHARACTERS, REQUEST_BYTES
+from macs_zenoh.protocol.limits import ASKED_BYTES, REASON_CHARACTERS, REQUEST_BYTES
 
 from .arrivals import Arrivals, now_s
 from .declared import Handler, Payload, Subscription, Traffic
@@ -81,6 +83,9 @@ class Calls:
         self._outgoing = outgoing
         self._from_thread = from_thread
         self._tasks: set[asyncio.Task[None]] = set()
+        self._asked_bytes = 0
+        """Of calls that wait or are being answered."""
+        self._lock = threading.Lock()
 
     def close(self) -> None:
         """Answer nothing any more."""
@@ -148,6 +153,7 @@ class Calls:
         stand_in: bool,
         first: Callable[[str, bytes], None] | None,
         gate: Admits | None,
+        most_bytes: int | None,
     ) -> Subscription:
         """`Mesh.serve`."""
 
@@ -155,10 +161,10 @@ class Calls:
             self._arrivals.asked.popleft()
             with query:
                 name = str(query.key_expr)
-                payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
                     if problem is not None:
                         raise problem
+                    payload = query.payload.to_bytes() if query.payload is not None else b""
                     reply = await handler(name, payload)
                     if reply is not None:
                         query.reply(query.key_expr, reply)
@@ -176,29 +182,46 @@ class Calls:
                     end_if_panic(error)
                     raise
 
-        def spawn(query: zenoh.Query, problem: Refused | None) -> None:
+        def spawn(query: zenoh.Query, problem: Refused | None, size: int) -> None:
             task = self._loop.create_task(answer(query, problem))
             self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            task.add_done_callback(partial(self._answered, size))
 
         def on_query(query: zenoh.Query) -> None:
             keep_attached()
-            problem = _tried(first, query) if first is not None else None
-            if gate is not None:
-                size = len(query.payload) if query.payload is not None else 0
-                if not gate.admits(str(query.key_expr), size, False, now_s()):
-                    query.drop()  # type: ignore[no-untyped-call]
-                    return
-            elif len(self._arrivals.asked) >= WAITING:
-                self._outgoing.drops.note("flooded", key, "more is asked than can be answered")
+            size = len(query.payload) if query.payload is not None else 0
+            problem = None
+            if most_bytes is not None and size > most_bytes:
+                problem = Refused(f"it brings {size} bytes, at most {most_bytes} are read")
+                self._outgoing.drops.note("too_large", key, problem.reason)
+            elif first is not None:
+                problem = _tried(first, query)
+            if not self._admits(query, size, gate, key):
                 query.drop()  # type: ignore[no-untyped-call]
                 return
             self._arrivals.asked.append(query)
-            self._from_thread(spawn, query, problem)
+            self._from_thread(spawn, query, problem, size)
 
         answering = zenoh.handlers.Callback(on_query, indirect=False)
         # Zenoh asks one that is complete if there is any, else all
         return Subscription(self._session.declare_queryable(key, answering, complete=not stand_in))
+
+    def _admits(self, query: zenoh.Query, size: int, gate: Admits | None, key: str) -> bool:
+        """Whether a call may wait, with all that it brings. In a thread of Zenoh's."""
+        if gate is not None and not gate.admits(str(query.key_expr), size, False, now_s()):
+            return False
+        with self._lock:
+            full = self._asked_bytes > 0 and self._asked_bytes + size > ASKED_BYTES
+            full = full or (gate is None and len(self._arrivals.asked) >= WAITING)
+            self._asked_bytes += 0 if full else size
+        if full:
+            self._outgoing.drops.note("flooded", key, "more is asked than can be answered")
+        return not full
+
+    def _answered(self, size: int, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        with self._lock:
+            self._asked_bytes -= size
 
 
 def _tried(first: Callable[[str, bytes], None], query: zenoh.Query) -> Refused | None:

@@ -409,14 +409,16 @@ class Mesh:
         stand_in: bool = False,
         first: Callable[[str, bytes], None] | None = None,
         gate: Admits | None = None,
+        most_bytes: int | None = None,
     ) -> Subscription:
-        """Answer queries on ``key`` with ``await handler(key, payload)``; raise Refused in it to refuse.
+        """Answer queries on ``key`` with ``await handler(key, payload)``; raise Refused in it to refuse. What brings
+        more than ``most_bytes`` is refused unread.
 
         With ``stand_in`` it is asked only where nobody else serves the key. ``first`` is called at once with every
         query, in a thread of Zenoh's; unless it raises Refused, the answer is the handler's, on the loop. What the
         ``gate`` does not admit has no answer.
         """
-        return self._calls.serve(key, handler, stand_in=stand_in, first=first, gate=gate)
+        return self._calls.serve(key, handler, stand_in=stand_in, first=first, gate=gate, most_bytes=most_bytes)
 
     def answer_pings(self) -> Subscription:
         """Let `macs doctor` measure the way to this program, and learn its clock and version."""

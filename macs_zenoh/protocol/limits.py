@@ -38,6 +38,12 @@ NAME_BYTES = 255
 REQUEST_BYTES = 64 << 10
 """JSON in the data part of a message to a gateway, a manager or a robot that reads it there."""
 
+CALL_BYTES = REQUEST_BYTES + METADATA_BYTES + (1 << 10)
+"""A whole call of a verb that reads such JSON."""
+
+ASKED_BYTES = 64 << 20
+"""What calls have brought that wait or are being answered, of one program together. One of any size always may."""
+
 ANSWER_BYTES = 1 << 20
 """JSON in an answer that one asked for oneself: 65 535 ids, or all that a robot offers."""
 

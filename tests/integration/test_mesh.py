@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
@@ -14,10 +15,11 @@ from bridge.gateway.server import Gateway
 from bridge.headset.client import Headset
 from bridge.settings import GatewaySettings
 from macs_zenoh.config import MeshSettings
-from macs_zenoh.errors import MacsError
+from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.mesh.outgoing import Outgoing
 from macs_zenoh.protocol.keyexpr import PING
+from macs_zenoh.protocol.limits import ASKED_BYTES
 from tests.support.local import patient
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
@@ -195,3 +197,41 @@ async def test_of_calls_that_no_gate_admits_so_many_wait_at_most(router: str) ->
         answered = sum(await asyncio.gather(*asking))
         assert 0 < count - answered == server.drops["flooded"]
         serving.close()
+
+
+async def test_what_calls_bring_is_bounded(router: str) -> None:
+    """One that brings more than is read is refused unread; of those that wait or are being answered so many bytes are
+    kept, and what is more has no answer. When they are answered there is room again."""
+    answers, read = asyncio.Event(), Counter[int]()
+
+    async def answer(key: str, payload: bytes) -> bytes:
+        read[len(payload)] += 1
+        await answers.wait()
+        return payload[:1]
+
+    here = patient(router)
+    async with await Mesh.open(here) as server, await Mesh.open(here) as client:
+        serving = [server.serve("macs/ping/little", answer, most_bytes=100), server.serve("macs/ping/much", answer)]
+
+        async def ask(key: str, size: int) -> bytes | MacsError:
+            try:
+                return await client.query(key, b"x" * size, timeout_s=PATIENCE_S)
+            except MacsError as error:
+                return error
+
+        async def served() -> bool:
+            return isinstance(await ask("macs/ping/little", 101), Refused)
+
+        await until(served)
+        large = ASKED_BYTES // 4 - 1000
+        asking = [asyncio.ensure_future(ask("macs/ping/much", large)) for _ in range(10)]
+        await until(lambda: server.drops["flooded"] == 6)
+        assert read == {large: 4}
+        answers.set()
+        told = await asyncio.gather(*asking)
+        assert (told.count(b"x"), sum(isinstance(each, MacsError) for each in told)) == (4, 6)
+        assert await ask("macs/ping/little", 100) == b"x"
+        assert await ask("macs/ping/much", 2 * ASKED_BYTES) == b"x"
+        assert server.drops["too_large"] >= 1
+        for each in serving:
+            each.close()
