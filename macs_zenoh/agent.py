@@ -22,6 +22,7 @@ from .protocol.agent_id import AgentId
 from .protocol.directory import AgentInfo, Change, Directory
 from .protocol.guard import Guard
 from .protocol.keyexpr import BROADCAST, GROUP, type_name, type_number
+from .protocol.limits import CALL_BYTES
 from .protocol.messages import EVERYBODY, Metadata, NodeType
 from .protocol.reading import Message, Reader
 from .protocol.routing import call, inbox, keys_of
@@ -280,17 +281,19 @@ class Agent:
         first: CallFirst | None = None,
         stand_in: bool = False,
         mesh: Mesh | None = None,
+        most_bytes: int | None = None,
     ) -> Handle:
-        """Answer calls of ``verb`` with ``await handler(call)``, until the handle is closed; raise Refused in it to
-        refuse with a reason.
+        """Answer calls of ``verb`` with ``await handler(call)``, until the handle is closed; it may raise Refused.
 
         ``first(call)`` is called before that, in a thread of Zenoh's, even while the loop is busy; it may refuse. With
         ``mesh`` another session answers for this agent; with ``stand_in`` this one answers only while no other session
-        does. The whole mesh knows of it a moment later; callers who see this agent online ask again until then.
+        does. What brings more than ``most_bytes`` (with ``first``: `CALL_BYTES`) is refused unread. The whole mesh
+        knows of it a moment later; callers who see this agent online ask again until then.
         """
-
         self._check_open()
-        return self._served.add(verb, handler, first=first, stand_in=stand_in, mesh=mesh or self.mesh)
+        return self._served.add(
+            verb, handler, first=first, stand_in=stand_in, mesh=mesh or self.mesh, most_bytes=most_bytes
+        )
 
     # -- what robots have ----------------------------------------------------------------------------------------
 
@@ -466,7 +469,7 @@ class Agent:
         if self.group:
             self._keep(self._subscribe(GROUP.every(group=self.group, type=self.type_number), by_group=True))
         self.id = await self._identity.take(wanted_id)
-        self.serve("ping", _echo)
+        self.serve("ping", _echo, most_bytes=CALL_BYTES)
 
     def _listen(self, agent_id: int) -> Subscription:
         if self._guard is not None:

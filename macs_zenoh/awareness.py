@@ -31,6 +31,7 @@ from .mesh import Mesh, Sample, Subscription, Token, Traffic
 from .protocol import named
 from .protocol.agent_id import AgentId
 from .protocol.keyexpr import LAST, NAME, NAMED, NAMED_ALL, WANTED
+from .protocol.limits import CALL_BYTES
 from .protocol.named import Arrivals, Envelope, LastValues, Named, Names, Outcome, RateLimits, check_word
 from .protocol.wire import PROBE
 from .timeouts import within
@@ -385,7 +386,7 @@ class Awareness:
             raise UsageError(f"an agent called {self.name!r} is already on the mesh; choose another name")
         self._keep(self.mesh.subscribe(NAMED.every(name=self.name), self._receive))
         self._keep(self.mesh.serve(NAMED.every(name=self.name), self._confirm))
-        self._keep(self.mesh.serve(LAST.every(name=self.name), self._tell_last))
+        self._keep(self.mesh.serve(LAST.every(name=self.name), self._tell_last, most_bytes=CALL_BYTES))
         self._keep(self._token_of_name)
         self._token_of_name.become(self._declare_name())
         if not await settle(self.mesh.zid, lambda: self.names.claimants(self.name)):

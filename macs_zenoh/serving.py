@@ -40,8 +40,19 @@ class Served:
         self._declared: dict[Handle, tuple[Callable[[], Subscription], Subscription]] = {}
         """What makes it anew, for another id, and what there is now."""
 
-    def add(self, verb: str, handler: CallHandler, *, first: CallFirst | None, stand_in: bool, mesh: Mesh) -> Handle:
+    def add(
+        self,
+        verb: str,
+        handler: CallHandler,
+        *,
+        first: CallFirst | None,
+        stand_in: bool,
+        mesh: Mesh,
+        most_bytes: int | None = None,
+    ) -> Handle:
         """`Agent.serve`, by a session."""
+        if most_bytes is None and first is not None:
+            most_bytes = CALL_BYTES  # what is done at once is done where all are read
 
         async def answer(key: str, payload: bytes) -> bytes:
             return await handler(self._read(verb, key, payload))
@@ -50,7 +61,6 @@ class Served:
             at_once = None if first is None else lambda key, payload: first(self._read(verb, key, payload))
             me = self._me()
             own = CALL.every(type=me.type, id=me.id, verb=verb)
-            most_bytes = None if first is None else CALL_BYTES  # what is done at once is done where all are read
             return mesh.serve(own, answer, stand_in=stand_in, first=at_once, gate=self._gate, most_bytes=most_bytes)
 
         declared = declare()

@@ -27,6 +27,7 @@ from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, Refused, UsageError, WireError
 from macs_zenoh.protocol.keyexpr import type_name
+from macs_zenoh.protocol.limits import CALL_BYTES
 from macs_zenoh.protocol.messages import decode_data
 from macs_zenoh.serving import Call
 from macs_zenoh.versions import installed
@@ -116,7 +117,7 @@ class Recording:
         if self._disk is not None:
             self._disk.start()
         self.recorder.start()
-        self._agent.serve("record", self._asked)
+        self._agent.serve("record", self._asked, most_bytes=CALL_BYTES)
 
     async def stop(self) -> None:
         """End, with all that waits written."""

@@ -18,6 +18,7 @@ from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.keyexpr import type_number
+from macs_zenoh.protocol.limits import CALL_BYTES
 from macs_zenoh.protocol.messages import (
     ROS,
     AddNode,
@@ -91,7 +92,7 @@ class ReplayedRobot:
             "stop": self._stop,
         }
         for verb, handler in verbs.items():
-            self.agent.serve(verb, handler)
+            self.agent.serve(verb, handler, most_bytes=CALL_BYTES)
         self.agent.on_message(self._receive)
         self.agent.on_presence(self._presence)
 

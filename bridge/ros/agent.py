@@ -42,6 +42,7 @@ from macs_zenoh.mesh import Mesh, now_s
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.guard import Guard
 from macs_zenoh.protocol.keyexpr import type_name, type_number
+from macs_zenoh.protocol.limits import CALL_BYTES
 from macs_zenoh.protocol.messages import (
     AddNode,
     CommandClock,
@@ -161,7 +162,7 @@ class RobotAgent:
             ("status", self._status),
             ("control", self._control),
         ):
-            self.agent.serve(verb, handler)
+            self.agent.serve(verb, handler, most_bytes=CALL_BYTES)
         self.agent.serve("stop", self._stopped, first=self._stop, stand_in=True)
         self.agent.on_message(self._receive)
         if settings.mirror:
@@ -345,11 +346,8 @@ class RobotAgent:
 
     def _stop(self, call: Call) -> None:
         """The emergency stop with an answer: data ``true`` or ``false``, as on its topic. In a thread of Zenoh's."""
-        stop, sender, topic = (
-            self.nodes.stop,
-            Registrant(type_number(call.sender_type), call.sender_id),
-            call.metadata.node_name,
-        )
+        stop, topic = self.nodes.stop, call.metadata.node_name
+        sender = Registrant(type_number(call.sender_type), call.sender_id)
         if stop is None:
             raise Refused(self.nodes.robot.no_stop or "this robot has no emergency stop")
         if topic and topic != stop.key.node_name:  # a gateway asks, as what a headset sent may be a stop

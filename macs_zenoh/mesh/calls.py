@@ -7,6 +7,7 @@ import logging
 import re
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 
 import msgspec
@@ -14,7 +15,7 @@ import zenoh
 
 from macs_zenoh.errors import CallTimeout, HeldByAnother, MacsError, NotServed, OutOfRange, Refused, Unreachable
 from macs_zenoh.protocol.guard import Admits
-from macs_zenoh.protocol.limits import ASKED_BYTES, REASON_CHARACTERS, REQUEST_BYTES
+from macs_zenoh.protocol.limits import ASKED_BYTES, CALL_BYTES, REASON_CHARACTERS, REQUEST_BYTES
 
 from .arrivals import Arrivals, now_s
 from .declared import Handler, Payload, Subscription, Traffic
@@ -84,7 +85,7 @@ class Calls:
         self._from_thread = from_thread
         self._tasks: set[asyncio.Task[None]] = set()
         self._asked_bytes = 0
-        """Of calls that wait or are being answered."""
+        """Of large calls that wait or are being answered."""
         self._lock = threading.Lock()
 
     def close(self) -> None:
@@ -182,46 +183,54 @@ class Calls:
                     end_if_panic(error)
                     raise
 
-        def spawn(query: zenoh.Query, problem: Refused | None, size: int) -> None:
+        def spawn(query: zenoh.Query, problem: Refused | None, counted: int) -> None:
             task = self._loop.create_task(answer(query, problem))
             self._tasks.add(task)
-            task.add_done_callback(partial(self._answered, size))
+            task.add_done_callback(partial(self._answered, counted))
 
         def on_query(query: zenoh.Query) -> None:
             keep_attached()
             size = len(query.payload) if query.payload is not None else 0
-            problem = None
             if most_bytes is not None and size > most_bytes:
-                problem = Refused(f"it brings {size} bytes, at most {most_bytes} are read")
-                self._outgoing.drops.note("too_large", key, problem.reason)
-            elif first is not None:
-                problem = _tried(first, query)
-            if not self._admits(query, size, gate, key):
+                self._refuse(query, f"it brings {size} bytes, at most {most_bytes} are read", size, gate, key)
+                return
+            problem = _tried(first, query) if first is not None else None
+            counted = size if size > CALL_BYTES else 0
+            if not self._admits(query, size, counted, gate, key):
                 query.drop()  # type: ignore[no-untyped-call]
                 return
             self._arrivals.asked.append(query)
-            self._from_thread(spawn, query, problem, size)
+            self._from_thread(spawn, query, problem, counted)
 
         answering = zenoh.handlers.Callback(on_query, indirect=False)
         # Zenoh asks one that is complete if there is any, else all
         return Subscription(self._session.declare_queryable(key, answering, complete=not stand_in))
 
-    def _admits(self, query: zenoh.Query, size: int, gate: Admits | None, key: str) -> bool:
-        """Whether a call may wait, with all that it brings. In a thread of Zenoh's."""
+    def _refuse(self, query: zenoh.Query, reason: str, size: int, gate: Admits | None, key: str) -> None:
+        """Answer a call that is not read, and let it go with all that it brings. In a thread of Zenoh's."""
+        self._outgoing.drops.note("too_large", key, reason)
+        if gate is None or gate.admits(str(query.key_expr), size, False, now_s()):
+            with suppress(zenoh.ZError):  # the session is closed
+                query.reply_err(msgspec.json.encode({"refused": reason}))
+        query.drop()  # type: ignore[no-untyped-call]
+
+    def _admits(self, query: zenoh.Query, size: int, counted: int, gate: Admits | None, key: str) -> bool:
+        """Whether a call may wait, with all that it brings, of which so much counts: small ones are judged by their
+        number, so that no large one is in their way, nor they in its. In a thread of Zenoh's."""
         if gate is not None and not gate.admits(str(query.key_expr), size, False, now_s()):
             return False
         with self._lock:
-            full = self._asked_bytes > 0 and self._asked_bytes + size > ASKED_BYTES
+            full = counted > 0 and self._asked_bytes > 0 and self._asked_bytes + counted > ASKED_BYTES
             full = full or (gate is None and len(self._arrivals.asked) >= WAITING)
-            self._asked_bytes += 0 if full else size
+            self._asked_bytes += 0 if full else counted
         if full:
             self._outgoing.drops.note("flooded", key, "more is asked than can be answered")
         return not full
 
-    def _answered(self, size: int, task: asyncio.Task[None]) -> None:
+    def _answered(self, counted: int, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         with self._lock:
-            self._asked_bytes -= size
+            self._asked_bytes -= counted
 
 
 def _tried(first: Callable[[str, bytes], None], query: zenoh.Query) -> Refused | None:

@@ -42,7 +42,8 @@ CALL_BYTES = REQUEST_BYTES + METADATA_BYTES + (1 << 10)
 """A whole call of a verb that reads such JSON."""
 
 ASKED_BYTES = 64 << 20
-"""What calls have brought that wait or are being answered, of one program together. One of any size always may."""
+"""What calls of more than ``CALL_BYTES`` have brought that wait or are being answered, of one program together. One of
+any size may when no other such waits."""
 
 ANSWER_BYTES = 1 << 20
 """JSON in an answer that one asked for oneself: 65 535 ids, or all that a robot offers."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
 import pytest
+import zenoh
 
 import macs_zenoh
 from bridge.gateway.server import Gateway
@@ -19,7 +21,7 @@ from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.mesh.outgoing import Outgoing
 from macs_zenoh.protocol.keyexpr import PING
-from macs_zenoh.protocol.limits import ASKED_BYTES
+from macs_zenoh.protocol.limits import CALL_BYTES
 from tests.support.local import patient
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
@@ -199,9 +201,11 @@ async def test_of_calls_that_no_gate_admits_so_many_wait_at_most(router: str) ->
         serving.close()
 
 
-async def test_what_calls_bring_is_bounded(router: str) -> None:
-    """One that brings more than is read is refused unread; of those that wait or are being answered so many bytes are
-    kept, and what is more has no answer. When they are answered there is room again."""
+async def test_what_calls_bring_is_bounded(router: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that brings more than is read is refused unread, at once; of large ones that wait or are being answered so
+    many bytes are kept, and what is more has no answer. Neither is in the way of small ones, nor they in its."""
+    most = 1 << 20
+    monkeypatch.setattr("macs_zenoh.mesh.calls.ASKED_BYTES", most)
     answers, read = asyncio.Event(), Counter[int]()
 
     async def answer(key: str, payload: bytes) -> bytes:
@@ -209,9 +213,12 @@ async def test_what_calls_bring_is_bounded(router: str) -> None:
         await answers.wait()
         return payload[:1]
 
+    async def at_once(key: str, payload: bytes) -> bytes:
+        return payload[:1]
+
     here = patient(router)
     async with await Mesh.open(here) as server, await Mesh.open(here) as client:
-        serving = [server.serve("macs/ping/little", answer, most_bytes=100), server.serve("macs/ping/much", answer)]
+        serving = [server.serve("macs/ping/little", at_once, most_bytes=100), server.serve("macs/ping/much", answer)]
 
         async def ask(key: str, size: int) -> bytes | MacsError:
             try:
@@ -223,15 +230,50 @@ async def test_what_calls_bring_is_bounded(router: str) -> None:
             return isinstance(await ask("macs/ping/little", 101), Refused)
 
         await until(served)
-        large = ASKED_BYTES // 4 - 1000
-        asking = [asyncio.ensure_future(ask("macs/ping/much", large)) for _ in range(10)]
-        await until(lambda: server.drops["flooded"] == 6)
-        assert read == {large: 4}
+        asking = [asyncio.ensure_future(ask("macs/ping/much", CALL_BYTES)) for _ in range(20)]
+        await until(lambda: read[CALL_BYTES] == 20)
+        large = most // 4 - 1000
+        asking += [asyncio.ensure_future(ask("macs/ping/much", large)) for _ in range(10)]
+        await until(lambda: read[large] == 4 and server.drops["flooded"] == 6)
+        assert await ask("macs/ping/little", 100) == b"x"
+        assert isinstance(await ask("macs/ping/little", 2 * most), Refused)
         answers.set()
         told = await asyncio.gather(*asking)
-        assert (told.count(b"x"), sum(isinstance(each, MacsError) for each in told)) == (4, 6)
-        assert await ask("macs/ping/little", 100) == b"x"
-        assert await ask("macs/ping/much", 2 * ASKED_BYTES) == b"x"
-        assert server.drops["too_large"] >= 1
+        assert told[:20] == [b"x"] * 20
+        assert (told.count(b"x"), sum(isinstance(each, MacsError) for each in told)) == (24, 6)
+        assert await ask("macs/ping/much", 2 * most) == b"x"
+        assert server.drops["flooded"] == 6
+        assert server.drops["too_large"] >= 2
         for each in serving:
             each.close()
+
+
+async def test_what_brings_too_much_is_refused_while_the_loop_is_busy(router: str) -> None:
+    """The answer is there before the loop comes to anything, and nothing of the call waits."""
+    told: list[bytes] = []
+    answered = threading.Event()
+
+    async def answer(key: str, payload: bytes) -> bytes:
+        return payload
+
+    here = patient(router)
+    async with await Mesh.open(here) as server, await Mesh.open(here) as client:
+        serving = server.serve("macs/ping/little", answer, most_bytes=100)
+
+        async def served() -> bool:
+            with suppress(MacsError):
+                return await client.query("macs/ping/little", b"x", timeout_s=PATIENCE_S) == b"x"
+            return False
+
+        await until(served)
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            told.append(reply.err.payload.to_bytes() if reply.err is not None else b"")
+            answered.set()
+
+        handler = zenoh.handlers.Callback(on_reply, answered.set, indirect=False)
+        client._session.get("macs/ping/little", handler, payload=b"x" * (1 << 20), timeout=PATIENCE_S)
+        assert answered.wait(PATIENCE_S)  # here the loop stands
+        assert len(told) == 1
+        assert b"refused" in told[0]
+        serving.close()
