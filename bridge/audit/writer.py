@@ -99,13 +99,15 @@ class AuditFile:
             "result": result[:TEXT],
         }
         with self._wake:
-            left_out = self._shares.take(event, by, result, now)
-            if left_out is not None and len(self._notes) < WAITING:
-                self._notes.append(note | ({"left_out": left_out} if left_out else {}))
-                self._wake.notify()
-                return
-            self._lost += left_out is not None
-        self._on_lost("audit_lost" if left_out is not None else "audit_left_out")
+            if fits := len(self._notes) < WAITING:  # what is lost takes nobody's share, and tells of nothing left out
+                left_out = self._shares.take(event, by, result, now)
+                if left_out is not None:
+                    self._notes.append(note | ({"left_out": left_out} if left_out else {}))
+                    self._wake.notify()
+                    return
+            else:
+                self._lost += 1
+        self._on_lost("audit_left_out" if fits else "audit_lost")
 
     def troubles(self) -> dict[str, int]:
         """As `Audit` says."""

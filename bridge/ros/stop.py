@@ -16,6 +16,7 @@ from collections.abc import Callable
 from msgspec import UNSET, structs
 
 from bridge.audit import who
+from bridge.audit.notes import BEFORE
 from bridge.ros.interface import InterfaceNode, Registrant, Robot
 from bridge.ros.rules import names_agent
 from bridge.ros.shared_stop import A_NODE, SharedStop, StopState
@@ -138,7 +139,7 @@ class StopNode(InterfaceNode):
             if self.robot.stop.press(by, time.time()):
                 self._has_stopped()
             elif self.robot.stop.changes != before:
-                self.robot.audit.record("stop", who(by), self.topic, "it was stopped before")
+                self.robot.audit.record("stop", who(by), self.topic, BEFORE)
                 self._tell()
 
     def release(self, by: str) -> None:

@@ -199,28 +199,38 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 async def test_a_full_disk(small_disk: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Notes are taken at once all the same; they wait, then are lost and counted; with room again all is told."""
-    path, lost = small_disk / "audit.jsonl", [0]
+    """Notes are taken at once all the same; they wait, then are lost and counted; with room again all is told, and how
+    much of somebody's was left out before his line was lost."""
+    path, lost, busy = small_disk / "audit.jsonl", [0], who("unity/0")
+    left_out = 0
 
     def count(name: str) -> None:
+        nonlocal left_out
         lost[0] += name == "audit_lost"
+        left_out += name == "audit_left_out"
 
     audit = AuditFile(path, "p", on_lost=count)
     (small_disk / "filler").write_bytes(bytes(100 << 10))
+    while left_out < 10:
+        audit.record("register", busy, "z" * 50)
     for number in range(WAITING + 2000):
-        audit.record("joined", who(f"unity/{number}"), "z" * 50)
+        audit.record("joined", who(f"unity/{1 + number % 1000}"), "z" * 50)
         if number == 500:
             await until(lambda: "audit_waiting" in audit.troubles())
     assert lost[0] > 0
+    await asyncio.sleep(2 / Shares.PER_S)  # then he would have a line, were there room
+    audit.record("register", busy)
+    assert left_out == 10
     assert path.read_bytes().endswith(b"\n")  # nothing half is left
     assert [record.levelname for record in caplog.records if record.name == "macs.audit"] == ["ERROR"]
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
     await until(lambda: not audit._notes)
-    audit.record("left", who("unity/1"))
+    audit.record("left", busy)
     audit.close()
     code, said = await verified(path)
     assert (code, kinds(said)) == (0, ["lost"])
     assert [line["lost"] for line in lines_of(path) if "lost" in line] == lost
+    assert [line["left_out"] for line in lines_of(path) if "left_out" in line] == [left_out]
     assert lines_of(path)[-1]["event"] == "stopped"
     assert audit.troubles() == {}
 
