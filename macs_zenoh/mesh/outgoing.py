@@ -20,6 +20,7 @@ from macs_zenoh.protocol.keyexpr import NAMED_ALL, STREAM
 from macs_zenoh.protocol.policing import Policer, Policy
 
 from .declared import Outlet, Payload, Traffic
+from .heartbeat import Counted, Heartbeats
 from .loopback import Loopback
 from .panics import call, unwatched
 from .tracing import Marked, Tracing
@@ -106,6 +107,7 @@ class Outgoing:
         """How often keys were put with that have no publisher yet, by key and whether apart."""
         self._on_room: Callbacks[Callable[[], None]] = Callbacks()
         self._sender = Sender(backlog_bytes, loopback.put, lambda: from_thread(self._room))
+        self._heartbeats = Heartbeats(self.HEARTBEAT_S)
 
     def link_changed(self, linked: bool) -> None:
         """A router came or went: who listens is unknown again."""
@@ -115,6 +117,7 @@ class Outgoing:
     def close(self, timeout_s: float) -> None:
         """Send what is queued, for at most so long."""
         self._sender.close(timeout_s)
+        self._heartbeats.close(timeout_s)
 
     def undeclare(self) -> None:
         """Have no publishers any more, on a session that goes on."""
@@ -288,12 +291,13 @@ class Outgoing:
             return 0
         return self._kept.get(key) or (shape.cache if shape is not None else None) or 0
 
-    def _keeping(self, key: str, traffic: Traffic, samples: int) -> Any:
-        """A publisher that numbers samples, keeps the last ones and answers questions for them."""
+    def _keeping(self, key: str, traffic: Traffic, samples: int) -> Counted:
+        """A publisher that numbers samples, keeps the last ones, answers questions for them and tells how many there
+        are."""
         priority, congestion, express = self.way(key, traffic)
         # an answer that were dropped would be asked for again, so it waits
         answers = zenoh.ext.RepliesConfig(priority=priority, congestion_control=zenoh.CongestionControl.BLOCK)
-        return call(
+        publisher = call(
             zenoh.ext.declare_advanced_publisher,
             unwatched(self._session),
             key,
@@ -301,8 +305,12 @@ class Outgoing:
             congestion_control=congestion,
             express=express,
             cache=zenoh.ext.CacheConfig(samples, replies_config=answers),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=self.HEARTBEAT_S, sporadic_heartbeat=None),
+            # numbered; the heartbeat is ours
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
         )
+        counted = Counted(self._session, key, publisher)
+        self._heartbeats.add(counted)
+        return counted
 
     def _declare_apart(self, key: str, size: int) -> _Apart:
         places = (zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE)
