@@ -18,9 +18,9 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Mapping
 from contextlib import asynccontextmanager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from .agent import Agent
 from .claims import settle, stale_until
@@ -28,6 +28,7 @@ from .errors import Refused, Unreachable, UsageError, WireError
 from .handles import Callbacks, Handle
 from .losses import Losses
 from .mesh import Mesh, Sample, Subscription, Token, Traffic
+from .mesh.followed import Followed
 from .protocol import named
 from .protocol.agent_id import AgentId
 from .protocol.keyexpr import LAST, NAME, NAMED, NAMED_ALL, WANTED
@@ -345,7 +346,10 @@ class Awareness:
     # -- last values ---------------------------------------------------------------------------------------------
 
     def _ask(self, name: str, message_type: str) -> None:
-        task = asyncio.get_running_loop().create_task(self._ask_for_last(name, message_type))
+        self._spawn(self._ask_for_last(name, message_type))
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -376,10 +380,10 @@ class Awareness:
 
     async def start(self) -> None:
         """Claim the name and listen. Raises UsageError when somebody else has it."""
-        # asked right after a watcher is declared for the same key, Zenoh may leave tokens out
-        for key in await self.mesh.tokens(NAME.every(name=self.name)):
-            self._token(key, True)
-        self._keep(self.mesh.watch_tokens(NAME.every(), self._token))
+        own = NAME.every(name=self.name)
+        followed = Followed(await self.mesh.tokens(own), self._token)
+        self._keep(self.mesh.watch_tokens(NAME.every(), followed.told))
+        self._spawn(followed.confirm(lambda: self.mesh.tokens(own)))
         self._keep(self.mesh.watch_tokens(WANTED.every(), self._token))
         await self._wait_for_stale()
         if self.names.claimants(self.name):

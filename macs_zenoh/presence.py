@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 
 from .deadline import Deadline
 from .mesh import Mesh, Subscription, Token
+from .mesh.followed import CONFIRM_S
 from .protocol.directory import AgentInfo, Change, Directory
 from .protocol.keyexpr import PRESENCE
 
@@ -23,9 +24,6 @@ AT_ONCE = 200
 
 CONTESTED_S = 0.05
 """Pause between two looks at what is contested: each costs what all of it costs, and a merge changes it in steps."""
-
-CONFIRM_S = 1.0
-"""After so long a watcher has all its first news."""
 
 Contested = Mapping[tuple[int, int], list[str]]
 """What this session holds and others hold as well: (type, id) and the others' Zenoh ids."""

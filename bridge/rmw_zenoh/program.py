@@ -21,8 +21,9 @@ from bridge.settings.rmw_zenoh import RmwZenohRobot, RmwZenohSettings
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, MacsError
+from macs_zenoh.handles import Handle
 from macs_zenoh.locked_out import locked_out
-from macs_zenoh.mesh import Mesh, Subscription
+from macs_zenoh.mesh import Mesh
 from macs_zenoh.mesh.panics import unwatched
 from macs_zenoh.mesh.ros_network import RosNetwork
 from macs_zenoh.protocol.messages import ROS
@@ -261,16 +262,13 @@ class _Following:
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
         self._told: set[Place] = set()
-        self._watching: Subscription | None = None
+        self._watching: Handle | None = None
 
     @classmethod
     async def begin(cls, settings: RmwZenohSettings, network: RosNetwork) -> _Following:
-        """Follow; who is there now is known. It asks first: while a watcher's first news are on their way, answers may
-        leave some out."""
+        """Follow; who is there now is known."""
         following = cls(settings)
-        for token in await network.tokens(None, timeout_s=LOOK_S):
-            following._token(token, True)
-        following._watching = network.watch_tokens(None, following._token)
+        following._watching = await network.follow_tokens(None, following._token, timeout_s=LOOK_S)
         await asyncio.sleep(SETTLE_S)
         return following
 

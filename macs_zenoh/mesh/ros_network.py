@@ -42,6 +42,7 @@ from macs_zenoh.protocol.rmw_zenoh.keyexpr import (
 from macs_zenoh.protocol.rmw_zenoh.qos import SERVICES, Durability, History, Qos, Reliability
 
 from .declared import Subscription
+from .followed import Followed, OnToken
 from .heartbeat import Heartbeat
 from .leaving import leave
 from .opening import open_session
@@ -95,7 +96,7 @@ class RosNetwork:
         self.ids = itertools.count()
         self._lock = threading.Lock()
         self._graphs: dict[int, Graph] = {}
-        self._watching: dict[int, Subscription] = {}
+        self._watching: dict[int, Handle | Subscription] = {}
         self._on_change: Callbacks[OnChange] = Callbacks()
         self.linked = True
         """Whether a router is connected now. Set in Zenoh's thread, before the tokens behind it are taken for gone."""
@@ -125,6 +126,8 @@ class RosNetwork:
 
     async def close(self) -> None:
         """Leave; tokens end. A process must not exit without it."""
+        for watching in self._watching.values():
+            watching.close()
         await leave(self.session.close)
 
     def _link(self, event: zenoh.LinkEvent) -> None:
@@ -149,10 +152,13 @@ class RosNetwork:
         return graph
 
     async def known(self, domain: int, *, timeout_s: float = 2.0) -> None:
-        """Wait until the tokens of a domain that exist now are in its graph."""
-        graph = self.graph(domain)
-        for token in await self.tokens(domain, timeout_s=timeout_s):
-            self._token(graph, token, True)
+        """Follow the graph of a domain, unless it is followed already: the tokens that exist now are in it when this
+        returns."""
+        with self._lock:
+            if domain in self._graphs:
+                return
+            graph = self._graphs[domain] = Graph(self.zid)
+        self._watching[domain] = await self.follow_tokens(domain, partial(self._token, graph), timeout_s=timeout_s)
 
     async def tokens(self, domain: int | None, *, timeout_s: float = 2.0) -> list[str]:
         """The tokens of a domain, or of all, that exist now."""
@@ -172,7 +178,20 @@ class RosNetwork:
         await ended.wait()
         return found
 
-    def watch_tokens(self, domain: int | None, receive: Callable[[str, bool], None]) -> Subscription:
+    async def follow_tokens(self, domain: int | None, receive: OnToken, *, timeout_s: float = 2.0) -> Handle:
+        """Call ``receive(token, alive)``, from any thread, for each token of a domain, or of all, until the handle is
+        closed; those that exist now have been told of when this returns."""
+        followed = Followed(await self.tokens(domain, timeout_s=timeout_s), receive)
+        watching = self.watch_tokens(domain, followed.told)
+        confirming = asyncio.ensure_future(followed.confirm(partial(self.tokens, domain, timeout_s=timeout_s)))
+
+        def end() -> None:
+            confirming.cancel()
+            watching.close()
+
+        return Handle(end)
+
+    def watch_tokens(self, domain: int | None, receive: OnToken) -> Subscription:
         """Call ``receive(token, alive)`` for each token of a domain, or of all."""
 
         def on_sample(sample: zenoh.Sample) -> None:

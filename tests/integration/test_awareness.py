@@ -12,6 +12,7 @@ import macs_zenoh
 from macs_zenoh import awareness
 from macs_zenoh.awareness import Awareness, Received
 from macs_zenoh.errors import Unreachable, UsageError
+from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import NAME, NAMED, NAMED_ALL
 from macs_zenoh.protocol.named import Outcome
 from tests.support.local import patient
@@ -311,3 +312,27 @@ async def test_nothing_is_lost_for_ever_with_a_router(tmp_path: object) -> None:
             assert module.received.empty()
     finally:
         await router.stop()
+
+
+async def test_a_name_that_is_given_up_in_this_moment_can_be_had(
+    meet: Meet, router: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who has it leaves after the router has named it, before anybody watches: who joins waits, and has it."""
+    async with AsyncExitStack() as stack:
+        agent = await stack.enter_async_context(macs_zenoh.join("ros", settings=patient(router)))
+        await stack.enter_async_context(awareness.join(agent, "a"))
+        really = Mesh.tokens
+
+        async def then_it_leaves(self: Mesh, key: str, *, timeout_s: float = 2.0) -> list[str]:
+            found = await really(self, key, timeout_s=timeout_s)
+            if key == NAME.every(name="a") and found:
+                monkeypatch.setattr(Mesh, "tokens", really)
+                await stack.aclose()
+                while await self.tokens(key):
+                    pass
+            return found
+
+        b = await meet("b")
+        monkeypatch.setattr(Mesh, "tokens", then_it_leaves)
+        assert (await meet("a")).name == "a"
+        await b.wait_for("a", timeout_s=PATIENCE_S)
