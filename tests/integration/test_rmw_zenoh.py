@@ -13,7 +13,9 @@ import pytest
 import macs_zenoh
 from bridge.headset.client import Headset
 from bridge.headset.nodes import ServiceRequest
+from macs_zenoh import ros
 from macs_zenoh.agent import Agent
+from macs_zenoh.protocol.rmw_zenoh.keyexpr import Kind
 from tests.support.programs import Program, macs
 from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
@@ -117,6 +119,45 @@ async def test_topics_both_ways(site: Site) -> None:
     await site.robot.start()
     await until(lambda: hears("back"), PATIENCE_S)
     listening.cancel()
+
+
+async def test_several_take_one_topic(site: Site) -> None:
+    """Two agents have it over one subscription in the robot's graph, which stays until the last of them leaves; and
+    who looks at the robot is told what nobody can do for it."""
+    await site.robot.ask("publish", topic="/chatter", text="first")
+    await site.there()
+
+    async def told() -> bool:
+        (robot,) = [each for each in await macs("ls", "-v", "--json", "-e", site.endpoint) if each["type"] == "ros"]
+        return "nobody stops it" in (robot["status"] or {}).get("beside", "")
+
+    await until(told, PATIENCE_S)
+    texts: dict[int, list[str]] = {300: [], 301: []}
+
+    async def heard_by(text: str, *ids: int) -> bool:
+        await site.robot.ask("publish", topic="/chatter", text=text)
+        return all(text in texts[number] for number in ids)
+
+    async with (
+        macs_zenoh.join("unity", id=301, connect=[site.endpoint]) as other,
+        ros.node("tool", domain=DOMAIN, connect=[site.endpoint]) as tool,
+    ):
+        await until(lambda: (1, 7) in other.directory)
+        heard = {}
+        for agent in (site.agent, other):
+            heard[agent.id] = subscription = await agent.subscribe("/chatter", robot=7)
+            subscription.on_message(lambda message, to=texts[agent.id]: to.append(message.value["data"]))
+
+        def taken() -> int:
+            return len(tool.network.graph(DOMAIN).on("/chatter", Kind.SUBSCRIPTION))
+
+        await until(lambda: heard_by("both", 300, 301), PATIENCE_S)
+        assert taken() == 1
+        heard[300].close()
+        await until(lambda: heard_by("one", 301), PATIENCE_S)
+        assert taken() == 1
+        heard[301].close()
+        await until(lambda: taken() == 0, PATIENCE_S)
 
 
 async def test_services_both_ways(site: Site) -> None:

@@ -71,14 +71,21 @@ async def test_each_robot_sends_one_copy(router: str, domain: int, seconds: int)
             for publisher in publishers:
                 publisher.publish(String(data=f"{number} ".ljust(POSE_BYTES, "x")))
             await asyncio.sleep(1 / HZ)
-        for both in heard:
-            for queue in both:
-                numbers: list[int] = []
-                while numbers[-1:] != [count - 1]:
-                    text = (await get(queue)).data
-                    numbers += [int(text.split()[0])] if text != "begin" else []
-                assert numbers == sorted(set(numbers))  # a busy machine may lose some
-                assert len(numbers) > count / 2
+        said: list[list[str]] = [[] for both in heard for _ in both]
+
+        def all_have_ended() -> bool:
+            for publisher in publishers:
+                publisher.publish(String(data="end"))
+            for words, queue in zip(said, (queue for both in heard for queue in both), strict=True):
+                while not queue.empty():
+                    words.append(queue.get_nowait().data.split()[0])
+            return all("end" in words for words in said)
+
+        await until(all_have_ended, PATIENCE_S, every_s=0.05)
+        for words in said:
+            numbers = [int(word) for word in words if word.isdigit()]
+            assert numbers == sorted(set(numbers))  # a busy machine may lose some
+            assert len(numbers) > count / 2
         copies = [
             tuple((after - at) / (count * POSE_BYTES) for after, at in zip(now(link), was, strict=True))
             for link, was in zip(links, before, strict=True)
