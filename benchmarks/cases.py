@@ -15,7 +15,7 @@ from macs_zenoh.protocol.wire import MACS
 
 from .figures import Figure
 from .link import CountingLink
-from .plan import KIB, MIB, QUIET_S, RELAYS, Case, Plan, Run, in_rotation, in_turn
+from .plan import KIB, LATE_S, MIB, QUIET_S, RELAYS, Case, Plan, Run, in_rotation, in_turn
 from .processes import Program, ProgramFailed, Stage
 
 
@@ -79,8 +79,13 @@ def stream(plan: Plan, pair: Pair, size: int) -> Run:
         pair.receiver.tell("receive", total_bytes=count * length, timeout_s=QUIET_S)
         began = pair.sender.ask("send", size=size, count=count, **pair.to)["began"]
         there = pair.receiver.answer()
-        got = sum(received // length for received in there["bytes"])
-        whole = plan.arrived(f"{pair.path}, {size_text(size)}", count * everybody, got)
+        where, got = f"{pair.path}, {size_text(size)}", sum(received // length for received in there["bytes"])
+        late = 0
+        if got < count * everybody:  # what still comes is not lost, and belongs to no other round
+            pair.receiver.tell("receive", total_bytes=count * length, timeout_s=LATE_S)
+            later = pair.receiver.answer(LATE_S)["bytes"]
+            late = sum((a + b) // length for a, b in zip(there["bytes"], later, strict=True)) - got
+        whole = plan.arrived(where, count * everybody, got, late)
         return float(got / (there["ended"] - began)) if whole else 0.0
 
     return run

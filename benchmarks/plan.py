@@ -13,7 +13,9 @@ KIB = 1 << 10
 MIB = 1 << 20
 
 QUIET_S = 3.0
-"""Nothing came for so long: what is missing by then is lost."""
+"""Nothing came for so long: what is missing by then is lost, or late."""
+LATE_S = 10.0
+"""The same, for what is late."""
 
 RELAYS = 3
 """So many plain relays take turns: `in_rotation`."""
@@ -31,6 +33,7 @@ class Plan:
     delivered: int = 0
     lost: int = 0
     lost_where: list[str] = field(default_factory=list)
+    late_where: list[str] = field(default_factory=list)
     peers: dict[str, str] = field(default_factory=dict)
     """Where other programs listen, by their names."""
 
@@ -39,12 +42,16 @@ class Plan:
         wanted = min(60_000, 400 * MIB // max(1, size)) // (2 if fan_out > 1 else 1) / fan_out**0.5
         return max(8, int(wanted * self.scale))
 
-    def arrived(self, where: str, expected: int, got: int) -> bool:
-        """Note what arrived of what was sent; True when that is all. A round that lost something counts as nothing."""
-        self.delivered += got
-        if got != expected:
-            self.lost += expected - got
-            self.lost_where.append(f"{where}: {expected - got} of {expected}")
+    def arrived(self, where: str, expected: int, got: int, late: int = 0) -> bool:
+        """Note what arrived of what was sent, and what when nobody waited for it any more; True when all came in time.
+        A round in which it did not counts as nothing."""
+        self.delivered += got + late
+        missing = expected - got - late
+        if missing:
+            self.lost += missing
+            self.lost_where.append(f"{where}: {missing} of {expected}")
+        if late:
+            self.late_where.append(f"{where}: {late} of {expected}, after {QUIET_S:g} s without any")
         return got == expected
 
 
