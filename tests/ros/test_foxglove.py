@@ -145,6 +145,29 @@ async def test_what_is_said_of_robots_comes_as_json(site: tuple[str, Client]) ->
     assert (stop["robot"], stop["by"]) == (7, "operator/0")
 
 
+async def test_the_graph_is_shown(site: tuple[str, Client], peer: Peer) -> None:
+    """Which robot publishes and serves what, and who receives it."""
+    _, client = site
+    await peer.publisher(String, "/chatter")
+    await peer.session.run(lambda: peer.session.node.create_service(SetBool, "/lamp", set_bool))
+    await client.send(op="subscribeConnectionGraph")
+    shown: dict[str, list[str]] = {}
+
+    def shows(topic: str, ids: str) -> list[str]:
+        for said in client.said:
+            for each in said.get("publishedTopics", []) + said.get("subscribedTopics", []):
+                shown.update({f"{each['name']} {key}": each[key] for key in each if key != "name"})
+            for each in said.get("advertisedServices", []) if said["op"] == "connectionGraphUpdate" else []:
+                shown[f"{each['name']} providerIds"] = each["providerIds"]
+        return shown.get(f"{topic} {ids}", [])
+
+    await client.subscribe(1, "/7/chatter")
+    await until(lambda: shows("/7/chatter", "publisherIds") == ["robot 7"])
+    await until(lambda: shows("/7/lamp", "providerIds") == ["robot 7"])
+    (receiver,) = await until(lambda: shows("/7/chatter", "subscriberIds"))
+    assert receiver.startswith("unity/")
+
+
 async def test_nobody_moves_a_robot_unless_the_server_was_told_so(site: tuple[str, Client], peer: Peer) -> None:
     """Without --publish no client can: any web page on the machine is one. Nothing is registered, no service shown."""
     _, client = site

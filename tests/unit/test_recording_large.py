@@ -15,6 +15,7 @@ from mcap.records import ChunkIndex
 
 from bridge.recording.bag import Bag
 from bridge.recording.mcap_file import McapFile
+from bridge.recording.serving.folder import Folder
 from tests.support.bags import BEGIN
 from tests.support.programs import ROOT
 
@@ -103,6 +104,21 @@ def test_it_is_listed(large: Path) -> None:
     assert f'"bytes": {large.stat().st_size}' in said
     assert '"messages": 5120' in said or '"messages": 51' in said
     assert used < 100
+
+
+def test_of_ten_gigabytes_the_index_is_read(large: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To list it, and to say what it has, a few hundred kilobytes are read, whatever its size: that takes no time."""
+    really, read = Bag._read, []
+
+    def counted(bag: Bag, at: int, size: int) -> bytes:
+        read.append(size)
+        return really(bag, at, size)
+
+    monkeypatch.setattr(Bag, "_read", counted)
+    (listed,) = Folder(large.parent).listed(())
+    assert (listed["state"], listed["bytes"], listed["channels"]) == ("whole", large.stat().st_size, TOPICS)
+    assert listed["messages"] > SIZE // (PICTURE + 1000)
+    assert 0 < sum(read) < 1 << 20
 
 
 def test_it_is_played(large: Path) -> None:
