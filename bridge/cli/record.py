@@ -9,6 +9,9 @@ or when the disk is full; after a crash `macs bag repair` keeps all that was on 
 whom [record] allow names), and by itself at a stop or when a dead-man acts (--on). A program asks by kill -USR2: that
 is refused after [record] ring_files files, and a line says what became of it.
 
+With --traces N one in N messages of each robot, and of commands, is marked on its way, and /macs/traces has how long
+each hop took, as macs trace prints it.
+
 --serve FOLDER is a recorder that a gateway's page asks ([gateway] recordings = "FOLDER"): start, stop, write the ring,
 list, download, replay. It says nothing by itself and records what it is asked to, but for the ring of --ring.
 
@@ -36,9 +39,11 @@ from typing import TYPE_CHECKING
 
 from bridge.cli import amounts, options, output, running
 from bridge.cli.amounts import pattern, seconds, size
+from bridge.cli.named import number
 from bridge.settings import Settings
 from macs_zenoh.errors import MissingExtra, UsageError
 from macs_zenoh.plain import plain
+from macs_zenoh.protocol.trace import MOST_EVERY
 
 if TYPE_CHECKING:
     from bridge.recording.program import Report
@@ -54,6 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     what.add_argument("--commands", action="store_true", help="also commands as sent and carried out, calls, refusals")
     what.add_argument("--headsets", action="store_true", help="also messages between agents")
+    what.add_argument(
+        "--traces", type=number, default=0, metavar="N", help="also the way of one in N messages, hop by hop"
+    )
     where = parser.add_argument_group("where to")
     where.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: macs_DATE.mcap here")
     where.add_argument("--max-size", type=size, default=0, metavar="SIZE", help="end at so much, as 500MB or 2GiB")
@@ -84,6 +92,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--on and --ring-size are for --ring TIME")
     if args.ring is not None and (args.split or args.max_size or args.max_duration):
         raise UsageError("a ring is as long as --ring says; --split, --max-size and --max-duration are for files")
+    if args.traces > MOST_EVERY:
+        raise UsageError(f"--traces: at least one in {MOST_EVERY}")
     if args.principal is not None and not args.principal.joins:
         raise UsageError("a recording is online: --as unity/5, or another agent with an id")
     settings = options.settings(args)
@@ -106,6 +116,7 @@ def _serve(args: argparse.Namespace, settings: Settings) -> int:
     what = [word for robot in args.robot for word in ("--robot", str(robot))]
     what += [word for topic in args.topics for word in ("--topics", topic)]
     what += [f"--{name}" for name in ("commands", "headsets") if getattr(args, name)]
+    what += ["--traces", str(args.traces)] if args.traces else []
     what += ["--compress", args.compress] if args.compress else []
     what += ["--as", str(args.principal)] if args.principal is not None else []
     ring = []
@@ -136,7 +147,7 @@ async def _record(args: argparse.Namespace, settings: Settings) -> int:
     path: Path = args.output or Path(time.strftime("macs_%Y-%m-%d_%H-%M-%S.mcap"))
     order = Order(
         path=path,
-        wanted=Wanted(frozenset(args.robot), tuple(args.topics), args.commands, args.headsets),
+        wanted=Wanted(frozenset(args.robot), tuple(args.topics), args.commands, args.headsets, args.traces),
         compression=args.compress or said.compress,
         max_bytes=args.max_size,
         max_s=args.max_duration,

@@ -8,21 +8,21 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from macs_zenoh.errors import MacsError, Unreachable
-from macs_zenoh.protocol import ping, trace
-from macs_zenoh.protocol.keyexpr import LEASE, PING, STREAM, UNICAST, block_of
+from macs_zenoh.errors import Unreachable
+from macs_zenoh.protocol import trace
+from macs_zenoh.protocol.keyexpr import STREAM, UNICAST, block_of
 from macs_zenoh.protocol.messages import ROS, node_name
 from macs_zenoh.protocol.offers import absolute
 from macs_zenoh.protocol.trace import ROUTER, Hop, Offset, Point, Report, TraceRequest, at_share
 from macs_zenoh.topics import TopicSubscription
 
 from .echo import subscribed
+from .programs import Programs
 from .site import Site
 
 POLL_S = 0.2
-ASK_S = 3.0
+HOLDS_S = 3.0
 """So long each request holds; it is repeated while traces are collected."""
-PINGS = 10
 MOST_OTHERS = 50
 """Of agents that are behind no gateway so many are asked to mark what they send."""
 WARM = 2
@@ -99,7 +99,9 @@ class Tracing:
         if found is None:
             raise Unreachable(f"robot {robot}", "it is not online (macs ls)")
         self._robot_zid = found.zid
-        self._names: dict[str, str] = {found.zid: f"robot {robot}", self._mesh.zid: "here"}
+        self._programs = Programs(self._mesh, site.timeout_s)
+        self._names = self._programs.names
+        self._names[found.zid] = f"robot {robot}"
         self._looking: list[Noting] = []
         self._marking: list[str] = []
         """Sessions of those who put what is traced."""
@@ -116,11 +118,7 @@ class Tracing:
 
     async def begin(self) -> None:
         """Find who marks and who notes, and receive the topic here. Raises Unreachable, Refused, UsageError."""
-        leases = [LEASE.parse(key) for key in await self._mesh.tokens(LEASE.every(), timeout_s=self._site.timeout_s)]
-        gateways = sorted({lease.zid for lease in leases if lease is not None})
-        for zid in gateways:
-            pong = await self._pong(zid)
-            self._names[zid] = f"gateway {pong.address}" if pong is not None and pong.address else f"gateway {zid[:8]}"
+        gateways = await self._programs.gateways()
         if self._commands:
             others = dict.fromkeys(agent.zid for agent in self._site.agent.online())
             putting = dict.fromkeys([*gateways, *list(others)[:MOST_OTHERS]])
@@ -158,12 +156,12 @@ class Tracing:
         deadline = time.monotonic() + seconds
         marked_s = 0.0
         while time.monotonic() < deadline:
-            if time.monotonic() - marked_s > ASK_S / 3:
+            if time.monotonic() - marked_s > HOLDS_S / 3:
                 marked_s = time.monotonic()
                 mark = TraceRequest(
-                    put=self._key, every=self._every, look=False, seconds=ASK_S, commands=self._commands
+                    put=self._key, every=self._every, look=False, seconds=HOLDS_S, commands=self._commands
                 )
-                await asyncio.gather(*(self._ask(zid, mark) for zid in self._marking))
+                await asyncio.gather(*(self._programs.ask(zid, mark) for zid in self._marking))
             await self._poll()
             if count is not None and any(len(noting.reports) >= count + WARM for noting in self._looking):
                 return
@@ -171,29 +169,13 @@ class Tracing:
 
     async def _poll(self) -> None:
         answers = await asyncio.gather(
-            *(self._ask(each.zid, TraceRequest(seconds=ASK_S, after=each.after)) for each in self._looking)
+            *(self._programs.ask(each.zid, TraceRequest(seconds=HOLDS_S, after=each.after)) for each in self._looking)
         )
         for noting, answer in zip(self._looking, answers, strict=True):
             for report in answer.reports if answer is not None else ():
                 noting.after = max(noting.after, report.number)
                 if report.key.startswith(self._key):
                     noting.reports.append(report)
-
-    async def _ask(self, zid: str, request: TraceRequest) -> trace.TraceAnswer | None:
-        asked = trace.encode_request(request)
-        try:
-            if zid == self._mesh.zid:
-                return trace.decode_answer(self._mesh.tracing.answer(asked))
-            answer = await self._mesh.query(PING.of(zid=zid), asked, timeout_s=ASK_S)
-            return trace.decode_answer(ping.decode(answer)[1])
-        except MacsError:
-            return None
-
-    async def _pong(self, zid: str) -> ping.Pong | None:
-        try:
-            return ping.decode(await self._mesh.query(PING.of(zid=zid), b"", timeout_s=self._site.timeout_s))[0]
-        except MacsError:
-            return None
 
     # -- what follows --------------------------------------------------------------------------------------------
 
@@ -202,25 +184,8 @@ class Tracing:
         await self._poll()
         reports = [report for noting in self._looking for report in noting.reports]
         programs = {clock for report in reports for name, _, clock in report.points if name != ROUTER}
-        clocks = {zid: await self._compared(zid) for zid in programs}
+        clocks = {zid: await self._programs.clock(zid) for zid in programs}
         return [traced for noting in self._looking for traced in self._ways(noting, clocks)]
-
-    async def _compared(self, zid: str) -> Offset:
-        """The clock of a program against ours; no difference is assumed where that is possible."""
-        if zid == self._mesh.zid:
-            return Offset(0.0, 0.0)
-        best = Offset()
-        for _ in range(PINGS):
-            sent_ns = time.time_ns()
-            pong = await self._pong(zid)
-            heard_ns = time.time_ns()
-            if pong is None:
-                return best
-            within_ns = (heard_ns - sent_ns) / 2
-            if best.within_ns is None or within_ns < best.within_ns:
-                best = Offset(pong.time_s * 1e9 - (sent_ns + heard_ns) / 2, within_ns)
-        same = best.within_ns is not None and abs(best.ahead_ns) <= best.within_ns
-        return Offset(0.0, best.within_ns) if same else best
 
     def _ways(self, noting: Noting, clocks: Mapping[str, Offset]) -> Iterator[Traced]:
         """Messages that passed the same points, each such way by itself."""

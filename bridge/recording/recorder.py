@@ -18,6 +18,7 @@ from bridge.recording.follower import RobotFollower
 from bridge.recording.schema_source import Schemas
 from bridge.recording.sent import SentCommands
 from bridge.recording.streams import MESSAGES, NOTES, OFFERS, PRESENCE, Channel
+from bridge.recording.traced import Traces
 from bridge.recording.traffic import Said, Sent, Traffic
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError, Unreachable, WireError
@@ -48,12 +49,14 @@ class Wanted:
         commands: what is sent to robots as commands and calls, what they answer and refuse, and the topics that they
             carry commands out on.
         headsets: plain messages between agents as well.
+        traces: the way of one in so many messages, hop by hop; 0: of none.
     """
 
     robots: frozenset[int] = frozenset()
     topics: tuple[str, ...] = ()
     commands: bool = False
     headsets: bool = False
+    traces: int = 0
 
     def robot(self, robot: int) -> bool:
         """Whether this robot is wanted."""
@@ -83,6 +86,7 @@ class Recorder:
         self._json: dict[str, Channel] = {}
         self._doors = Doors(agent, self._put)
         self._commands = SentCommands(sink, self.schemas, self.robots, self._doors.token)
+        self._traces: Traces | None = None
         self._watching: dict[int, asyncio.Task[None]] = {}
         self._asked: dict[int, asyncio.Event] = {}
         self._subscribed: list[Any] = []
@@ -101,11 +105,23 @@ class Recorder:
                 self._subscribed.append(self.agent.mesh.subscribe(key, self._heard))
         self.agent.on_presence(self._presence)
         self.agent.on_id(self._id_changed)
+        if self._wanted.traces:
+            self._traces = Traces(
+                self.agent,
+                self._wanted.traces,
+                self.robots,
+                commands=self._wanted.commands,
+                wants=self.wants,
+                put=self._put,
+                note=self.note,
+            )
 
     def close(self) -> None:
         """Hear no more; robots are told."""
         for task in self._watching.values():
             task.cancel()
+        if self._traces is not None:
+            self._traces.close()
         self._commands.close()
         self._doors.close()
         for subscription in self._subscribed:

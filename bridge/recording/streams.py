@@ -14,7 +14,7 @@ ROS2MSG = "ros2msg"
 
 PREFIX = "/macs"
 """Before the names of all channels that are no topics of robots."""
-PRESENCE, STATUS, STOPS, CONTROL, DEADMAN, REFUSALS, DROPS, CALLS, MESSAGES, LOST, OFFERS, NOTES, TOKENS = (
+PRESENCE, STATUS, STOPS, CONTROL, DEADMAN, REFUSALS, DROPS, CALLS, MESSAGES, LOST, OFFERS, NOTES, TOKENS, TRACES = (
     f"{PREFIX}/{name}"
     for name in (
         "presence",
@@ -30,6 +30,7 @@ PRESENCE, STATUS, STOPS, CONTROL, DEADMAN, REFUSALS, DROPS, CALLS, MESSAGES, LOS
         "offers",
         "notes",
         "tokens",
+        "traces",
     )
 )
 """JSON channels: who came and left; a robot's state; and what of it changed."""

@@ -25,6 +25,7 @@ MARK_BYTES = 512
 MOST_POINTS = 24
 MOST_REPORTS = 1000
 """Reports that a program keeps until somebody asks for them."""
+MOST_EVERY = 1_000_000
 LONGEST_S = 60.0
 """So long a request holds; who wants more asks again."""
 
@@ -68,7 +69,7 @@ class Report(msgspec.Struct, frozen=True, array_like=True):
     """One message as one receiver saw it. ``number`` counts the receiver's reports; ``way`` is how the message was
     handled there, ``at once`` or ``loop``."""
 
-    number: int
+    number: Count
     mark: int
     key: str
     way: str
@@ -95,7 +96,7 @@ def decode_request(asked: bytes) -> TraceRequest:
         request = msgspec.json.decode(asked[len(PREFIX) :], type=TraceRequest)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise BadJson("a request for traces", str(error)) from None
-    if not 1 <= request.every <= 1_000_000:
+    if not 1 <= request.every <= MOST_EVERY:
         raise BadField("every", f"it is {request.every}")
     if not 0 < request.seconds <= LONGEST_S:
         raise BadField("seconds", f"it is {request.seconds}, and at most {LONGEST_S:g} are allowed")

@@ -45,6 +45,7 @@ class Robot:
         agent.serve("add_node", self._add)
         agent.serve("remove_node", self._nothing)
         agent.serve("offers", self._offers)
+        agent.serve("definitions", self._nothing)
 
     async def _add(self, call: macs_zenoh.Call) -> bytes:
         self.registrants.add(decode_data(AddNode, call.data).registrant_agent_id)

@@ -104,3 +104,14 @@ def test_requests_and_answers_are_bounded() -> None:
     for wrong in (b"{", b"[1]", b'{"reports": [[1]]}', b"\xff"):
         with pytest.raises(WireError):
             trace.decode_answer(wrong)
+
+
+@pytest.mark.parametrize("number", [-1, 1 << 63])
+def test_numbers_and_times_that_are_none(number: int) -> None:
+    """What a program tells may be made up: an answer with such a time, or such a count, is none."""
+    for report in (
+        Report(1, 2, "macs/from/ros/7/nd__x", "loop", [(PUT, number, "ab")]),
+        Report(number, 2, "macs/from/ros/7/nd__x", "loop", []),
+    ):
+        with pytest.raises(BadJson):
+            trace.decode_answer(trace.encode_answer(TraceAnswer([report])))
