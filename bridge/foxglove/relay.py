@@ -42,6 +42,8 @@ MESSAGE_BYTES = 16 << 20
 """Of a client."""
 TEXT_BYTES = 256 << 10
 """Of what a client says besides the data of topics and calls."""
+TEXT_PARTS = 24 << 10
+"""Keys in it: all that so much text has that subscribes to channels, of which a site has thousands."""
 MESSAGES_PER_S = 1000.0
 """Of a client. Who sends more is closed: what would wait here is commands that have become old."""
 TOLD_BYTES = 256 << 20
@@ -133,11 +135,15 @@ class Relay:
             return web.json_response({"error": "a valid token is wanted here: ws://…/?token=macs_…"}, status=401)
         problem = self._why_not_see(grant)
         if problem is not None:
+            self.drops.once("client_not_allowed", "%s is refused: %s", request.remote, problem)
             return web.json_response({"error": problem}, status=403)
         host = of_peer(request.remote or "?")
         from_there = sum(client.host == host for client in self._clients)
         if len(self._clients) >= CLIENTS or from_there >= CLIENTS_PER_ADDRESS:
-            return web.json_response({"error": f"{len(self._clients)} look already"}, status=503)
+            name = "too_many_connections" if len(self._clients) >= CLIENTS else "too_many_from_address"
+            problem = f"{len(self._clients)} look already, {from_there} from there"
+            self.drops.once(name, "%s is refused: %s", host, problem)
+            return web.json_response({"error": problem}, status=503)
         here = web.WebSocketResponse(
             protocols=SUBPROTOCOLS, heartbeat=20.0, compress=False, max_msg_size=MESSAGE_BYTES
         )
@@ -216,12 +222,13 @@ class Relay:
                 await self._binary(client, there, message.data)
             elif message.type == WSMsgType.TEXT:
                 try:
-                    said = json_object("a message", judged("a message", message.data.encode(), TEXT_BYTES))
+                    said = json_object("a message", judged("a message", message.data.encode(), TEXT_BYTES, TEXT_PARTS))
                     op = said["op"]
                     if not isinstance(op, str):
                         raise BadJson("a message", "its op is no text")
                 except (WireError, KeyError) as error:
                     self.drops.once("bad_json", "a client says what is no message of Foxglove's: %s", error)
+                    await self._tell(client, f"this is dropped: {error}")
                     continue
                 if op == "advertise":
                     said["channels"] = await self._advertised(client, said)
@@ -237,6 +244,9 @@ class Relay:
                         await there.send_str(json.dumps({"op": op, "channelIds": numbers}))
                 elif op in PASSED:
                     await there.send_str(message.data)
+                else:
+                    self.drops.once("unknown_op", "a client says %r, which nobody here does", op[:80])
+                    await self._tell(client, f"nobody here does {op[:80]}")
 
     async def _advertised(self, client: _Client, said: dict[str, Any]) -> list[Any]:
         """Of the channels that a client will publish to, those that it may."""
@@ -285,7 +295,11 @@ class Relay:
 
     async def _refuse(self, client: _Client, topic: str, why: str) -> None:
         self.drops.once("client_not_allowed", "%s is not published to: %s", topic, why)
-        status = {"op": "status", "level": 1, "message": f"{topic[:200]}: {why}", "id": topic[:200]}
+        await self._tell(client, f"{topic[:200]}: {why}", id=topic[:200])
+
+    async def _tell(self, client: _Client, problem: str, **about: str) -> None:
+        """In Foxglove's own list of problems."""
+        status = {"op": "status", "level": 1, "message": problem, **about}
         await client.here.send_str(json.dumps(status))
 
 

@@ -18,14 +18,14 @@ from .limits import ANSWER_BYTES, ANSWER_PARTS, JSON_FIELDS, JSON_PARTS, METADAT
 StructT = TypeVar("StructT", bound=Struct)
 
 
-def judged(what: str, data: bytes | bytearray | memoryview, max_bytes: int) -> bytes:
+def judged(what: str, data: bytes | bytearray | memoryview, max_bytes: int, max_parts: int = JSON_PARTS) -> bytes:
     """The same bytes, if they may be parsed: not too many, and not made of too many parts. Raises TooLong or BadJson,
     which name ``what``."""
     if len(data) > max_bytes:
         raise TooLong(what, len(data), max_bytes)
     data = bytes(data)
     if len(data) > METADATA_BYTES:
-        keys, nested, most = data.count(b":"), data.count(b"[") + data.count(b"{"), JSON_PARTS
+        keys, nested, most = data.count(b":"), data.count(b"[") + data.count(b"{"), max_parts
         if max_bytes >= ANSWER_BYTES:
             keys, most = keys + nested + data.count(b","), ANSWER_PARTS
         if (parts := max(keys, nested)) > most:

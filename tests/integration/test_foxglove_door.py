@@ -61,6 +61,7 @@ class Site:
         self.live = live
         self.inside = inside
         self.secret = secret
+        self.relay: Relay
         self.port = 0
 
     def token(self, name: str, **rights: Any) -> str:
@@ -107,6 +108,7 @@ async def started(tmp_path: Path, *, publish: bool, with_tokens: bool) -> AsyncI
         relay = Relay(
             site.inside, context, secret, tokens=watch, origins=["https://app.example"], names=["hall"], robots={7}
         )
+        site.relay = relay
         site.port = await relay.open("127.0.0.1", 0, None)
         if watch is not None:
             watch.start()
@@ -245,12 +247,15 @@ async def test_bad_input_costs_that_message(tmp_path: Path) -> None:
             '{"op": {"a": 1}}',
             '{"op": "subscribe", "x": ["%s"]}' % ("x" * TEXT_BYTES),
             '{"op": "advertise", "channels": [%s]}' % ("[]," * 80_000 + "1"),
-            '{"op": "advertise"}',
-            '{"op": "advertise", "channels": [1, {}]}',
         ):
             await socket.send_str(text)
-        for text in ('{"op": "unadvertise", "channelIds": [[1]]}', '{"op": "setParameters"}', "[" * 100_000):
+            assert (await said(socket, "status"))["message"]
+        for text in ('{"op": "advertise"}', '{"op": "advertise", "channels": [1, {}]}'):
             await socket.send_str(text)
+        await socket.send_str('{"op": "unadvertise", "channelIds": [[1]]}')
+        for text in ('{"op": "setParameters"}', "[" * 100_000):
+            await socket.send_str(text)
+            assert (await said(socket, "status"))["message"]
         for data in (b"", b"\x01", b"\x02\x00", b"\xff" * 100, published(77, b"")):
             await socket.send_bytes(data)
         await socket.send_str(json.dumps({"op": "advertise", "channels": [channel(1, "/7/cmd_vel")]}))
@@ -261,6 +266,19 @@ async def test_bad_input_costs_that_message(tmp_path: Path) -> None:
 
         await until(arrived, every_s=0.1)
         assert set(site.robot.commands) == {b"\0\1\0\0good"}
+
+
+async def test_somebody_looks_at_thousands_of_channels_at_once(tmp_path: Path) -> None:
+    """What has so many keys is passed on, and what is too much is dropped, counted, and told."""
+    async with started(tmp_path, publish=False, with_tokens=False) as site, site.client() as socket:
+        many = [{"id": number, "channelId": 100_000 + number} for number in range(2048)]
+        # that it has no such channel the SDK says of each, and so often it may not: it reads the first one alone
+        await socket.send_str(json.dumps({"op": "subscribe", "subscriptions": many[:1], "others": many[1:]}))
+        assert "100000" in (await said(socket, "status"))["message"]
+        assert site.relay.drops == {}
+        await socket.send_str(json.dumps({"op": "subscribe", "subscriptions": many * 20}))
+        assert "this is dropped" in (await said(socket, "status"))["message"]
+        assert site.relay.drops == {"bad_json": 1}
 
 
 async def test_who_floods_is_closed(tmp_path: Path) -> None:
@@ -296,6 +314,7 @@ async def test_one_address_does_not_take_all_places(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(door, "CLIENTS_PER_ADDRESS", 2)
     async with started(tmp_path, publish=False, with_tokens=False) as site, site.client(), site.client():
         assert await site.status() == 503
+        assert site.relay.drops == {"too_many_from_address": 1}
         elsewhere = aiohttp.TCPConnector(local_addr=("127.0.0.2", 0))
         async with (
             aiohttp.ClientSession(connector=elsewhere) as session,
