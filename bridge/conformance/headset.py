@@ -19,7 +19,7 @@ from .checks import Level, Verdict, Verdicts
 from .client_frames import ClientFrames, Kind, Node, Said
 from .headset_checks import CHECKS as CHECKS
 from .headset_checks import IGNORED, WELCOMES
-from .headset_sessions import Sessions, registered
+from .headset_sessions import AGAIN_S, Sessions, registered
 from .router import Client, Router, cdr_for
 from .vectors import Value
 
@@ -31,7 +31,6 @@ MOST_S = 55.0
 """Checks that would come later are skipped: so many fail then that the first of them tell enough."""
 _SETTLE_S = 0.7
 _SETTLED_S = 3.0
-_AGAIN_S = 10.0
 _BEAT_S = 7.5
 _LOOKS = 3
 _LARGE_BYTES = 1 << 20
@@ -61,6 +60,7 @@ class Judge:
         self._frames = frames
         self._verdicts = verdicts
         self._patience_s = patience_s
+        self._again_s = max(AGAIN_S, patience_s)
         self._request = 1000
         self._client: Client
         self._program = program
@@ -201,7 +201,7 @@ class Judge:
     async def _anew(self, why: str) -> None:
         """Make it connect again, after a check that cost its connection. Raises Gone."""
         self._client.abort()
-        client = await self._router.next(_AGAIN_S)
+        client = await self._router.next(self._again_s)
         if client is None:
             client = await self._started_again(f"it made no new connection after {why}")
         self._client = client
@@ -370,8 +370,8 @@ class Judge:
         await self._closed_at_once()
 
     async def _joins_again(self, name: str, agent_id: int) -> None:
-        client = await self._router.next(_AGAIN_S)
-        if not self._verdicts.hold(name, client is not None, f"it did not within {_AGAIN_S:g} s"):
+        client = await self._router.next(self._again_s)
+        if not self._verdicts.hold(name, client is not None, f"it did not within {self._again_s:g} s"):
             client = await self._started_again(f"it made no new connection ({name})")
         assert client is not None
         self._client, self._frames.id = client, 0

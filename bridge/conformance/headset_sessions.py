@@ -24,7 +24,8 @@ NAMES = (
     "sessions.registers_nothing",
     "sessions.forgotten",
 )
-_AGAIN_S = 10.0
+AGAIN_S = 10.0
+"""By when it makes a new connection, at the least."""
 _QUIET_S = 0.5
 
 
@@ -111,7 +112,7 @@ class Sessions:
 
     async def _comes(self, agent_id: int) -> tuple[Client, Said] | None:
         """Its next connection, with its configuration there."""
-        client = await self._router.next(_AGAIN_S)
+        client = await self._router.next(max(AGAIN_S, self._patience_s))
         if client is None:
             return None
         self._frames.given.add(agent_id)

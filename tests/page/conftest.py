@@ -1,4 +1,8 @@
-"""A whole site for pages: router, gateway, the demo robot and its agent as processes, and browsers."""
+"""A whole site for pages: router, gateway, the demo robot and its agent as processes, and browsers.
+
+All tests here run in one loop: a worker has one browser of each kind, in which each test has contexts of its own, and
+the tests of a module that leave its site as it was share it.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,15 @@ import itertools
 import math
 import os
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import AsyncExitStack
-from dataclasses import dataclass, field
+from collections.abc import AsyncIterator, Awaitable, Callable, Generator
+from contextlib import AsyncExitStack, suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+import pytest_asyncio
 
 from bridge.tokens import store
 from macs_zenoh.protocol.rights import Rights
@@ -41,6 +47,55 @@ for _ in range((os.getpid() + worker_number() * 7) % DOMAINS):
     next(_domains)
 
 
+FAILED = pytest.StashKey[bool]()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """One loop for all of them."""
+    for item in items:
+        if item.path.parent == Path(__file__).parent and pytest_asyncio.is_async_test(item):
+            item.add_marker(pytest.mark.asyncio(loop_scope="session"), append=False)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Remember that a test failed: who knows what it has left."""
+    report = yield
+    item.stash[FAILED] = item.stash.get(FAILED, False) or report.failed
+    return report
+
+
+Chromium = Callable[..., Awaitable["Browser"]]
+
+
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
+async def chromium() -> AsyncIterator[Chromium]:
+    """The browser with these arguments, started once."""
+    found: dict[tuple[str, ...], Browser] = {}
+    async with AsyncExitStack() as stack:
+
+        async def get(*arguments: str) -> Browser:
+            if arguments not in found or not found[arguments].is_connected():
+                found[arguments] = await stack.enter_async_context(browser(*arguments))
+            return found[arguments]
+
+        yield get
+
+
+@dataclass
+class Gate:
+    """Gateways without a robot: the second one wants a token."""
+
+    chromium: Chromium
+    ports: tuple[int, int]
+    secret: str
+    pages: list[Watched] = field(default_factory=list)
+
+    def url_of(self, *, wanted: bool) -> str:
+        """Of the gateway that wants a token, or of the other one."""
+        return f"http://127.0.0.1:{self.ports[int(wanted)]}/"
+
+
 @dataclass
 class Site:
     """What runs, each program by itself so that it can be killed and started again."""
@@ -52,7 +107,7 @@ class Site:
     web_port: int
     domain: int
     endpoint: str
-    browser: Browser
+    chromium: Chromium
     pages: list[Watched] = field(default_factory=list)
 
     @property
@@ -63,7 +118,7 @@ class Site:
     async def open(self, path: str = "", **options: Any) -> Watched:
         """A page in a browser of its own, so far as cache and cookies go."""
         options = {"viewport": {"width": 1280, "height": 900}, "color_scheme": "dark", **options}
-        context = await self.browser.new_context(**options)
+        context = await (await self.chromium()).new_context(**options)
         page = await opened(context, self.url + path)
         self.pages.append(page)
         return page
@@ -81,44 +136,123 @@ Act = Callable[[], Awaitable[object]]
 StartSite = Callable[..., Awaitable[Site]]
 
 
-@pytest.fixture
-async def start_site(tmp_path: Path) -> AsyncIterator[StartSite]:
-    """Starts a site; ``gateway`` and ``agent`` are words for these."""
+async def started(
+    stack: AsyncExitStack,
+    folder: Path,
+    chromium: Chromium,
+    gateway: tuple[str, ...] = (),
+    rules: str = ROBOT,
+    agent: tuple[str, ...] = (),
+) -> Site:
+    """A site; ``gateway`` and ``agent`` are words for these."""
+    domain = next(_domains)
+    environment = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    endpoint, web_port = f"tcp/127.0.0.1:{free_port()}", free_port()
+    settings = folder / f"robot-{domain}.toml"
+    settings.write_text(rules)
+    words = ["--port", str(free_port()), "--web-port", str(web_port), "-e", endpoint, *gateway]
+    robot = ["--id", "1", "--settings", str(settings), "-e", endpoint, *agent]
+    return Site(
+        await stack.enter_async_context(Program("router", "-l", endpoint)),
+        await stack.enter_async_context(Program("gateway", *words)),
+        await stack.enter_async_context(Program("agent", *robot, env=environment)),
+        await stack.enter_async_context(Process(sys.executable, "-m", "bridge.cli.demo_robot", env=environment)),
+        web_port,
+        domain,
+        endpoint,
+        chromium,
+    )
+
+
+async def judged(pages: list[Watched]) -> None:
+    """Judge these pages, and close them."""
+    from playwright.async_api import Error
+
+    try:
+        for page in pages:
+            page.judge()
+    finally:
+        for page in pages:
+            with suppress(Error):  # it is closed
+                await page.page.context.close()
+
+
+@pytest_asyncio.fixture(loop_scope="session")
+async def start_site(tmp_path: Path, chromium: Chromium) -> AsyncIterator[StartSite]:
+    """Starts sites of the test's own, as `started` has it."""
     async with AsyncExitStack() as stack:
         sites: list[Site] = []
 
-        async def start(gateway: tuple[str, ...] = (), rules: str = ROBOT, agent: tuple[str, ...] = ()) -> Site:
-            domain = next(_domains)
-            environment = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-            endpoint, web_port = f"tcp/127.0.0.1:{free_port()}", free_port()
-            settings = tmp_path / f"robot-{domain}.toml"
-            settings.write_text(rules)
-            words = ["--port", str(free_port()), "--web-port", str(web_port), "-e", endpoint, *gateway]
-            robot = ["--id", "1", "--settings", str(settings), "-e", endpoint, *agent]
-            site = Site(
-                await stack.enter_async_context(Program("router", "-l", endpoint)),
-                await stack.enter_async_context(Program("gateway", *words)),
-                await stack.enter_async_context(Program("agent", *robot, env=environment)),
-                await stack.enter_async_context(
-                    Process(sys.executable, "-m", "bridge.cli.demo_robot", env=environment)
-                ),
-                web_port,
-                domain,
-                endpoint,
-                await stack.enter_async_context(browser()),
-            )
-            sites.append(site)
-            return site
+        async def start(gateway: tuple[str, ...] = (), **options: Any) -> Site:
+            sites.append(await started(stack, tmp_path, chromium, gateway, **options))
+            return sites[-1]
 
         yield start
-        for page in (page for site in sites for page in site.pages):
-            page.judge()
+        await judged([page for site in sites for page in site.pages])
 
 
-@pytest.fixture
-async def site(start_site: StartSite) -> Site:
-    """One with its usual settings."""
-    return await start_site()
+@dataclass
+class Shared:
+    """The site of a module, started for the first test and after one that failed."""
+
+    folder: Path
+    chromium: Chromium
+    rules: str
+    stack: AsyncExitStack = field(default_factory=AsyncExitStack)
+    site: Site | None = None
+
+    async def get(self) -> Site:
+        if self.site is None:
+            self.site = await started(self.stack, self.folder, self.chromium, rules=self.rules)
+        return replace(self.site, pages=[])
+
+    async def stop(self) -> None:
+        self.site = None
+        await self.stack.aclose()
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="session")
+async def shared(
+    tmp_path_factory: pytest.TempPathFactory, chromium: Chromium, request: pytest.FixtureRequest
+) -> AsyncIterator[Shared]:
+    found = Shared(tmp_path_factory.mktemp("site"), chromium, getattr(request.module, "RULES", ROBOT))
+    yield found
+    await found.stop()
+
+
+@pytest_asyncio.fixture(loop_scope="session")
+async def site(shared: Shared, request: pytest.FixtureRequest) -> AsyncIterator[Site]:
+    """The module's, which each test leaves as it was: all runs, and nothing is stopped. Its robot has the module's
+    ``RULES``."""
+    site = await shared.get()
+    yield site
+    good = False
+    try:
+        await judged(site.pages)
+        good = not request.node.stash.get(FAILED, False)
+    finally:
+        if not good:
+            await shared.stop()
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="session")
+async def gateways(tmp_path_factory: pytest.TempPathFactory, chromium: Chromium) -> AsyncIterator[Gate]:
+    secret, words = with_token(tmp_path_factory.mktemp("gate") / "tokens.json", Rights(may=["see"], robots="any"))
+    async with AsyncExitStack() as stack:
+        endpoint, ports = f"tcp/127.0.0.1:{free_port()}", (free_port(), free_port())
+        await stack.enter_async_context(Program("router", "-l", endpoint))
+        for port, more in zip(ports, ((), words), strict=True):
+            argv = ["--port", str(free_port()), "--web-port", str(port), "-e", endpoint, *more]
+            await stack.enter_async_context(Program("gateway", *argv))
+        yield Gate(chromium, ports, secret)
+
+
+@pytest_asyncio.fixture(loop_scope="session")
+async def gate(gateways: Gate) -> AsyncIterator[Gate]:
+    """The module's gateways."""
+    gate = replace(gateways, pages=[])
+    yield gate
+    await judged(gate.pages)
 
 
 async def signed_in(site: Site, secret: str) -> Watched:
@@ -130,12 +264,19 @@ async def signed_in(site: Site, secret: str) -> Watched:
     return page
 
 
-def with_token(path: Path, rights: Rights) -> tuple[str, tuple[str, ...]]:
+def with_token(path: Path, rights: Rights, name: str = "hall") -> tuple[str, tuple[str, ...]]:
     """A token with these rights in a file: its secret, and the words for a gateway that wants one."""
     secret = new_secret(os.urandom(32))
-    token = Token(name="hall", rights=rights, hashes=[hash_of(secret)])
+    token = Token(name=name, rights=rights, hashes=[hash_of(secret)])
     store.change(path, lambda tokens: (tokens.with_token(token), None))
     return secret, ("--tokens", str(path), "--without-token", "nobody")
+
+
+async def released(page: Watched) -> None:
+    """Press release, twice as it wants it; nothing is stopped then."""
+    await page.page.click("#release")
+    await page.page.click("#release")
+    await until(partial(page.value, "document.querySelector('#stop-status').textContent === ''"))
 
 
 async def says(page: Watched, selector: str, words: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator
@@ -10,7 +11,7 @@ from typing import Any
 
 from geometry_msgs.msg import Twist
 
-from tests.page.conftest import Act, Site
+from tests.page.conftest import HELD, Act, Site
 from tests.support.browser import Watched
 from tests.support.ros_peer import Peer
 
@@ -23,6 +24,26 @@ async def hold(page: Watched, across: float = 0.0, up: float = 0.8) -> None:
     await page.page.mouse.move(x, y)
     await page.page.mouse.down()
     await page.page.mouse.move(x + across * 0.38 * box["width"], y - up * 0.38 * box["height"], steps=3)
+
+
+@contextlib.asynccontextmanager
+async def held(page: Watched) -> AsyncIterator[None]:
+    """It is held all the while, anew where a busy machine lets the page stand still."""
+
+    async def hold_on() -> None:
+        while True:
+            if not await page.value(HELD):
+                await page.page.mouse.up()
+                await hold(page)
+            await asyncio.sleep(0.05)
+
+    holding = asyncio.create_task(hold_on())
+    try:
+        yield
+    finally:
+        holding.cancel()
+        await asyncio.gather(holding, return_exceptions=True)
+        await page.page.mouse.up()
 
 
 def pointer(page: Watched, across: float = 0.0, up: float = 0.8) -> tuple[Act, Act]:

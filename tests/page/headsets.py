@@ -9,25 +9,20 @@ import math
 import struct
 import time
 import zlib
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CompressedImage
 
-from tests.page.conftest import Act, Site
+from tests.page.conftest import Act, Gate, Site
 from tests.page.driving import Heard
-from tests.support.browser import ROOT, SCREENSHOTS, Watched, browser, opened
+from tests.support.browser import ROOT, SCREENSHOTS, Watched, opened
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
-
-if TYPE_CHECKING:
-    from playwright.async_api import Browser
 
 IWER = ROOT / "build" / "npm" / "node_modules" / "iwer" / "build" / "iwer.min.js"
 WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
@@ -39,6 +34,9 @@ device.installRuntime({ forceInstall: true }); // Chromium has one, without a he
 device.position.set(0, 1.6, 0.2);
 window.device = device;
 """
+SMALL = "Object.assign(window, { innerWidth: 320, innerHeight: 210 })"
+"""As large as the eyes of the emulated device are then: without graphics hardware each pixel costs the processor, and
+who drives has to be confirmed five times a second by a frame."""
 PICTURES = "/test/picture"
 PATIENT_ROBOT = """
 [robot]
@@ -167,32 +165,14 @@ class Headset:
         return path
 
 
-@dataclass
-class Gate:
-    """Gateways without a robot, with a browser: the second one wants a token."""
-
-    browser: Browser
-    ports: tuple[int, int]
-    secret: str
-    pages: list[Watched] = field(default_factory=list)
-
-    def url_of(self, *, wanted: bool) -> str:
-        """Of the gateway that wants a token, or of the other one."""
-        return f"http://127.0.0.1:{self.ports[int(wanted)]}/"
-
-
-@asynccontextmanager
-async def with_webgl(site: Site) -> AsyncIterator[Site]:
-    """A site whose browser has WebGL."""
-    async with browser(*WEBGL) as found:
-        site.browser = found
-        yield site
-
-
-async def headset_at(site: Site | Gate, settings: dict[str, Any] | None = None, *, wanted: bool = False) -> Headset:
+async def headset_at(
+    site: Site | Gate, settings: dict[str, Any] | None = None, *, wanted: bool = False, small: bool = True
+) -> Headset:
     """A headset that has opened the scene, with these settings; ``wanted``: where a token is."""
-    context = await site.browser.new_context(viewport={"width": 640, "height": 420})
+    context = await (await site.chromium(*WEBGL)).new_context(viewport={"width": 640, "height": 420})
     await context.add_init_script(path=IWER)
+    if small:
+        await context.add_init_script(script=SMALL)
     kept = json.dumps(json.dumps({**PATIENT, **(settings or {})}))
     await context.add_init_script(
         script=f"{DEVICE}\nlocalStorage.getItem('macs.xr') ?? localStorage.setItem('macs.xr', {kept})"

@@ -16,10 +16,9 @@ from bridge.conformance.program import Command
 from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.wire import Frame
 from tests.support.browser import STATIC, needs_browser, needs_node, node
+from tests.support.waiting import PATIENCE_S
 
 HERE = Path(__file__).parent
-PATIENCE_S = 8.0
-"""As long as a loaded machine may take."""
 
 
 def ran(script: str, given: object) -> Any:
@@ -73,7 +72,7 @@ def failed(verdicts: list[Verdict]) -> dict[str, str]:
 async def judged(command: str) -> list[Verdict]:
     program = Command(command)
     try:
-        return await headset.judge("127.0.0.1", 0, patience_s=PATIENCE_S, most_s=150, program=program, web=True)
+        return await headset.judge("127.0.0.1", 0, patience_s=PATIENCE_S, most_s=250, program=program, web=True)
     finally:
         await program.stop()
 

@@ -16,9 +16,10 @@ pytest.importorskip("rclpy")
 from bridge.tokens import store
 from macs_zenoh.protocol.rights import Rights
 from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
-from tests.page.conftest import Site, StartSite, driven, says, still
-from tests.page.driving import GAMEPAD, heard_at, hold, key, pointer
+from tests.page.conftest import HELD, Site, StartSite, driven, released, says, still
+from tests.page.driving import GAMEPAD, heard_at, held, hold, key, pointer
 from tests.support.browser import AXE, OFFLINE, SCREENSHOTS, Watched, needs_browser
+from tests.support.thorough import some
 from tests.support.waiting import until
 
 pytestmark = needs_browser
@@ -141,32 +142,37 @@ async def test_a_network_that_stands_still_gets_no_more_commands(site: Site) -> 
     dead-man stops it, and what comes through late is little."""
     async with heard_at(site) as heard:
         page = await site.with_robot()
-        await hold(page)
-        await until(lambda: len(heard.speeds) > 5 and heard.last > 0)
-        site.gateway.send_signal(signal.SIGSTOP)
-        try:
-            await until(lambda: says(page, "#drive-hint", "not fresh"))
+        for _ in range(6):  # a page that stood still has let go for that
+            heard.speeds.clear()
+            await hold(page)
+            await until(lambda: len(heard.speeds) > 5 and heard.last > 0)
+            site.gateway.send_signal(signal.SIGSTOP)
+            try:
+                await until(partial(page.value, f"!{HELD}"))
+                hint = await text(page, "#drive-hint")
+                await until(lambda: heard.last == 0.0)
+                stopped = len(heard.speeds)
+            finally:
+                site.gateway.send_signal(signal.SIGCONT)
+            await page.page.wait_for_selector('#pad[aria-disabled="false"]')
             await until(lambda: heard.last == 0.0)
-            stopped = len(heard.speeds)
-        finally:
-            site.gateway.send_signal(signal.SIGCONT)
-        await page.page.wait_for_selector('#pad[aria-disabled="false"]')
-        await until(lambda: heard.last == 0.0)
-        assert sum(speed > 0 for speed in heard.speeds[stopped:]) <= 6  # 200 ms of them were on their way
-        await page.page.mouse.up()
+            assert sum(speed > 0 for speed in heard.speeds[stopped:]) <= 6  # 200 ms of them were on their way
+            await page.page.mouse.up()
+            if "not fresh" in hint:
+                break
+        assert "not fresh" in hint
 
 
 async def test_who_has_control_is_respected(site: Site) -> None:
     """While one page drives another may not, and says who does; when that has let go for a while it may."""
     one, two = await site.with_robot(), await site.with_robot()
-    await hold(one)
-    await until(lambda: says(two, "#drive-hint", "has control"))
-    before = await two.value("macsPage.headset.nodes.find((node) => node.name === '/cmd_vel').unsent")
-    await hold(two)
-    assert await two.page.get_attribute("#pad", "aria-disabled") == "true"
-    assert await two.value("macsPage.headset.nodes.find((node) => node.name === '/cmd_vel').unsent") == before
-    await two.page.mouse.up()
-    await one.page.mouse.up()
+    async with held(one):
+        await until(lambda: says(two, "#drive-hint", "has control"))
+        before = await two.value("macsPage.headset.nodes.find((node) => node.name === '/cmd_vel').unsent")
+        await hold(two)
+        assert await two.page.get_attribute("#pad", "aria-disabled") == "true"
+        assert await two.value("macsPage.headset.nodes.find((node) => node.name === '/cmd_vel').unsent") == before
+        await two.page.mouse.up()
     await two.page.wait_for_selector('#pad[aria-disabled="false"]', timeout=60_000)
     await driven(two, *pointer(two))
     await two.page.mouse.up()
@@ -209,6 +215,7 @@ async def test_a_stop_that_finds_no_connection_is_sent_later(site: Site) -> None
     await until(lambda: says(page, "#stop-status", "no connection"))
     await site.gateway.start()
     await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
+    await released(page)
 
 
 async def test_a_service_is_called_with_a_form(site: Site) -> None:
@@ -314,7 +321,7 @@ async def test_it_offers_what_the_token_permits(start_site: StartSite, tmp_path:
         assert not await page.page.is_visible(hidden), hidden
 
 
-SIZES = [(390, 844), (1280, 900), (1920, 1080)]
+LOOKS = [(scheme, *size) for scheme in ("dark", "light") for size in ((390, 844), (1280, 900), (1920, 1080))]
 
 
 async def test_it_can_be_used_by_everybody(site: Site) -> None:
@@ -324,24 +331,23 @@ async def test_it_can_be_used_by_everybody(site: Site) -> None:
         pytest.skip("axe-core is missing: make page")
     SCREENSHOTS.mkdir(parents=True, exist_ok=True)
     faults: list[str] = []
-    for scheme in ("dark", "light"):
-        for width, height in SIZES:
-            page = await site.with_robot(viewport={"width": width, "height": height}, color_scheme=scheme)
-            await page.value(AXE.read_text(encoding="utf-8"))
-            for view, shown in (("robot", CAMERA), ("mesh", "#mesh svg.mesh g.robot"), ("latency", "#hops tbody tr")):
-                await page.value(f"location.hash = '{view}'")
-                await page.page.wait_for_selector(shown)
-                assert await page.page.locator("#stop").is_visible()
-                await page.page.screenshot(path=SCREENSHOTS / f"{view}-{width}-{scheme}.png")
-                assert await page.value("document.documentElement.scrollWidth <= innerWidth"), f"{view} {width}"
-                found = await page.value("axe.run().then(({violations}) => violations)")
-                faults += [
-                    f"{view} {width} {scheme}: {each['id']}: {node['html'][:200]}"
-                    for each in found
-                    if each["impact"] in ("serious", "critical")
-                    for node in each["nodes"]
-                ]
-            await page.page.context.close()
+    for scheme, width, height in some(LOOKS):
+        page = await site.with_robot(viewport={"width": width, "height": height}, color_scheme=scheme)
+        await page.value(AXE.read_text(encoding="utf-8"))
+        for view, shown in (("robot", CAMERA), ("mesh", "#mesh svg.mesh g.robot"), ("latency", "#hops tbody tr")):
+            await page.value(f"location.hash = '{view}'")
+            await page.page.wait_for_selector(shown)
+            assert await page.page.locator("#stop").is_visible()
+            await page.page.screenshot(path=SCREENSHOTS / f"{view}-{width}-{scheme}.png")
+            assert await page.value("document.documentElement.scrollWidth <= innerWidth"), f"{view} {width}"
+            found = await page.value("axe.run().then(({violations}) => violations)")
+            faults += [
+                f"{view} {width} {scheme}: {each['id']}: {node['html'][:200]}"
+                for each in found
+                if each["impact"] in ("serious", "critical")
+                for node in each["nodes"]
+            ]
+        await page.page.context.close()
     assert faults == []
 
 

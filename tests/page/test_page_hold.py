@@ -10,28 +10,25 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import pytest_asyncio
 
 pytest.importorskip("rclpy")
 
 from macs_zenoh.protocol.rights import Rights
-from tests.page.conftest import HELD, Site, StartSite, says, signed_in, with_token
+from tests.page.conftest import HELD, Site, StartSite, released, says, signed_in, with_token
 from tests.page.driving import GAMEPAD, Heard, heard_at, hold
 from tests.support.browser import Watched, needs_browser
 from tests.support.waiting import until
 
 pytestmark = needs_browser
+RULES = ""
+"""The robot keeps its last speed, whatever happens."""
 
 AXES_FORWARD = f"navigator.getGamepads = () => [{GAMEPAD}]"
 NO_GAMEPAD = "navigator.getGamepads = () => []"
 
 
-@pytest.fixture
-async def site(start_site: StartSite) -> Site:
-    """One whose robot keeps its last speed, whatever happens."""
-    return await start_site(rules="")
-
-
-@pytest.fixture
+@pytest_asyncio.fixture(loop_scope="session")
 async def heard(site: Site) -> AsyncIterator[Heard]:
     """What its robot is told."""
     async with heard_at(site) as heard:
@@ -135,6 +132,7 @@ async def test_a_pressed_stop_ends_a_hold(site: Site, heard: Heard) -> None:
         site.agent.send_signal(signal.SIGCONT)
     await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
     await page.page.mouse.up()
+    await released(page)
 
 
 async def test_a_zero_comes_through_a_network_that_stood_still(site: Site, heard: Heard) -> None:

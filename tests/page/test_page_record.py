@@ -10,7 +10,7 @@ import pytest
 
 from bridge.recording.bag import Bag
 from macs_zenoh.protocol.rights import Rights
-from tests.page.conftest import StartSite, says, signed_in, with_token
+from tests.page.conftest import StartSite, released, says, signed_in, with_token
 from tests.support.browser import needs_browser
 from tests.support.programs import Program
 from tests.support.waiting import until
@@ -45,9 +45,7 @@ async def test_a_stop_is_recorded_found_and_played(start_site: StartSite, tmp_pa
         )
         await page.click("#stop")
         await until(lambda: says(watched, "#stop-status", "robot 1 stopped"))
-        await page.click("#release")
-        await page.click("#release")
-        await until(partial(watched.value, "document.querySelector('#stop-status').textContent === ''"))
+        await released(watched)
         await page.click("#record-stop:enabled")
         row = await page.wait_for_selector("#recordings-list tr[data-state=whole]")
         assert row is not None
@@ -73,13 +71,15 @@ async def test_a_stop_is_recorded_found_and_played(start_site: StartSite, tmp_pa
         await page.wait_for_selector("#recordings-list tr[data-name^=ring_asked]", timeout=60_000)
 
 
-@pytest.mark.parametrize("may", [["see"], ["see", "record"]])
-async def test_the_tab_is_for_who_may_record(start_site: StartSite, tmp_path: Path, may: list[str]) -> None:
+async def test_the_tab_is_for_who_may_record(start_site: StartSite, tmp_path: Path) -> None:
     """A token without the right does not see it; with it, and without a recorder, the page says that there is none."""
-    secret, words = with_token(tmp_path / "tokens.json", Rights(may=may, robots="any"))  # type: ignore[arg-type]
+    path = tmp_path / "tokens.json"
+    sees, words = with_token(path, Rights(may=["see"], robots="any"), "sees")
+    records, _ = with_token(path, Rights(may=["see", "record"], robots="any"), "records")
     site = await start_site((*words, *with_recorder(tmp_path / "recordings")))
-    page = await signed_in(site, secret)
-    assert await page.value("!!document.querySelector(\"a[href='#recordings']\")") is ("record" in may)
-    if "record" in may:
-        await page.page.click("a[href='#recordings']")
-        await until(lambda: says(page, "#record-state", "the recorder does not answer"))
+    tab = "!!document.querySelector(\"a[href='#recordings']\")"
+    assert await (await signed_in(site, sees)).value(tab) is False
+    page = await signed_in(site, records)
+    assert await page.value(tab) is True
+    await page.page.click("a[href='#recordings']")
+    await until(lambda: says(page, "#record-state", "the recorder does not answer"))

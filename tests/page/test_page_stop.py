@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from macs_zenoh.protocol.rights import Rights
-from tests.page.conftest import DOMAINS, Site, StartSite, says, signed_in, with_token
+from tests.page.conftest import DOMAINS, Site, StartSite, released, says, signed_in, with_token
 from tests.support.browser import OFFLINE, Watched, needs_browser
 from tests.support.programs import Program
 from tests.support.waiting import until
@@ -54,6 +54,7 @@ async def test_a_press_holds_for_a_robot_that_drops_out(site: Site) -> None:
         finally:
             other.send_signal(signal.SIGCONT)
         await until(lambda: says(page, "#stop-status", "robot 1, 2 stopped"))
+        await released(page)
 
 
 async def test_a_press_holds_where_no_robot_is_known(site: Site) -> None:
@@ -73,9 +74,7 @@ async def test_a_press_holds_where_no_robot_is_known(site: Site) -> None:
     await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
     async with second_agent(site):
         await until(lambda: says(page, "#stop-status", "robot 1, 2 stopped"))
-        await page.page.click("#release")
-        await page.page.click("#release")
-        await until(partial(page.value, "document.querySelector('#stop-status').textContent === ''"))
+        await released(page)
     assert await page.value("sessionStorage.getItem('macs.stop')") is None
 
 
@@ -86,35 +85,35 @@ async def test_a_press_that_was_taken_back_is_not_sent(site: Site) -> None:
     await until(partial(page.value, "window.macsPage?.headset.connected"))
     await online(page)
     await page.page.click("#stop")
-    await page.page.click("#release")
-    await page.page.click("#release")
-    await until(partial(page.value, "document.querySelector('#stop-status').textContent === ''"))
+    await released(page)
     await site.agent.start()
     await page.page.wait_for_selector('#pad[aria-disabled="false"]', timeout=60_000)
     assert await page.value("macsPage.stop.stopped().length") == 0
 
 
-@pytest.mark.parametrize("groups", [[3], "any"])
-async def test_a_token_for_groups_stops_their_robots(start_site: StartSite, tmp_path: Path, groups: object) -> None:
+async def test_a_token_for_groups_stops_their_robots(start_site: StartSite, tmp_path: Path) -> None:
     """A robot that it may name by its group only is stopped and released, also when it was away; nothing else of the
-    page pretends to be for it."""
-    rights = Rights(may=["see", "stop", "command"], robots=[], groups=groups)  # type: ignore[arg-type]
-    secret, words = with_token(tmp_path / "tokens.json", rights)
+    page pretends to be for it. For one group, and for any."""
+    path, secrets = tmp_path / "tokens.json", list[str]()
+    for name, groups in (("three", [3]), ("any", "any")):
+        rights = Rights(may=["see", "stop", "command"], robots=[], groups=groups)  # type: ignore[arg-type]
+        secret, words = with_token(path, rights, name)
+        secrets.append(secret)
     site = await start_site(words, agent=("--group", "3"))
-    page = await signed_in(site, secret)
-    await online(page, 1)
-    assert "by their group" in await page.page.inner_text(".robot-view")
-    await page.page.click("#stop")
-    await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
-    await page.page.click("#release")
-    await page.page.click("#release")
-    await until(partial(page.value, "document.querySelector('#stop-status').textContent === ''"))
-    await site.agent.stop(signal.SIGKILL)
-    await online(page)
-    await page.page.click("#stop")
-    await until(lambda: says(page, "#stop-status", "robot 1 not online: stopped on return"))
-    await site.agent.start()
-    await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
+    for secret in secrets:
+        page = await signed_in(site, secret)
+        await online(page, 1)
+        assert "by their group" in await page.page.inner_text(".robot-view")
+        await page.page.click("#stop")
+        await until(lambda page=page: says(page, "#stop-status", "robot 1 stopped"))
+        await released(page)
+        await site.agent.stop(signal.SIGKILL)
+        await online(page)
+        await page.page.click("#stop")
+        await until(lambda page=page: says(page, "#stop-status", "robot 1 not online: stopped on return"))
+        await site.agent.start()
+        await until(lambda page=page: says(page, "#stop-status", "robot 1 stopped"))
+        await released(page)
 
 
 async def test_a_stop_holds_on_a_robot_that_starts_anew(site: Site) -> None:
@@ -130,3 +129,4 @@ async def test_a_stop_holds_on_a_robot_that_starts_anew(site: Site) -> None:
     await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
     said = "fetch('/view/robots/1/status').then((r) => r.json()).then((s) => s.stopped === true)"
     await until(lambda: page.value(said))
+    await released(page)

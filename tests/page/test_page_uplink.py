@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from tests.page.conftest import Site
+from tests.page.conftest import StartSite
 from tests.support.browser import Watched, needs_browser
 from tests.support.links import Link, counted
 from tests.support.programs import Program
@@ -42,8 +42,9 @@ async def all_show(pages: list[Watched]) -> None:
         await until(more)
 
 
-async def test_ten_pages_cost_a_robot_what_one_does(site: Site) -> None:
+async def test_ten_pages_cost_a_robot_what_one_does(start_site: StartSite) -> None:
     """Its pictures, place, map, plots and state for ten pages, and the mesh for ten: no more bytes than for one."""
+    site = await start_site()
     environment = {"ROS_DOMAIN_ID": str(site.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     await site.agent.stop()
     async with (

@@ -22,14 +22,16 @@ pytest.importorskip("rclpy")
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
 
-from tests.page.conftest import Site, StartSite
-from tests.page.headsets import PATIENT_ROBOT, Headset, headset_at, needs_headset, with_webgl
+from tests.page.conftest import Site
+from tests.page.headsets import PATIENT_ROBOT, WEBGL, Headset, headset_at, needs_headset
 from tests.support.browser import needs_browser
 from tests.support.processes import Process
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset, pytest.mark.alone, pytest.mark.soak, pytest.mark.timeout(280)]
+RULES = PATIENT_ROBOT
+"""The robot is patient."""
 
 MEASURED_S = 8.0
 DRIVEN = "/test/drive"
@@ -47,12 +49,6 @@ JPEG = """async ([shade]) => {
   for (const byte of bytes) text += String.fromCharCode(byte);
   return btoa(text);
 }"""
-
-
-@pytest.fixture
-async def site(start_site: StartSite) -> Site:
-    """One whose robot is patient."""
-    return await start_site(rules=PATIENT_ROBOT)
 
 
 def part(values: Sequence[float], share: float) -> float:
@@ -110,30 +106,27 @@ async def test_how_late_and_how_dear(site: Site, tmp_path: Path) -> None:
     try:
         await drives.listen(peer, TwistStamped, DRIVEN)
         await poses.listen(peer, PoseStamped, "/xr/head")
-        async with with_webgl(site):
-            headset = await headset_at(site, settings=settings)
-            await headset.ready(pictures=False)
-            await pictures(headset, tmp_path)
-            await headset.enter()
-            offset = float(await headset.value(CLOCK))
-            await headset.stick("right", 0, -1)
-            holding = asyncio.create_task(hold_on(headset))
-            commands = await measured(drives, offset)
-            holding.cancel()
-            await asyncio.gather(holding, return_exceptions=True)
-            lines.append(told("command, browser to ROS node", commands))
-            await headset.squeeze("right", held=False)
-            lines.append(told("pose, browser to ROS node", await measured(poses, offset)))
-            async with camera(site, tmp_path, 0, 30):
-                await show(headset, ["/test/raw"])
-                beside = await measured(poses, offset)
-                raw_hz = await headset.value(
-                    "[...macsXr.links.rates.values()].find(each => each.key.includes('raw')).hz"
-                )
-                lines.append(told(f"pose beside {raw_hz:.0f} raw pictures of 0.9 MB a second", beside))
-            async with camera(site, tmp_path, 30, 0):
-                await show(headset, ["/test/jpeg", "/test/jpeg2"])
-                lines += await with_two_cameras(site, headset, offset, tmp_path)
+        headset = await headset_at(site, settings=settings, small=False)
+        await headset.ready(pictures=False)
+        await pictures(headset, tmp_path)
+        await headset.enter()
+        offset = float(await headset.value(CLOCK))
+        await headset.stick("right", 0, -1)
+        holding = asyncio.create_task(hold_on(headset))
+        commands = await measured(drives, offset)
+        holding.cancel()
+        await asyncio.gather(holding, return_exceptions=True)
+        lines.append(told("command, browser to ROS node", commands))
+        await headset.squeeze("right", held=False)
+        lines.append(told("pose, browser to ROS node", await measured(poses, offset)))
+        async with camera(site, tmp_path, 0, 30):
+            await show(headset, ["/test/raw"])
+            beside = await measured(poses, offset)
+            raw_hz = await headset.value("[...macsXr.links.rates.values()].find(each => each.key.includes('raw')).hz")
+            lines.append(told(f"pose beside {raw_hz:.0f} raw pictures of 0.9 MB a second", beside))
+        async with camera(site, tmp_path, 30, 0):
+            await show(headset, ["/test/jpeg", "/test/jpeg2"])
+            lines += await with_two_cameras(site, headset, offset, tmp_path)
     finally:
         peer.session.close()
     print("\n".join(["", *lines]))
@@ -160,9 +153,10 @@ async def show(headset: Headset, topics: list[str]) -> None:
 async def with_two_cameras(site: Site, headset: Headset, offset: float, folder: Path) -> list[str]:
     await headset.value("macsXr.links.pictureMs.length = 0; macsXr.frameMs.length = 0")
     trace = folder / "trace.json"
-    await site.browser.start_tracing(page=headset.page, path=trace, categories=["toplevel", "devtools.timeline"])
+    browser = await site.chromium(*WEBGL)
+    await browser.start_tracing(page=headset.page, path=trace, categories=["toplevel", "devtools.timeline"])
     await asyncio.sleep(4)
-    await site.browser.stop_tracing()
+    await browser.stop_tracing()
     ages = json.loads(await headset.value("JSON.stringify(macsXr.links.pictureMs)"))
     frames = json.loads(await headset.value("JSON.stringify(macsXr.frameMs)"))
     wall, cpu = work_per_frame(json.loads(trace.read_text()))

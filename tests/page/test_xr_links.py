@@ -11,11 +11,13 @@ pytest.importorskip("rclpy")
 
 from tests.page.conftest import ROBOT, Site, StartSite
 from tests.page.driving import heard_at
-from tests.page.headsets import PATIENT_ROBOT, Headset, headset_at, needs_headset, with_webgl
+from tests.page.headsets import PATIENT_ROBOT, Headset, headset_at, needs_headset
 from tests.support.browser import OFFLINE, needs_browser
 from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
+RULES = PATIENT_ROBOT + ROBOT
+"""The robot is patient."""
 
 LINKS = """
 macsXr.told = [];
@@ -32,12 +34,6 @@ hold_s = 60.0
 """
 
 
-@pytest.fixture
-async def site(start_site: StartSite) -> Site:
-    """One whose robot is patient."""
-    return await start_site(rules=PATIENT_ROBOT + ROBOT)
-
-
 async def told(headset: Headset, which: str) -> list[dict[str, object]]:
     """What became of a connection, in order."""
     found = json.loads(await headset.value("JSON.stringify(macsXr.told)"))
@@ -52,7 +48,7 @@ async def back(headset: Headset, which: str) -> bool:
 async def test_a_connection_that_is_cut_on_entering_comes_back_as_the_same(site: Site) -> None:
     """Both sockets end as VR begins, which costs others their session: each is back within a second, with its id and
     what it was subscribed to, and the robot is driven on. The one of pictures ends without the other noticing."""
-    async with with_webgl(site), heard_at(site) as heard:
+    async with heard_at(site) as heard:
         headset = await headset_at(site)
         headset.watched.allowed.append(OFFLINE)
         await headset.ready()
@@ -91,7 +87,7 @@ async def hold(headset: Headset) -> None:
 async def test_a_second_headset_is_told_who_has_control_and_gets_it(start_site: StartSite) -> None:
     """It sees who has control and does not drive; handed over, it drives, and the first one does not."""
     site = await start_site(rules=HELD_LONG)
-    async with with_webgl(site), heard_at(site) as heard:
+    async with heard_at(site) as heard:
         first = await headset_at(site, settings={"cameras": []})
         await first.ready(pictures=False)
         second = await headset_at(site, settings={"cameras": []})

@@ -14,22 +14,18 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from tests.page.conftest import Act, Site, StartSite
+from tests.page.conftest import Act, Site
 from tests.page.driving import heard_at
-from tests.page.headsets import PATIENT_ROBOT, PICTURES, Headset, Pictures, headset_at, needs_headset, with_webgl
+from tests.page.headsets import PATIENT_ROBOT, PICTURES, Headset, Pictures, headset_at, needs_headset
 from tests.support.browser import needs_browser
 from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
+RULES = PATIENT_ROBOT
+"""The robot has no dead-man."""
 
 LOCKOUT_S = float(os.environ.get("MACS_LOCKOUT_S", "1.0"))
 """Longer than its default: on a busy machine pictures come late without being frozen."""
-
-
-@pytest.fixture
-async def site(start_site: StartSite) -> Site:
-    """One whose robot has no dead-man."""
-    return await start_site(rules=PATIENT_ROBOT)
 
 
 def by_grip(headset: Headset) -> tuple[Act, Act]:
@@ -46,7 +42,7 @@ def by_grip(headset: Headset) -> tuple[Act, Act]:
 async def test_a_frozen_picture_turns_driving_off(site: Site) -> None:
     """Pictures stop while it drives: a zero, no command after that, the panel says why; and it
     comes back by itself with them, to be taken hold of anew."""
-    async with with_webgl(site), heard_at(site) as heard, Pictures(site.domain) as pictures:
+    async with heard_at(site) as heard, Pictures(site.domain) as pictures:
         headset = await headset_at(site, settings={"cameras": [PICTURES], "lockoutS": LOCKOUT_S, "hz": 60})
         await headset.ready()
         await headset.enter()
@@ -99,7 +95,7 @@ WHY = {
 async def test_who_wears_it_no_more_has_let_go(site: Site) -> None:
     """Taken off, its menu opened, hung, the robot given up, XR left: each ends with a zero, and nothing drives that
     was not taken hold of anew."""
-    async with with_webgl(site), heard_at(site) as heard:
+    async with heard_at(site) as heard:
         headset = await headset_at(site, settings={"cameras": []})
         await headset.ready(pictures=False)
         await headset.enter()
@@ -129,7 +125,7 @@ async def test_who_wears_it_no_more_has_let_go(site: Site) -> None:
 
 async def test_a_page_that_nobody_sees_has_let_go(site: Site) -> None:
     """The same on a screen: driven by keys, and the page is hidden, or the window loses the focus."""
-    async with with_webgl(site), heard_at(site) as heard:
+    async with heard_at(site) as heard:
         headset = await headset_at(site, settings={"cameras": []})
         await headset.ready(pictures=False)
         keys = headset.page.keyboard
@@ -151,7 +147,7 @@ async def test_a_page_that_nobody_sees_has_let_go(site: Site) -> None:
 
 async def test_a_gateway_that_stands_still_gets_no_more(site: Site) -> None:
     """Nothing goes into a network that does not answer, and when it does, the robot is told to stand."""
-    async with with_webgl(site), heard_at(site) as heard:
+    async with heard_at(site) as heard:
         headset = await headset_at(site, settings={"cameras": []})
         await headset.ready(pictures=False)
         await headset.enter()

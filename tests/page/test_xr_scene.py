@@ -16,22 +16,18 @@ pytest.importorskip("rclpy")
 from geometry_msgs.msg import PoseArray, PoseStamped
 from sensor_msgs.msg import Joy
 
-from tests.page.conftest import ROBOT, Site, StartSite
+from tests.page.conftest import ROBOT, Site
 from tests.page.driving import Heard, heard_at
-from tests.page.headsets import PATIENT_ROBOT, Headset, about_up, headset_at, needs_headset, with_webgl
+from tests.page.headsets import PATIENT_ROBOT, Headset, about_up, headset_at, needs_headset
 from tests.support.browser import needs_browser
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
+RULES = PATIENT_ROBOT + ROBOT
+"""The robot is patient."""
 
 POSES = {"head": "/xr/head", "right": "/xr/right", "rightHand": "/xr/right/hand", "joy": "/xr/joy"}
-
-
-@pytest.fixture
-async def site(start_site: StartSite) -> Site:
-    """One whose robot is patient."""
-    return await start_site(rules=PATIENT_ROBOT + ROBOT)
 
 
 async def by_stick(headset: Headset, hand: str, x: float, y: float) -> None:
@@ -64,7 +60,7 @@ async def stands(headset: Headset, heard: Heard) -> None:
 async def test_it_sees_and_drives(site: Site) -> None:
     """Enter VR; the panel's pixels change as the robot turns; stick and hand drive it while they hold, and a zero
     follows; leave, come back, drive on; both face buttons stop it, also while it drives."""
-    async with with_webgl(site), heard_at(site) as heard:
+    async with heard_at(site) as heard:
         headset = await headset_at(site)
         await headset.ready()
         await until(lambda: headset.state("maxAgeS === 10"))  # its commands tell when they were made
@@ -137,34 +133,31 @@ async def test_poses_come_in_ros_axes(site: Site) -> None:
         rights = await peer.subscription(PoseStamped, "/xr/right", 100)
         hands = await peer.subscription(PoseArray, "/xr/right/hand", 100)
         joys = await peer.subscription(Joy, "/xr/joy", 100)
-        async with with_webgl(site):
-            headset = await headset_at(site, settings=POSES)
-            await headset.ready()
-            await headset.enter()
-            print(
-                await headset.value("JSON.stringify([macsXr.telling.last, macsXr.telling.state, [...macsXr.wanted]])")
-            )
-            await headset.place("head", (0.5, 1.5, -2.0), about_up(math.pi / 2))
-            head = await newest(heads, lambda message: at(message.pose)[0] == 2.0)
-            assert at(head.pose) == (2.0, -0.5, 1.5)
-            assert head.header.frame_id == "xr"
-            turned = head.pose.orientation
-            assert (turned.x, turned.y) == (0, 0)
-            assert math.isclose(2 * math.atan2(turned.z, turned.w), math.pi / 2, abs_tol=1e-6)
-            await headset.place("right", (0.25, 1.25, -0.5), about_up(-math.pi / 2))
-            right = await newest(rights, lambda message: abs(message.pose.position.z - 1.25) < 0.1)
-            assert abs(right.pose.position.x - 0.5) < 0.1
-            assert abs(right.pose.position.y + 0.25) < 0.1
-            assert right.pose.orientation.z < -0.4  # to the right
-            await by_stick(headset, "right", 1.0, -0.5)
-            joy = await newest(joys, lambda message: message.buttons[7] and message.axes[2])
-            assert [round(axis, 3) for axis in joy.axes] == [0, 0, -1.0, 0.5, 0, 0, 0, 1.0]
-            await released(headset, "right")
-            await headset.value("device.primaryInputMode = 'hand'")
-            await headset.place("rightHand", (0.25, 1.25, -0.5))
-            hand = await newest(hands, lambda message: abs(message.poses[0].position.z - 1.25) < 0.15)
-            assert len(hand.poses) == 25
-            assert all(abs(pose.position.x - 0.5) < 0.3 for pose in hand.poses)
-            assert head.header.stamp.sec <= hand.header.stamp.sec <= time.time() + 1
+        headset = await headset_at(site, settings=POSES)
+        await headset.ready()
+        await headset.enter()
+        print(await headset.value("JSON.stringify([macsXr.telling.last, macsXr.telling.state, [...macsXr.wanted]])"))
+        await headset.place("head", (0.5, 1.5, -2.0), about_up(math.pi / 2))
+        head = await newest(heads, lambda message: at(message.pose)[0] == 2.0)
+        assert at(head.pose) == (2.0, -0.5, 1.5)
+        assert head.header.frame_id == "xr"
+        turned = head.pose.orientation
+        assert (turned.x, turned.y) == (0, 0)
+        assert math.isclose(2 * math.atan2(turned.z, turned.w), math.pi / 2, abs_tol=1e-6)
+        await headset.place("right", (0.25, 1.25, -0.5), about_up(-math.pi / 2))
+        right = await newest(rights, lambda message: abs(message.pose.position.z - 1.25) < 0.1)
+        assert abs(right.pose.position.x - 0.5) < 0.1
+        assert abs(right.pose.position.y + 0.25) < 0.1
+        assert right.pose.orientation.z < -0.4  # to the right
+        await by_stick(headset, "right", 1.0, -0.5)
+        joy = await newest(joys, lambda message: message.buttons[7] and message.axes[2])
+        assert [round(axis, 3) for axis in joy.axes] == [0, 0, -1.0, 0.5, 0, 0, 0, 1.0]
+        await released(headset, "right")
+        await headset.value("device.primaryInputMode = 'hand'")
+        await headset.place("rightHand", (0.25, 1.25, -0.5))
+        hand = await newest(hands, lambda message: abs(message.poses[0].position.z - 1.25) < 0.15)
+        assert len(hand.poses) == 25
+        assert all(abs(pose.position.x - 0.5) < 0.3 for pose in hand.poses)
+        assert head.header.stamp.sec <= hand.header.stamp.sec <= time.time() + 1
     finally:
         peer.session.close()

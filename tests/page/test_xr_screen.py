@@ -10,12 +10,11 @@ import pytest
 
 pytest.importorskip("rclpy")  # the kit has a camera, which is a ROS node
 
-from tests.page.headsets import Gate, headset_at, needs_headset
-from tests.page.test_xr_stage import gate
+from tests.page.conftest import Gate
+from tests.page.headsets import headset_at, needs_headset
 from tests.support.browser import needs_browser
 from tests.support.waiting import until
 
-__all__ = ["gate"]
 pytestmark = [needs_browser, needs_headset]
 
 LOSE = "window.lose = macsXr.stage.renderer.getContext().getExtension('WEBGL_lose_context'), lose.loseContext()"

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack
-from pathlib import Path
-
 import pytest
 
 pytest.importorskip("rclpy")  # the kit has a camera, which is a ROS node
 
 from bridge.page.routes import POLICY
-from macs_zenoh.protocol.rights import Rights
-from tests.page.conftest import with_token
-from tests.page.headsets import WEBGL, Gate, headset_at, needs_headset
-from tests.support.browser import AXE, browser, needs_browser
-from tests.support.programs import Program, free_port
+from tests.page.conftest import Gate
+from tests.page.headsets import headset_at, needs_headset
+from tests.support.browser import AXE, needs_browser
 from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
@@ -49,22 +43,6 @@ WORLD = {
     "map": "{ pixels: new Uint8Array(4 * 64).fill(220), width: 8, height: 8, size: [8, 8], origin: { position: "
     "{ x: -4, y: -4, z: 0 }, orientation: { x: 0, y: 0, z: 0, w: 1 } } }",
 }
-
-
-@pytest.fixture
-async def gate(tmp_path: Path) -> AsyncIterator[Gate]:
-    """A router, a gateway and a browser with WebGL."""
-    secret, words = with_token(tmp_path / "tokens.json", Rights(may=["see"], robots="any"))
-    async with AsyncExitStack() as stack:
-        endpoint, ports = f"tcp/127.0.0.1:{free_port()}", (free_port(), free_port())
-        await stack.enter_async_context(Program("router", "-l", endpoint))
-        for port, more in zip(ports, ((), words), strict=True):
-            argv = ["--port", str(free_port()), "--web-port", str(port), "-e", endpoint, *more]
-            await stack.enter_async_context(Program("gateway", *argv))
-        gate = Gate(await stack.enter_async_context(browser(*WEBGL)), ports, secret)
-        yield gate
-        for page in gate.pages:
-            page.judge()
 
 
 def like(pixels: list[int], colour: tuple[int, int, int], by: int = 24) -> bool:

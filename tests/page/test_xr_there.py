@@ -11,23 +11,19 @@ pytest.importorskip("rclpy")
 
 from geometry_msgs.msg import PoseStamped
 
-from tests.page.conftest import Site, StartSite
+from tests.page.conftest import Site
 from tests.page.driving import Heard, heard_at
-from tests.page.headsets import PATIENT_ROBOT, Headset, headset_at, needs_headset, with_webgl
+from tests.page.headsets import PATIENT_ROBOT, Headset, headset_at, needs_headset
 from tests.support.browser import needs_browser
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
+RULES = PATIENT_ROBOT
+"""The robot has no dead-man."""
 
 OFF = "device.updateVisibilityState('hidden')"
 ON = "device.updateVisibilityState('visible')"
-
-
-@pytest.fixture
-async def site(start_site: StartSite) -> Site:
-    """One whose robot has no dead-man."""
-    return await start_site(rules=PATIENT_ROBOT)
 
 
 async def take(headset: Headset) -> None:
@@ -45,7 +41,7 @@ async def stands(headset: Headset, heard: Heard, why: str) -> None:
 
 async def test_what_was_taken_hold_of_meanwhile_does_not_drive(site: Site) -> None:
     """The grip is pressed while the headset is off, and while it is entered: it counts once it was let go of."""
-    async with with_webgl(site), heard_at(site) as heard:
+    async with heard_at(site) as heard:
         headset = await headset_at(site, settings={"cameras": []})
         await headset.ready(pictures=False)
         await take(headset)
@@ -68,7 +64,7 @@ async def test_a_view_that_is_centred_anew_lets_go(site: Site) -> None:
     peer = Peer(site.domain)
     try:
         heads = await peer.subscription(PoseStamped, "/xr/head", 100)
-        async with with_webgl(site), heard_at(site) as heard:
+        async with heard_at(site) as heard:
             headset = await headset_at(site, settings={"cameras": [], "head": "/xr/head"})
             await headset.ready(pictures=False)
             await headset.enter()

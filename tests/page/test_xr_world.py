@@ -16,7 +16,7 @@ from sensor_msgs.msg import JointState, LaserScan, PointCloud2, PointField
 from std_msgs.msg import Float32
 
 from tests.page.conftest import Site
-from tests.page.headsets import headset_at, needs_headset, with_webgl
+from tests.page.headsets import headset_at, needs_headset
 from tests.support.browser import needs_browser
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
@@ -67,24 +67,23 @@ async def test_what_a_robot_publishes_is_on_the_table(site: Site) -> None:
                 await asyncio.sleep(0.3)
 
         publishing = asyncio.create_task(publish())
-        async with with_webgl(site):
-            headset = await headset_at(site, settings={"cameras": [], "values": ["/level"], "points": 1000})
-            await headset.ready(pictures=False)
-            for layer in ("scan", "cloud"):
-                await until(lambda layer=layer: headset.value(f"macsXr.room.model.{layer}.visible"))
-            model = "macsXr.room.model"
-            assert await headset.value(f"{model}.cloud.parent === {model}.atRobot")
-            # the demo robot has a smaller one on the same topic
-            count = f"[{model}.cloud.geometry.drawRange.count].find((count) => count > 500)"
-            drawn = await until(lambda: headset.value(count))
-            assert drawn <= 1000, "few of its points"
-            await until(lambda: headset.value(f"{model}.joints.group.children.length === 2"))
-            await until(lambda: headset.value("macsXr.telling.batteries.all(0)[0]?.value.text.includes('V')"))
-            await until(lambda: headset.value("macsXr.telling.texts.all(0)[0]?.value[0] === 'level: data 0.625'"))
-            await until(lambda: headset.value(f"Boolean({model}.map?.visible)"))
-            await headset.shot("world")
-            await headset.value("macsXr.settings.set('layers', ['scan'])")
-            await until(lambda: headset.value(f"!{model}.cloud.visible && {model}.scan.visible"))
+        headset = await headset_at(site, settings={"cameras": [], "values": ["/level"], "points": 1000})
+        await headset.ready(pictures=False)
+        for layer in ("scan", "cloud"):
+            await until(lambda layer=layer: headset.value(f"macsXr.room.model.{layer}.visible"))
+        model = "macsXr.room.model"
+        assert await headset.value(f"{model}.cloud.parent === {model}.atRobot")
+        # the demo robot has a smaller one on the same topic
+        count = f"[{model}.cloud.geometry.drawRange.count].find((count) => count > 500)"
+        drawn = await until(lambda: headset.value(count))
+        assert drawn <= 1000, "few of its points"
+        await until(lambda: headset.value(f"{model}.joints.group.children.length === 2"))
+        await until(lambda: headset.value("macsXr.telling.batteries.all(0)[0]?.value.text.includes('V')"))
+        await until(lambda: headset.value("macsXr.telling.texts.all(0)[0]?.value[0] === 'level: data 0.625'"))
+        await until(lambda: headset.value(f"Boolean({model}.map?.visible)"))
+        await headset.shot("world")
+        await headset.value("macsXr.settings.set('layers', ['scan'])")
+        await until(lambda: headset.value(f"!{model}.cloud.visible && {model}.scan.visible"))
     finally:
         if publishing is not None:
             publishing.cancel()
