@@ -266,7 +266,7 @@ def _router_info(told: Router) -> RouterInfo:
             zid=session.peer,
             whatami=session.whatami,
             shared_memory=bool(session.shm),
-            address=next((link.dst for link in session.links), ""),
+            address=session.address,
         )
         for session in told.sessions
     ]

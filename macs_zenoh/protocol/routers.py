@@ -27,7 +27,14 @@ class RouterSession(msgspec.Struct, frozen=True):
     peer: str = ""
     whatami: str = ""
     shm: bool | None = None
-    links: list[RouterLink] = []
+    links: list[RouterLink | str] = []
+    """Zenoh 1.0 writes the far end alone."""
+
+    @property
+    def address(self) -> str:
+        """The far end of its first link; empty where nothing is said of it."""
+        link = next(iter(self.links), "")
+        return link if isinstance(link, str) else link.dst
 
 
 class Router(msgspec.Struct, frozen=True):

@@ -69,3 +69,7 @@ def test_a_router_is_read_as_it_tells() -> None:
     told += b'"links":[{"src":"tcp/1","dst":"tcp/2"}]}],"locators":["tcp/3"],"plugins":{}}'
     session = RouterSession("bb", "router", False, [RouterLink("tcp/2")])
     assert router_of(told) == Router("aa", "v1", ["tcp/3"], [session])
+    assert session.address == "tcp/2"
+    older = router_of(b'{"zid":"aa","sessions":[{"peer":"bb","links":["tcp/1:2",{}]},{"peer":"cc"}]}')
+    assert older is not None
+    assert [each.address for each in older.sessions] == ["tcp/1:2", ""]
