@@ -5,9 +5,10 @@ Of a file no more is read than the chunks that have such.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
+
+import msgspec
 
 from bridge.recording.bag import Bag
 from bridge.recording.streams import CONTROL, DEADMAN, DROPS, JSON, LOST, REFUSALS, STOPS
@@ -33,9 +34,9 @@ def happened(bag: Bag) -> Iterator[Happened]:
     for message in bag.messages(lambda channel: channel.topic in _WORDS and channel.encoding == JSON):
         kind, words = _WORDS[topics[message.channel]]
         try:
-            value = json.loads(message.data)
+            value = msgspec.json.decode(message.data)  # so that what is made of it can be written as JSON as well
             text, robot = words(value), _robot(value)
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        except (msgspec.MsgspecError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             continue
         # what is repeated at the beginning of a file happened before
         time_ns = min(message.log_ns, message.publish_ns or message.log_ns)
@@ -44,7 +45,7 @@ def happened(bag: Bag) -> Iterator[Happened]:
 
 def _robot(value: dict[str, Any]) -> int:
     robot = value.get("robot", value.get("robotId", value.get("robot_id", 0)))
-    return robot if isinstance(robot, int) else 0
+    return robot if isinstance(robot, int) and 0 <= robot <= 0xFFFF else 0
 
 
 def _stop(value: dict[str, Any]) -> str:

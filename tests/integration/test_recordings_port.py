@@ -47,6 +47,7 @@ def write(path: Path, size: int = 100) -> None:
     refusal = {"from": "ros/7", "to": "unity/256", "robotId": 7, "tosName": "/cmd_vel", "reason": "it is stopped"}
     disk.put(Entry(refusals, 1, START + 2 * 10**9, json.dumps(refusal).encode()))
     disk.put(Entry(refusals, 2, START + 2 * 10**9, b'["no object"]'))
+    disk.put(Entry(refusals, 3, START + 2 * 10**9, json.dumps({**refusal, "reason": "\ud800"}).encode()))
     disk.stop()
 
 
@@ -155,7 +156,7 @@ async def test_record_list_and_download(site: Site) -> None:
 
 
 async def test_what_happened(site: Site) -> None:
-    """Stops and refusals by their time; what is no object of ours is left out. The verb says the same."""
+    """Stops and refusals by their time; what is no object of ours, or no text, is left out. The verb says the same."""
     write(site.folder / "a.mcap")
     status, told = await site.get("/recordings/happened/a.mcap")
     assert status == 200
