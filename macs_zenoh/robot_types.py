@@ -40,9 +40,7 @@ async def definitions(ask: Ask, types: Iterable[str] = ()) -> DefinitionsReply:
         left = [name for name in answer.left if name not in found]
         if len(found) == before and not rest:  # it has no more to tell
             break
-        if sum(len(each.text) for each in found.values()) > MOST_BYTES:
-            break
         waiting = list(dict.fromkeys([*rest, *left]))
-        if not waiting:
+        if not waiting or sum(len(each.text) for each in found.values()) > MOST_BYTES:
             break
     return DefinitionsReply(found, missing, [name for name in waiting if name not in found and name not in missing])

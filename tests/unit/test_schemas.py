@@ -4,7 +4,20 @@ from __future__ import annotations
 
 import pytest
 
-from macs_zenoh.protocol.schemas import SCHEMA_BYTES, Definition, definitions_in, full_type, needs, schema, text_of
+from macs_zenoh import robot_types
+from macs_zenoh.protocol.messages import decode_data, encode_data
+from macs_zenoh.protocol.schemas import (
+    SCHEMA_BYTES,
+    TEXT_BYTES,
+    Definition,
+    DefinitionsReply,
+    DefinitionsRequest,
+    definitions_in,
+    full_type,
+    needs,
+    schema,
+    text_of,
+)
 
 POSE = "# where it is\nPoint position  # [m]\nQuaternion orientation\n"
 POINT = "float64 x\nfloat64 y\nfloat64 z\n"
@@ -112,3 +125,20 @@ def test_a_schema_has_a_size() -> None:
     assert whole is not None
     assert whole.count("MSG: ") == 99
     assert schema("a/msg/A", {"a/msg/A": Definition("#" * (SCHEMA_BYTES + 1))}) is None
+
+
+async def test_of_a_robot_that_never_ends_it_is_told_that_there_is_more() -> None:
+    """So much is asked of it and no more, and what was left is named."""
+    asked: list[list[str]] = []
+
+    async def ask(verb: str, data: bytes) -> bytes:
+        asked.append(decode_data(DefinitionsRequest, data).types)
+        number = 4 * len(asked)
+        names = [*asked[-1], *(f"a_msgs/msg/T{number + each}" for each in range(3))]
+        told = {name: Definition("x" * TEXT_BYTES) for name in names}
+        return encode_data(DefinitionsReply(told, {}, [f"a_msgs/msg/T{number + 3}"]))
+
+    told = await robot_types.definitions(ask)
+    assert sum(len(each.text) for each in told.definitions.values()) < robot_types.MOST_BYTES + 4 * TEXT_BYTES + 1
+    assert len(asked) < robot_types.ROUNDS
+    assert told.left == [f"a_msgs/msg/T{4 * len(asked) + 3}"]
