@@ -10,6 +10,7 @@ Exit code 0: nothing is wrong; 1: something is, or a file cannot be read; 2: wro
 examples:
   macs audit verify /var/log/macs/audit.jsonl
   macs audit head /var/log/macs/audit.jsonl
+  macs audit verify <(ssh robot cat /var/log/macs/audit.jsonl)
   macs audit verify /var/log/macs/audit.jsonl --seen 1234:9f86d081884c7d65…
 
 what it prints:
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     verifier = Verifier(args.seen if args.audit_verb == "verify" else ())
     for path in _all(args.files):
         try:
-            if not path.is_file() and path.exists():  # a FIFO, say, for which one would wait for ever
+            if not path.is_file() and path.exists() and not _is_given(path):  # a FIFO: one would wait
                 raise ConfigError(str(path), "is no file")
             with path.open("rb") as file:
                 verifier.read(str(path), file)
@@ -82,6 +83,11 @@ def run(args: argparse.Namespace) -> int:
         output.say(plain(f"{each.file}, line {each.line}: {each.kind.value}: {each.text}"))
     output.say(f"{verifier.lines} lines, the last is number {verifier.link.number}")
     return int(wrong)
+
+
+def _is_given(path: Path) -> bool:
+    """Whether it is open already, as a shell gives it: ``/dev/stdin``, or ``<(ssh host cat audit.jsonl)``."""
+    return path == Path("/dev/stdin") or path.parent in (Path("/dev/fd"), Path("/proc/self/fd"))
 
 
 def _all(named: list[Path]) -> list[Path]:

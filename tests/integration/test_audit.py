@@ -19,6 +19,7 @@ from bridge.audit.notes import Shares
 from bridge.audit.writer import WAITING, older_files
 from bridge.headset.client import Headset
 from macs_zenoh.errors import ConfigError, MacsError
+from tests.support.processes import finished
 from tests.support.programs import ROOT, Program, ended, free_port
 from tests.support.waiting import until
 
@@ -265,6 +266,16 @@ async def test_what_is_no_record_is_left_alone(tmp_path: Path) -> None:
     assert other.read_text() == "my notes\n"
     code, _, errors = await ended("audit", "verify", str(fifo))
     assert (code, "is no file" in errors) == (2, True)
+
+
+async def test_a_record_is_verified_through_a_pipe(tmp_path: Path) -> None:
+    """As a shell gives it: by a file descriptor, or as standard input."""
+    path = tmp_path / "audit.jsonl"
+    AuditFile(path, "p").close()
+    macs = f"{sys.executable} -m bridge audit verify"
+    for words in (f"{macs} <(cat {path})", f"cat {path} | {macs} /dev/stdin", f"cat {path} | {macs} /proc/self/fd/0"):
+        code, out, errors = await finished("bash", "-c", words)
+        assert (code, "2 lines, the last is number 1" in out) == (0, True), (words, errors)
 
 
 async def test_who_does_the_same_all_day_pushes_nothing_out(tmp_path: Path) -> None:
