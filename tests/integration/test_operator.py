@@ -228,23 +228,24 @@ async def test_a_session_that_serves_no_robot_verbs_is_no_fault(router: str) -> 
         assert (code, out) == (1, "robot 7 is NOT stopped: it is online, and has no emergency stop\n")
 
 
-@pytest.mark.parametrize(
-    "said", ['{"bad_cdr": 1%s}' % ("0" * 400), '{"bad_cdr": NaN}', '{"\\ud800": 1}', '{"bad_cdr": 1e999}']
-)
-async def test_numbers_that_are_none_end_no_verb(router: str, said: str) -> None:
-    """What one robot says of itself, and what somebody answers in the place of a router, costs nobody his tools."""
-    status = f'{{"ros_node": "/r", "stopped": false, "stop": {{}}, "nodes": [], "drops": {said}}}'
-
-    async def tell(_call: macs_zenoh.Call) -> bytes:
-        return status.encode()
+async def test_numbers_that_are_none_end_no_verb(router: str) -> None:
+    """What robots say of themselves, and what somebody answers in the place of a router, costs nobody his tools."""
+    faults = ['{"bad_cdr": 1%s}' % ("0" * 400), '{"bad_cdr": NaN}', '{"\\ud800": 1}', '{"bad_cdr": 1e999}']
 
     async def pretend(key: str, payload: bytes) -> bytes:
         return b'{"zid": [], "sessions": ' + b"[" * 100_000
 
-    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
-        agent.serve("status", tell)
+    async with AsyncExitStack() as stack:
+        for number, said in enumerate(faults, 1):
+            status = f'{{"ros_node": "/r", "stopped": false, "stop": {{}}, "nodes": [], "drops": {said}}}'
+
+            async def tell(_call: macs_zenoh.Call, status: bytes = status.encode()) -> bytes:
+                return status
+
+            agent = await stack.enter_async_context(macs_zenoh.join("ros", id=number, settings=patient(router)))
+            agent.serve("status", tell)
+            await agent.call("ros", number, "status")
         agent.mesh.serve("@/abcdef/router", pretend)
-        await agent.call("ros", 7, "status")
         for words in (
             ("ls", "-v"),
             ("ls", "-v", "--json"),
@@ -258,7 +259,9 @@ async def test_numbers_that_are_none_end_no_verb(router: str, said: str) -> None
             assert "Traceback" not in errors, (words, errors)
             assert code == 0 or words[0] == "doctor", (words, errors)
             if "--json" in words:
-                json.loads(out, parse_constant=pytest.fail)
+                told = json.loads(out, parse_constant=pytest.fail)
+            if words == ("ls", "-v", "--json"):
+                assert [row["id"] for row in told if row["type"] == "ros"] == [1, 2, 3, 4]
 
 
 async def test_an_answer_that_makes_no_sense_is_told(router: str) -> None:
