@@ -18,11 +18,12 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
 from .agent import Agent
+from .anew import Anew
 from .claims import settle, stale_until
 from .errors import Refused, Unreachable, UsageError, WireError
 from .handles import Callbacks, Handle
@@ -107,7 +108,7 @@ class Awareness:
         self.agent_type = agent_type
         self.agent_id = agent_id
         self.max_bytes = max_bytes
-        self.names = Names()
+        self.names = Names(name, mine=mesh.zid)
         self.counters = Losses(log)
         self._lock = threading.Lock()
         self._keys: dict[tuple[str, str], str] = {}
@@ -125,6 +126,7 @@ class Awareness:
         self._on_change: Callbacks[Callable[[str], None]] = Callbacks()
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._anew = Anew(mesh, [NAME.every(), WANTED.every()], self._again)
 
     def __repr__(self) -> str:
         return f"<Awareness {self.name!r} {AgentId(self.agent_type, self.agent_id)}>"
@@ -415,6 +417,7 @@ class Awareness:
 
     def close(self) -> None:
         """Leave: the name is free at once. The mesh stays open."""
+        self._anew.close()
         for task in self._tasks:
             task.cancel()
         for declared in reversed([*self._declared, *(d for per_type in self._per_type.values() for d in per_type)]):
@@ -427,10 +430,14 @@ class Awareness:
         self._declared.append(declared)
 
     def _token(self, key: str, alive: bool) -> None:
+        if not alive:
+            self._anew.ended(key)
         with self._lock:
-            ignored, name = self.names.ignored, self.names.token(key, alive)
-        if self.names.ignored != ignored:
-            self._lose("too_many_names", "", "more names, or types of one, than are remembered")
+            left_out, name = self.names.left_out, self.names.token(key, alive)
+        if self.names.left_out != left_out:
+            self._lose("too_many_names", "", "more names, or types of one session, than are remembered")
+        if self.names.has_room():
+            self._anew.ask()
         if name is None:
             return
         self._changed.set()
@@ -443,6 +450,11 @@ class Awareness:
                 self._ask(name, message_type)
         for callback in self._on_change:
             callback(name)
+
+    def _again(self, keys: Sequence[str]) -> None:
+        for key in keys:
+            if not self.names.knows(key):
+                self._token(key, True)
 
     def _check_name(self) -> None:
         """Tell once when another agent has our name, each by itself: both were given it, and keep it.

@@ -9,8 +9,9 @@ import asyncio
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
+from .anew import AT_ONCE, Anew
 from .deadline import Deadline
 from .mesh import Mesh, Subscription, Token
 from .mesh.followed import CONFIRM_S
@@ -18,9 +19,6 @@ from .protocol.directory import AgentInfo, Change, Directory
 from .protocol.keyexpr import PRESENCE
 
 log = logging.getLogger("macs.presence")
-
-AT_ONCE = 200
-"""Tokens that are handled without a break, which takes about a millisecond."""
 
 CONTESTED_S = 0.05
 """Pause between two looks at what is contested: each costs what all of it costs, and a merge changes it in steps."""
@@ -39,7 +37,7 @@ class Presence:
     def __init__(
         self, mesh: Mesh, on_changes: Callable[[list[Change]], None], on_contested: Callable[[Contested], None]
     ) -> None:
-        self.directory = Directory()
+        self.directory = Directory(mine=mesh.zid)
         self._mesh = mesh
         self._on_changes = on_changes
         self._on_contested = on_contested
@@ -49,7 +47,8 @@ class Presence:
         self._looking: asyncio.TimerHandle | None = None
         self._news: deque[tuple[str, bool]] = deque()
         self._handling: asyncio.Handle | None = None
-        self._complained = False
+        self._left_out = 0
+        self._anew = Anew(mesh, [PRESENCE.every()], self._again)
         self._sweep = Deadline(self._let_go)
         self._watching: Subscription | None = None
         self._unseen: set[str] = set()
@@ -84,6 +83,8 @@ class Presence:
     def _watched(self, key: str, alive: bool) -> None:
         """A token came or ended. Those that come together are handled in pieces, between which others have their turn:
         one session can have thousands."""
+        if not alive:
+            self._anew.ended(key)
         self._news.append((key, alive))
         if self._handling is None:
             self._handling = asyncio.get_running_loop().call_soon(self._handle)
@@ -96,11 +97,13 @@ class Presence:
             self._changes += self.directory.token(key, alive, time.monotonic())
         if self._news:
             self._handling = asyncio.get_running_loop().call_soon(self._handle)
-        if self.directory.ignored and not self._complained:
-            self._complained = True
-            what = "more than %d agents of a session, %d sessions for one agent, or %d in all"
-            most = Directory.PER_SESSION, Directory.PER_AGENT, Directory.IN_ALL
-            log.warning(f"{what}: the rest is ignored (logged once)", *most)
+        self._tell()
+
+    def _again(self, keys: Sequence[str]) -> None:
+        """Tokens that may have been left out. Those of who is known are old news, maybe of an earlier group."""
+        for key in keys:
+            if not self.directory.knows(key):
+                self._token(key, True)
         self._tell()
 
     def close(self) -> None:
@@ -111,6 +114,7 @@ class Presence:
             if handle is not None:
                 handle.cancel()
         self._sweep.cancel()
+        self._anew.close()
 
     def declare(self, agent_type: int, agent_id: int, group: int, epoch: int = 0, *, asleep: int = 0) -> Token:
         """Be online under this id, until the token is closed. Subscribe the inbox before: who is seen is sent to.
@@ -142,6 +146,16 @@ class Presence:
         self._schedule_sweep()
 
     def _tell(self) -> None:
+        room = self.directory.room
+        if more := room.left_out - self._left_out:
+            self._left_out = room.left_out
+            text = (
+                "more than %d agents of one session, %d sessions of one agent or %d claims in all: some do not count"
+            )
+            most = Directory.PER_SESSION, Directory.PER_AGENT, Directory.IN_ALL
+            self._mesh.drops.once("too_many_claims", text, *most, about="presence", count=more)
+        if room.is_made():
+            self._anew.ask()
         changes, self._changes = self._changes, []
         if changes:
             self._change.set()

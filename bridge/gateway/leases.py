@@ -9,14 +9,16 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 
+from macs_zenoh.anew import Anew
 from macs_zenoh.claims import SETTLE_S, Disputes, stale_until
 from macs_zenoh.errors import ConfigError, Unreachable
 from macs_zenoh.mesh import Mesh, Subscription, Token
 from macs_zenoh.protocol import ids as blocks
 from macs_zenoh.protocol.ids import Contests, FreeIds, Verdict
 from macs_zenoh.protocol.keyexpr import BLOCK_SIZE, LEASE
+from macs_zenoh.protocol.room import Room
 
 log = logging.getLogger("macs.gateway")
 
@@ -30,7 +32,7 @@ TRUTH_S = 2.0
 """How long answers are not believed that leave out what we hold ourselves: a busy router may answer nothing."""
 
 HOLDERS = 16
-"""Sessions that lease the same block, as far as they are remembered: where parts of a mesh meet there are two."""
+"""Sessions that lease the same block, as far as they count: where parts of a mesh meet there are two."""
 
 AGAIN_S = 2.0
 """Pause after an attempt in vain to lease a block."""
@@ -66,6 +68,8 @@ class Leases:
         self.exhausted = False
         """Whether the last attempt found that all blocks are leased."""
         self._holders: dict[int, set[str]] = {}
+        self._room: Room[int] = Room(mesh.zid, sessions=HOLDERS, each=blocks.BLOCKS, total=2 * HOLDERS * blocks.BLOCKS)
+        self._anew = Anew(mesh, [LEASE.every()], self._again)
         self._disputes = Disputes(
             Contests[int](mesh.zid, lambda block: block == wanted or block in only), self._judged
         )
@@ -140,6 +144,7 @@ class Leases:
     def close(self) -> None:
         """Give the blocks back."""
         self._disputes.close()
+        self._anew.close()
         if self._taking is not None:
             self._taking.cancel()
         if self._watching is not None:
@@ -150,13 +155,32 @@ class Leases:
     # -- a block that others have as well ------------------------------------------------------------------------
 
     def _token(self, key: str, alive: bool) -> None:
+        if not alive:
+            self._anew.ended(key)
         if (lease := LEASE.parse(key)) is not None:
-            holders = self._holders.setdefault(lease.block, set())
-            if not alive:
-                holders.discard(lease.zid)
-            elif len(holders) < HOLDERS:
-                holders.add(lease.zid)
+            self._note(lease.block, lease.zid, alive)
             self._look()
+
+    def _again(self, keys: Sequence[str]) -> None:
+        for key in keys:
+            if (lease := LEASE.parse(key)) is not None:
+                self._note(lease.block, lease.zid, True)
+        self._look()
+
+    def _note(self, block: int, zid: str, alive: bool) -> None:
+        holders = self._holders.setdefault(block, set())
+        if not alive and zid in holders:
+            holders.discard(zid)
+            self._room.release(block, zid)
+        elif alive and zid not in holders:
+            out = self._room.take(block, zid, holders)
+            if out is not None:
+                text = "more than %d sessions lease block %d: some do not count"
+                self._mesh.drops.once("too_many_claims", text, HOLDERS, block, about="blocks")
+            holders.add(zid)
+            holders.discard(out or "")
+        if self._room.is_made():
+            self._anew.ask()
 
     def _look(self) -> None:
         self._disputes.look({block: self._holders.get(block, set()) - {self._mesh.zid} for block in self.blocks})

@@ -6,13 +6,14 @@ it came back, a token that ends is only remembered; its agent leaves when the gr
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from hashlib import blake2b
 from typing import NamedTuple
 
 from .agent_id import AgentId
 from .keyexpr import PRESENCE, type_name
+from .messages import ROS
+from .room import Room
 
 EPOCH = "."
 """Between a Zenoh id and an epoch. No Zenoh id has one."""
@@ -92,7 +93,11 @@ class Change(NamedTuple):
 class Directory:
     """Everybody online. Several sessions may claim one (type, id), as after two parts of a mesh met that had both
     given it out; the smallest Zenoh id's claim counts, so that everybody who sees them all sees the same. A claim in
-    doubt counts last: it may be of an earlier life."""
+    doubt counts last: it may be of an earlier life.
+
+    There is `room` for so many claims. A robot that nobody else claims to be is there however many others there are:
+    who is not there is not asked to stop. ``mine`` is the own Zenoh id.
+    """
 
     PER_SESSION = 16 << 10
     """Agents of one Zenoh session: a gateway has as many as it has connections."""
@@ -101,16 +106,15 @@ class Directory:
     IN_ALL = 128 << 10
     """Claims of all; there are 64 Ki ids."""
 
-    def __init__(self, grace_s: float = 2.0) -> None:
+    def __init__(self, grace_s: float = 2.0, *, mine: str = "") -> None:
         self.grace_s = grace_s
-        self.ignored = 0
-        """Tokens that were too many: of one session, for one agent, or of all."""
+        self.room: Room[tuple[int, int]] = Room(
+            mine, sessions=self.PER_AGENT, each=self.PER_SESSION, total=self.IN_ALL
+        )
         self._claims: dict[tuple[int, int], dict[str, AgentInfo]] = {}
         self._ids: dict[int, set[int]] = {}
         self._contested: set[tuple[int, int]] = set()
         self._doubtful: set[AgentInfo] = set()
-        self._tokens_of: Counter[str] = Counter()
-        self._tokens = 0
         self._linked = True
         self._settled_at = 0.0
 
@@ -170,11 +174,7 @@ class Directory:
         if agent is None:
             return []
         if alive:
-            claims = self._claims.get(agent.key, {})
-            if agent.zid not in claims and self._is_full(agent, len(claims)):
-                self.ignored += 1
-                return []
-            return self._claim(agent)
+            return self._claim(agent) if self._has_room(agent) else []
         if not self._linked or now < self._settled_at:
             return self._doubt(agent)
         return self._release(agent)
@@ -198,12 +198,20 @@ class Directory:
         self._doubtful.clear()
         return changes
 
-    def _is_full(self, agent: AgentInfo, claims: int) -> bool:
-        """Whether there is no room for one more claim on an agent that has so many: each costs a look at all of them,
-        and who makes up sessions has no end of them."""
-        if claims >= self.PER_AGENT or self._tokens >= self.IN_ALL:
+    def knows(self, key: str) -> bool:
+        """Whether a token's session is known as that agent, whatever its group; so is what is no presence key."""
+        agent = AgentInfo.parse(key)
+        return agent is None or agent.zid in self._claims.get(agent.key, ())
+
+    def _has_room(self, agent: AgentInfo) -> bool:
+        """Whether a claim counts. Another one may have to go for it."""
+        claims = self._claims.get(agent.key, {})
+        if agent.zid in claims:
             return True
-        return self._tokens_of.get(agent.zid, 0) >= self.PER_SESSION
+        out = self.room.take(agent.key, agent.zid, claims, always=agent.type == ROS and not claims)
+        if out is not None and out != agent.zid:
+            self._doubtful.discard(claims.pop(out))
+        return out != agent.zid
 
     def _current(self, key: tuple[int, int]) -> AgentInfo:
         claims = self._claims[key]
@@ -227,9 +235,6 @@ class Directory:
         before = self._current(agent.key) if claims else None
         replaced = before is not None and before.zid == agent.zid and before.epoch != agent.epoch
         self._doubtful.discard(agent)
-        if agent.zid not in claims:
-            self._tokens_of[agent.zid] += 1
-            self._tokens += 1
         claims[agent.zid] = agent
         if len(claims) > 1:
             self._contested.add(agent.key)
@@ -245,10 +250,7 @@ class Directory:
             return []  # already replaced, e.g. by the same agent in another group
         before = self._current(agent.key)
         del claims[agent.zid]
-        self._tokens -= 1
-        self._tokens_of[agent.zid] -= 1
-        if not self._tokens_of[agent.zid]:
-            del self._tokens_of[agent.zid]
+        self.room.release(agent.key, agent.zid)
         if len(claims) < 2:
             self._contested.discard(agent.key)
         if not claims:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict, deque
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from enum import Enum
 from typing import Annotated, NamedTuple, TypeVar
 
@@ -19,6 +19,7 @@ from ..errors import BadField, BadJson, UsageError
 from .keyexpr import NAME, WANTED, type_name
 from .limits import NESTING
 from .rate import Rate
+from .room import Room
 from .wire import encode_message, split_message
 
 _K = TypeVar("_K")
@@ -121,16 +122,20 @@ class Names:
     Without grace: who has lost the way to the others cannot reach them, and their tokens come back with the link.
     """
 
-    NAMES = 4096
-    TYPES, TYPES_IN_ALL = 512, 16 << 10
-    """Types of each name; a robot's modules take tens."""
+    NAMES, NAMES_IN_ALL = 64, 4096
+    """Of one session, which has one as a rule."""
+    TYPES, TYPES_IN_ALL = 1024, 64 << 10
+    """Of one session; a robot's modules take tens."""
     SESSIONS = 16
     """That say the same."""
 
-    def __init__(self) -> None:
-        self.ignored = 0
-        """Tokens that were too many."""
-        self._types = 0
+    def __init__(self, own: str = "", *, mine: str = "") -> None:
+        """``own`` is the own name, of which it must be known that another has it; ``mine`` the own Zenoh id."""
+        self._own = own
+        self._room: Room[str] = Room(mine, sessions=self.SESSIONS, each=self.NAMES, total=self.NAMES_IN_ALL)
+        self._room_for_types: Room[tuple[str, str]] = Room(
+            mine, sessions=self.SESSIONS, each=self.TYPES, total=self.TYPES_IN_ALL
+        )
         self._claims: dict[str, dict[str, Named]] = {}
         self._wanted: dict[str, dict[str, set[str]]] = {}
 
@@ -148,6 +153,23 @@ class Names:
         if (wanted := WANTED.parse(key)) is not None:
             return self._want(*wanted, alive)
         return None
+
+    def knows(self, key: str) -> bool:
+        """Whether a token's session is known to say this, whatever its id; so is what is no such key."""
+        if (claim := NAME.parse(key)) is not None:
+            return claim.zid in self._claims.get(claim.name, ())
+        if (wanted := WANTED.parse(key)) is not None:
+            return wanted.zid in self._wanted.get(wanted.name, {}).get(wanted.message_type, ())
+        return True
+
+    @property
+    def left_out(self) -> int:
+        """How often a token was one too many."""
+        return self._room.left_out + self._room_for_types.left_out
+
+    def has_room(self) -> bool:
+        """Whether there may be room for something that was left out, since this was last asked."""
+        return any([self._room.is_made(), self._room_for_types.is_made()])
 
     def claims(self) -> list[Named]:
         """Every claim, by name and session: a name that two agents have is listed twice."""
@@ -170,42 +192,45 @@ class Names:
         return (name for name, types in self._wanted.items() if message_type in types and name in self._claims)
 
     def _claim(self, agent: Named, alive: bool) -> str | None:
-        if alive and self._is_full(self._claims, agent.name, self.NAMES, agent.zid):
-            return None
-        claims = self._claims.setdefault(agent.name, {})
-        before = dict(claims)
-        if alive:
-            claims[agent.zid] = agent
-        elif claims.get(agent.zid) == agent:
+        claims = self._claims.get(agent.name, {})
+        before = claims.get(agent.zid)
+        if not alive:
+            if before != agent:
+                return None
             del claims[agent.zid]
-        changed = claims != before
-        if not claims:
-            del self._claims[agent.name]
-        return agent.name if changed else None
-
-    def _is_full(self, table: Mapping[str, Collection[str]], key: str, most: int, zid: str = "") -> bool:
-        """Whether there is no room for one more in a table, or for one more session that says the same."""
-        found = table.get(key)
-        full = len(table) >= most if found is None else bool(zid) and zid not in found and len(found) >= self.SESSIONS
-        self.ignored += full
-        return full
+            self._room.release(agent.name, agent.zid)
+            if not claims:
+                del self._claims[agent.name]
+            return agent.name
+        if before is None:
+            out = self._room.take(agent.name, agent.zid, claims, always=agent.name == self._own and not claims)
+            if out == agent.zid:
+                return None
+            claims.pop(out or "", None)
+        self._claims.setdefault(agent.name, claims)[agent.zid] = agent
+        return agent.name if before != agent else None
 
     def _want(self, name: str, message_type: str, zid: str, alive: bool) -> str | None:
-        known = self._wanted.get(name, {})
-        most = self.TYPES if self._types < self.TYPES_IN_ALL else 0
-        if alive and (self._is_full(self._wanted, name, self.NAMES) or self._is_full(known, message_type, most, zid)):
+        types = self._wanted.get(name, {})
+        zids = types.get(message_type, set())
+        if (zid in zids) == alive:
             return None
-        types = self._wanted.setdefault(name, {})
-        zids = types.setdefault(message_type, set())
-        before = bool(zids)
-        (zids.add if alive else zids.discard)(zid)
-        after = bool(zids)
-        self._types += after - before
-        if not zids:
-            del types[message_type]
+        if alive:
+            out = self._room_for_types.take((name, message_type), zid, zids)
+            if out == zid:
+                return None
+            zids.discard(out or "")
+            zids.add(zid)
+            self._wanted.setdefault(name, types)[message_type] = zids
+            return name if len(zids) == 1 else None
+        zids.discard(zid)
+        self._room_for_types.release((name, message_type), zid)
+        if zids:
+            return None
+        del types[message_type]
         if not types:
             del self._wanted[name]
-        return name if before != after else None
+        return name
 
 
 # -- what is sent ----------------------------------------------------------------------------------------------------

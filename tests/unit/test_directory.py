@@ -278,38 +278,76 @@ def test_other_keys_are_not_presence() -> None:
 
 
 def test_one_session_cannot_fill_the_directory() -> None:
-    """Of one session only so many agents count; those of others do, and room is made by those that leave."""
+    """Of one session only so many agents count; those of others do, and who came before there was room does when he is
+    told of again."""
     directory = Directory()
     for number in range(Directory.PER_SESSION + 10):
         directory.token(key(AgentInfo(3 + number // 60_000, number % 60_000 + 1, 0, "a")), True, 0.0)
-    assert (len(directory), directory.ignored) == (Directory.PER_SESSION, 10)
+    assert (len(directory), directory.room.left_out) == (Directory.PER_SESSION, 10)
     assert directory.token(key(AgentInfo(2, 1, 0, "b")), True, 0.0)
+    early = key(AgentInfo(2, 2, 0, "a"))
+    assert not directory.token(early, True, 0.0)
+    assert not directory.room.is_made()
     assert directory.token(key(AgentInfo(3, 1, 0, "a")), False, 0.0)
-    assert directory.token(key(AgentInfo(2, 2, 0, "a")), True, 0.0)
+    assert directory.room.is_made()
+    assert not directory.knows(early)
+    assert directory.token(early, True, 0.0)
     assert not directory.token(key(AgentInfo(2, 3, 0, "a")), True, 0.0)
 
 
-def test_sessions_that_somebody_makes_up_are_few() -> None:
-    """Of those that claim one agent so many count, and of all claims together; who was there before stays, and room is
-    made by those that end."""
+@given(st.permutations([f"{number:02x}" for number in range(30)]), st.permutations(list(range(30))))
+def test_of_many_claims_the_smallest_count(zids: list[str], order: list[int]) -> None:
+    """Who sees the tokens for one agent in another order sees the same claims and the same holder; what is told adds
+    up, and who holds it himself always sees that."""
+    directory, other = Directory(), Directory(mine="1d")
+    told = [change for zid in zids for change in directory.token(key(ROBOT._replace(zid=zid)), True, 0.0)]
+    for number in order:
+        other.token(key(ROBOT._replace(zid=zids[number])), True, 0.0)
+    smallest = sorted(zids)[: Directory.PER_AGENT]
+    assert sorted(agent.zid for agent in directory.claimants(1, 7)) == smallest
+    assert {agent.zid for agent in other.claimants(1, 7)} <= {*zids}
+    assert other.get(1, 7) == directory.get(1, 7) == told[-1].agent
+    assert "1d" in {agent.zid for agent in other.claimants(1, 7)}
+    assert len(other.contested("1d")[1, 7]) >= Directory.PER_AGENT - 1
+
+
+def test_who_was_left_out_comes_back() -> None:
+    """A robot that came after sixteen made up sessions that claim to be it is there when they are gone and it is told
+    of again; until then there is a robot with this id."""
     directory = Directory()
-    directory.token(key(ROBOT), True, 0.0)
-    for number in range(100):
-        directory.token(key(ROBOT._replace(zid=f"b{number:04x}")), True, 0.0)
-    assert len(directory.claimants(1, 7)) == Directory.PER_AGENT
-    assert directory.get(1, 7) == ROBOT
-    assert directory.ignored == 101 - Directory.PER_AGENT
-    directory.token(key(ROBOT._replace(zid="b0000")), False, 0.0)
-    directory.token(key(ROBOT._replace(zid="c")), True, 0.0)
-    assert "c" in {agent.zid for agent in directory.claimants(1, 7)}
-    directory = Directory()
-    directory.IN_ALL = 50
+    made_up = [ROBOT._replace(zid=f"00{number:04x}") for number in range(Directory.PER_AGENT)]
+    for each in made_up:
+        directory.token(key(each), True, 0.0)
+    assert not directory.token(key(ROBOT), True, 0.0)
+    assert ROBOT.key in directory
+    for each in made_up:
+        directory.token(key(each), False, 0.0)
+    assert directory.room.is_made()
+    assert not directory.room.is_made()
+    assert not directory.knows(key(ROBOT))
+    assert directory.token(key(ROBOT), True, 0.0) == [Change(ROBOT, online=True)]
+    assert directory.knows(key(ROBOT._replace(group=4)))
+    directory.token(key(ROBOT), False, 0.0)
+    assert not directory.room.is_made()
+
+
+def test_all_claims_have_an_end_and_a_robot_is_always_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever others claim, a robot that nobody else claims to be counts, as does what is our own; a headset does
+    when there is room."""
+    monkeypatch.setattr(Directory, "IN_ALL", 50)
+    directory = Directory(mine="99")
     for number in range(60):
         directory.token(key(AgentInfo(2, number + 1, 0, f"{number:04x}")), True, 0.0)
     assert len(directory) == 50
     assert directory.token(key(AgentInfo(2, 1, 3, "0000")), True, 0.0)  # another group, the same claim
-    directory.token(key(AgentInfo(2, 1, 3, "0000")), False, 0.0)
-    assert directory.token(key(AgentInfo(2, 60, 0, "ff")), True, 0.0)
+    assert directory.token(key(ROBOT), True, 0.0)
+    assert directory.token(key(AgentInfo(2, 99, 0, "99")), True, 0.0)
+    late = key(AgentInfo(2, 60, 0, "ff"))
+    assert not directory.token(late, True, 0.0)
+    for number in range(1, 4):
+        directory.token(key(AgentInfo(2, number + 1, 0, f"{number:04x}")), False, 0.0)
+    assert directory.room.is_made()
+    assert directory.token(late, True, 0.0)
 
 
 def test_who_sleeps_is_online_and_does_not_leave() -> None:

@@ -27,6 +27,7 @@ WITH_ZENOH = set((ROOT / "macs_zenoh" / "mesh").glob("*.py"))
 WITH_ASYNCIO = WITH_ZENOH | {
     ROOT / "macs_zenoh" / name
     for name in (
+        "anew.py",
         "agent.py",
         "awareness.py",
         "claims.py",

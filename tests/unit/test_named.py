@@ -214,25 +214,67 @@ def test_an_envelope_is_small_and_flat() -> None:
 
 
 def test_names_and_types_are_bounded() -> None:
-    """One name has so many types, one type so many sessions, all together so many; those that are known stay, and go
-    when their tokens do."""
-    names = Names()
+    """Of one session so many names and types count, and so many sessions that say the same: the smallest, and one's
+    own. Others have room, and those that are known go when their tokens do."""
+    names = Names("own", mine="ff")
     for number in range(Names.TYPES + 10):
-        names.token(WANTED.of(name="greedy", message_type=f"t{number}", zid="1"), True)
-    assert len(names.types("greedy")) == Names.TYPES
-    assert names.ignored == 10
-    assert names.token(WANTED.of(name="modest", message_type="t", zid="2"), True) == "modest"
-    for number in range(Names.SESSIONS + 5):
-        names.token(WANTED.of(name="modest", message_type="t", zid=f"{number:x}f"), True)
-        names.token(NAME.of(name="modest", type=1, id=7, zid=f"{number:x}f"), True)
-    assert len(names.claimants("modest")) == Names.SESSIONS
-    for name in range(200):
-        for number in range(100):
-            names.token(WANTED.of(name=f"n{name}", message_type=f"t{number}", zid="3"), True)
-    assert sum(len(names.types(name)) for name in ("greedy", "modest", *(f"n{n}" for n in range(200)))) == (
-        Names.TYPES_IN_ALL
-    )
-    for number in range(Names.TYPES):
-        names.token(WANTED.of(name="greedy", message_type=f"t{number}", zid="1"), False)
-    assert names.types("greedy") == []
-    assert names.token(WANTED.of(name="late", message_type="t", zid="4"), True) == "late"
+        names.token(WANTED.of(name=f"greedy{number // 512}", message_type=f"t{number}", zid="1"), True)
+    for number in range(Names.NAMES + 10):
+        names.token(NAME.of(name=f"n{number}", type=1, id=7, zid="1"), True)
+    assert sum(len(names.types(f"greedy{number}")) for number in range(4)) == Names.TYPES
+    assert (len(list(names)), names.left_out) == (Names.NAMES, 20)
+    assert names.token(WANTED.of(name="modest", message_type="t", zid="f1"), True) == "modest"
+    zids = [f"{number:02x}f" for number in range(Names.SESSIONS + 5)]
+    for zid in reversed(zids):
+        names.token(WANTED.of(name="modest", message_type="t", zid=zid), True)
+        names.token(NAME.of(name="modest", type=1, id=7, zid=zid), True)
+    assert names.claimants("modest") == zids[: Names.SESSIONS]
+    names.token(NAME.of(name="modest", type=1, id=7, zid="ff"), True)
+    assert names.claimants("modest") == [*zids[: Names.SESSIONS], "ff"]
+    for zid in zids:
+        names.token(WANTED.of(name="modest", message_type="t", zid=zid), False)
+        names.token(NAME.of(name="modest", type=1, id=7, zid=zid), False)
+    assert names.claimants("modest") == ["ff"]
+    assert names.types("modest") == []
+
+
+def test_a_name_that_is_our_own_is_always_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """That another has our name is seen however many names there are."""
+    monkeypatch.setattr(Names, "NAMES_IN_ALL", 40)
+    names = Names("own", mine="ff")
+    for number in range(60):
+        names.token(NAME.of(name=f"n{number}", type=1, id=7, zid=f"{number:02x}"), True)
+    assert len(list(names)) == 40
+    assert names.token(NAME.of(name="own", type=1, id=7, zid="ee"), True) == "own"
+    assert names.token(NAME.of(name="n99", type=1, id=7, zid="ff"), True) == "n99"
+
+
+def test_who_came_before_there_was_room_is_known_when_told_of_again() -> None:
+    """A robot that takes a type while one session has said so for 32 names and 512 types takes it; one that was left
+    out does when it is told of again, and it is known that there is room."""
+    names = Names()
+    for number in range(32 * 512):
+        names.token(WANTED.of(name=f"n{number // 512}", message_type=f"t{number % 512}", zid="1"), True)
+    assert names.token(WANTED.of(name="arm", message_type="std_msgs/String", zid="2"), True) == "arm"
+    assert names.takes("arm", "std_msgs/String")
+    early = WANTED.of(name="late", message_type="t", zid="1")
+    assert names.token(early, True) is None
+    assert not names.has_room()
+    names.token(WANTED.of(name="n0", message_type="t0", zid="1"), False)
+    assert names.has_room()
+    assert not names.has_room()
+    assert not names.knows(early)
+    assert names.token(early, True) == "late"
+    assert names.knows(early)
+    assert names.knows("macs/all/ros/7")
+
+
+def test_a_site_of_three_hundred_robots_has_room() -> None:
+    """300 robots with 55 types each, each in a session of its own, all count."""
+    names = Names()
+    for robot in range(300):
+        names.token(NAME.of(name=f"r{robot}", type=1, id=7, zid=f"{robot:x}f"), True)
+        for number in range(55):
+            names.token(WANTED.of(name=f"r{robot}", message_type=f"t{number}", zid=f"{robot:x}f"), True)
+    assert names.left_out == 0
+    assert len(list(names.takers("t54"))) == 300
