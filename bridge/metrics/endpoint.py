@@ -14,6 +14,7 @@ from contextlib import asynccontextmanager, suppress
 
 from bridge.listening import bound
 from macs_zenoh.errors import UsageError
+from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.addresses import bare, is_local, joined, parse
 from macs_zenoh.protocol.origins import host_problem
 from macs_zenoh.timeouts import within
@@ -44,8 +45,9 @@ _REASONS = {
 class Endpoint:
     """The port. ``host`` and ``port`` are where it listens."""
 
-    def __init__(self, answers: Answers) -> None:
+    def __init__(self, answers: Answers, drops: Losses) -> None:
         self._answers = answers
+        self._drops = drops
         own = socket.gethostname().lower()
         self._names = frozenset({own, f"{own}.local"})
         self._open: dict[asyncio.Task[None], str] = {}
@@ -71,7 +73,10 @@ class Endpoint:
         task = asyncio.current_task()
         assert task is not None
         host = str((writer.get_extra_info("peername") or "?")[0])
-        if len(self._open) >= AT_ONCE or list(self._open.values()).count(host) >= AT_ONCE_EACH:
+        from_there = list(self._open.values()).count(host)
+        if len(self._open) >= AT_ONCE or from_there >= AT_ONCE_EACH:
+            name = "too_many_connections" if len(self._open) >= AT_ONCE else "too_many_from_address"
+            self._drops.once(name, "%s is closed: %d watch already, %d from there", host, len(self._open), from_there)
             writer.transport.abort()
             return
         self._open[task] = host
@@ -135,7 +140,7 @@ async def watched_at(address: str | None, watched: Watched) -> AsyncIterator[Non
     host, port = parse_address(address)
     answers = Answers(watched)
     answers.must_write()
-    endpoint = Endpoint(answers)
+    endpoint = Endpoint(answers, watched.at_port)
     await endpoint.listen(host, port)
     log.info("figures at http://%s/metrics", joined(host, endpoint.port))
     if not is_local(host):

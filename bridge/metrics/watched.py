@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.versions import installed
 
@@ -15,6 +17,8 @@ from .hops import HopTimes
 if TYPE_CHECKING:
     from macs_zenoh.mesh import Mesh
     from macs_zenoh.protocol.directory import Directory
+
+log = logging.getLogger("macs.metrics")
 
 Figures = Callable[[], Iterable[Family]]
 Problems = Callable[[], list[str]]
@@ -45,6 +49,8 @@ class Watched:
         self._facts = facts
         self._directory = directory
         self._hops = HopTimes()
+        self.at_port = Losses(log)
+        """Connections of who watches that were closed."""
         self._began_s = time.monotonic()
         self._versions = {"macs": installed("macs-zenoh"), "zenoh": installed("eclipse-zenoh")}
 
@@ -103,4 +109,5 @@ class Watched:
 
     def _all_lost(self) -> dict[str, Mapping[str, int]]:
         mesh = self._mesh()
-        return {**({"session": dict(mesh.drops)} if mesh is not None else {}), **self._lost()}
+        session = {"session": dict(mesh.drops)} if mesh is not None else {}
+        return {**session, **self._lost(), **({"metrics": dict(self.at_port)} if self.at_port else {})}

@@ -19,6 +19,7 @@ import pytest
 from bridge.gateway import figures
 from bridge.headset.client import Headset
 from bridge.metrics import answers
+from bridge.metrics.endpoint import AT_ONCE_EACH
 from bridge.tokens import store
 from macs_zenoh.protocol.messages import Configuration, encode_management
 from macs_zenoh.protocol.rights import Rights
@@ -27,6 +28,8 @@ from macs_zenoh.protocol.wire import encode_frame
 from tests.support.given import Connect, StartGateway
 from tests.support.programs import Program, free_port
 from tests.support.waiting import until
+
+TOO_MANY = "too_many_from_address"
 
 
 async def get(url: str, **headers: str) -> tuple[int, str]:
@@ -127,6 +130,8 @@ async def test_what_is_no_request_costs_nothing() -> None:
             return (await said(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")).endswith(b"ok\n")
 
         await until(answered, every_s=0.05)
+        counted = figure((await get(f"{where}/metrics"))[1], "macs_drops_total", where="metrics", counter=TOO_MANY)
+        assert counted >= 40 + 1 - AT_ONCE_EACH
 
 
 async def test_one_address_does_not_take_all_places() -> None:
