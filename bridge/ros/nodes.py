@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from typing import TypeVar
 
 from bridge.ros.actions import ActionNode, tell_no_goal
 from bridge.ros.early import ASKING, EarlyMessages, NodeKey
@@ -60,6 +61,8 @@ MOVING = (NodeType.PUBLISHER, NodeType.ACTION)
 GONE_S = 2.0
 """After so long nothing of a removed node is left in ROS."""
 LOOK_S = 0.05
+
+T = TypeVar("T")
 
 Work = tuple[int, str]
 """What a node is the only one for: its type, and the full name of its topic, service or action. Topics of the robot
@@ -501,9 +504,7 @@ class InterfaceNodes:
             opened = asyncio.wrap_future(self.robot.session.submit(partial(self._open_entity, node)))
 
     def _note_removed(self, topic: str) -> None:
-        now = self._loop.time()
-        self._removed = {gone: at for gone, at in self._removed.items() if at > now - GONE_S}
-        self._removed[topic] = now
+        _note(self._removed, topic, self._loop.time())
 
     def _linger(self, node: InterfaceNode, registrant: Registrant) -> None:
         """Its gateway may only have lost the way to us: what it will ask for then has to be there."""
@@ -517,11 +518,8 @@ class InterfaceNodes:
             lingering.cancel()
 
     def _note_left(self, node: InterfaceNode, registrant: Registrant) -> None:
-        now = self._loop.time()
-        for gone in [gone for gone, at in self._left.items() if at < now - GONE_S]:
-            del self._left[gone]
         for key in {node.key, *self._places.names_of(node, registrant)}:
-            self._left[key, registrant] = now
+            _note(self._left, (key, registrant), self._loop.time())
 
     def _has_just_left(self, key: NodeKey, message: Message) -> bool:
         """Whether the sender has taken a node back that its message was for: a removal is a call, and overtakes."""
@@ -585,6 +583,15 @@ class InterfaceNodes:
         """What nobody will answer: tell who waits for it."""
         tell_failure(self.robot, message, "refused", reason)
         tell_no_goal(self.robot, message, reason)
+
+
+def _note(table: dict[T, float], what: T, now: float) -> None:
+    """Note when something was, in a table that has them in their order, and forget what has gone by now: few of them
+    each time, however many there are."""
+    table.pop(what, None)
+    table[what] = now
+    while table[first := next(iter(table))] <= now - GONE_S:
+        del table[first]
 
 
 def _work(node: InterfaceNode) -> Work:

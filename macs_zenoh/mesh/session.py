@@ -6,6 +6,7 @@ import asyncio
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import TracebackType
@@ -38,6 +39,9 @@ from .tracing import Tracing
 from .zenoh_config import check_files, first_line, id_is_chosen, insert, zenoh_config
 
 log = logging.getLogger("macs.mesh")
+
+TOKENS_AT_ONCE = 200
+"""So many tokens are told of without a break."""
 
 BEAT_S = 5.0
 """How often it is tried whether Zenoh still works in this process."""
@@ -455,10 +459,23 @@ class Mesh:
 
     def watch_tokens(self, key: str, on_change: Callable[[str, bool], None]) -> Subscription:
         """Call ``on_change(key, alive)`` for every token that exists, comes or goes."""
+        news: deque[tuple[str, bool]] = deque()
 
         def receive(sample: zenoh.Sample) -> None:
             keep_attached()
-            self._from_thread(on_change, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+            news.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+            if len(news) == 1:  # to wake the loop for each costs more than the rest
+                self._from_thread(tell)
+
+        def tell() -> None:
+            try:
+                for _ in range(TOKENS_AT_ONCE):
+                    if not news:
+                        return
+                    on_change(*news.popleft())
+            finally:
+                if news:
+                    self._loop.call_soon(tell)
 
         return Subscription(
             self._session.liveliness().declare_subscriber(

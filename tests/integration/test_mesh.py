@@ -277,3 +277,38 @@ async def test_what_brings_too_much_is_refused_while_the_loop_is_busy(router: st
         assert len(told) == 1
         assert b"refused" in told[0]
         serving.close()
+
+
+async def test_tokens_that_come_together_are_each_told_of(router: str) -> None:
+    """In their order, whatever becomes of one of them, and the loop goes on in between."""
+    told: list[str] = []
+    ticks = 0
+
+    def hear(key: str, alive: bool) -> None:
+        told.append(f"{key} {alive}")
+        if len(told) % 100 == 7:
+            raise ValueError("on purpose")
+
+    async def tick() -> None:
+        nonlocal ticks
+        while True:
+            await asyncio.sleep(0)
+            ticks += bool(told) and len(told) < 2000
+
+    failed: list[object] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, about: failed.append(about["exception"]))
+    here = patient(router)
+    async with await Mesh.open(here) as watcher, await Mesh.open(here) as other:
+        watching = watcher.watch_tokens("macs/name/*", hear)
+        ticking = asyncio.ensure_future(tick())
+        tokens = [other.declare_token(f"macs/name/{number}") for number in range(1000)]
+        await until(lambda: len(told) == 1000)
+        for token in tokens:
+            token.close()
+        await until(lambda: len(told) == 2000)
+        ticking.cancel()
+        for alive, part in ((True, told[:1000]), (False, told[1000:])):
+            assert sorted(part) == sorted(f"macs/name/{number} {alive}" for number in range(1000))
+        assert len(failed) == 20
+        assert ticks > 5
+        watching.close()
