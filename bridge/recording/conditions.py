@@ -8,7 +8,7 @@ import msgspec
 from msgspec import UNSET
 
 from bridge.recording.streams import CONTROL, DEADMAN, DROPS, STATUS, STOPS
-from macs_zenoh.protocol.robot_state import NodeStatus, RobotStatus
+from macs_zenoh.protocol.robot_state import NodeStatus, RobotStatus, tripped
 
 STOP, DEAD_MAN = "stop", "deadman"
 """What a ring is written for."""
@@ -41,7 +41,8 @@ class Condition:
         before, self._last, self._stable = self._last, status, stable
         events = [self._event(STATUS, {"status": msgspec.to_builtins(status)}, keep="status")]
         events += self._stops(before, status)
-        events += self._nodes(before, status)
+        events += self._controls(before, status)
+        events += self._deadmen(before, status)
         events += self._drops(before, status)
         return events
 
@@ -59,7 +60,7 @@ class Condition:
         is_new = now.stop.times > was[1] or (now.stopped and not was[0])
         return [self._event(STOPS, value, keep="stop", trigger=STOP if is_new and before is not None else "")]
 
-    def _nodes(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
+    def _controls(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
         events = []
         known = {(node.role, node.name): node for node in before.nodes} if before is not None else {}
         for node in now.nodes:
@@ -68,13 +69,18 @@ class Condition:
             if holder != held:
                 who = {"topic": node.name, "holder": holder, "before": held}
                 events.append(self._event(CONTROL, who, keep=f"control {node.name}"))
-            if node.deadman is not UNSET:
-                trips = old.deadman.trips if old is not None and old.deadman is not UNSET else 0
-                if node.deadman.trips > trips:
-                    value = {"topic": node.name, "trips": node.deadman.trips, "why": node.deadman.last}
-                    trigger = DEAD_MAN if before is not None else ""
-                    events.append(self._event(DEADMAN, value, trigger=trigger))
         return events
+
+    def _deadmen(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
+        """Those that have acted since. Of what was before the first look nobody knows when: it is in the state."""
+        if before is None:
+            return []
+        known = tripped(before)
+        return [
+            self._event(DEADMAN, {"topic": topic, "trips": told.times, "why": told.why}, trigger=DEAD_MAN)
+            for topic, told in tripped(now).items()
+            if told.times > (known[topic].times if topic in known else 0)
+        ]
 
     def _drops(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
         was = before.drops if before is not None else {}
@@ -113,4 +119,5 @@ def _stable(status: RobotStatus) -> object:
             )
         )
     stop = status.stop
-    return (status.ros_node, status.stopped, stop.by, stop.pressed, stop.times, nodes, status.drops, status.ros_domain)
+    told = (stop.by, stop.pressed, stop.times)
+    return (status.ros_node, status.stopped, told, nodes, status.drops, status.trips, status.ros_domain)

@@ -57,12 +57,12 @@ def _figures(robot: RobotAgent) -> Iterator[Family]:
     goals = gauge("macs_robot_running_goals", "goals that actions work on").add(0)
     messages = counter("macs_topic_messages", "messages of a topic: out to the mesh, in to ROS")
     carried = counter("macs_topic_bytes", "their bytes of CDR")
+    for topic, (times, _) in robot.nodes.robot.trips.all().items():
+        trips.add(times, topic=topic)
     for node in robot.nodes:
         status = node.status()
         nodes.add(1, role=status.role)
         registrants.add(len(status.registrants), role=status.role)
-        if status.deadman is not UNSET:
-            trips.add(status.deadman.trips, topic=status.name)
         if status.control is not UNSET and status.control.holder:
             controlled.add(1)
         if status.open_calls is not UNSET:

@@ -15,7 +15,7 @@ from bridge.ros.alarms import Alarms
 from bridge.ros.early import NodeKey
 from bridge.ros.refusals import Refusals
 from bridge.ros.rules import Rules
-from bridge.ros.safety import EmergencyStop
+from bridge.ros.safety import EmergencyStop, Trips
 from bridge.ros.side import Side
 from bridge.ros.types import InterfaceName
 from macs_zenoh.config import Priority
@@ -82,6 +82,7 @@ class Robot:
         is_online: whether an agent has been seen: what it sends can come before its presence, on which its rights
             may depend.
         stop: the emergency stop.
+        trips: which dead-men have acted.
         no_stop: why there is none, though the settings want one. Until there is, nobody acts on the robot.
         alarms: calls back at a time, whatever the loop is busy with.
         refusals: who was told lately why what he sent was not taken.
@@ -99,6 +100,7 @@ class Robot:
     group_of: Callable[[Registrant], int] = lambda agent: 0
     is_online: Callable[[Registrant], bool] = lambda agent: True
     stop: EmergencyStop = field(default_factory=EmergencyStop)
+    trips: Trips = field(default_factory=Trips)
     no_stop: str = ""
     prioritise_stream: Callable[[str, Priority | None], None] = lambda node, priority: None
     keep_stream: Callable[[str, int | None], bool] = lambda node, frames: False

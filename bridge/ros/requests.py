@@ -20,7 +20,7 @@ from bridge.ros.topics import PublisherNode
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.credit import Credit
 from macs_zenoh.protocol.messages import NodeType
-from macs_zenoh.protocol.robot_state import ControlReply, ControlRequest, RobotStatus, StopStatus
+from macs_zenoh.protocol.robot_state import ControlReply, ControlRequest, RobotStatus, StopStatus, TripsStatus
 
 FRESH_PER_S = 100.0
 GOOD_S = 0.05
@@ -74,6 +74,7 @@ def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int])
             history=stop.history,
         ),
         nodes=[node.status() for node in nodes],
+        trips={topic: TripsStatus(*told) for topic, told in nodes.robot.trips.all().items()},
         drops={**lost_before, **nodes.drops},
         max_timed_command_age_s=nodes.robot.rules.settings.max_timed_command_age_s,
     )

@@ -6,6 +6,7 @@ Pure: the time is passed in, in seconds. Agents are whatever identifies them.
 from __future__ import annotations
 
 import math
+import threading
 import uuid
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
@@ -75,6 +76,7 @@ class DeadMan:
         self.silence_s = silence_s
         self.trips = 0
         self.why = ""
+        self.on_trip: Callable[[str], None] = lambda why: None
         self._commander: Hashable | None = None
         self._last = -math.inf
 
@@ -111,7 +113,32 @@ class DeadMan:
         self._commander = None
         self.trips += 1
         self.why = why
+        self.on_trip(why)
         return True
+
+
+class Trips:
+    """How often the dead-man of each topic has acted, and why the last time: also of those whose node has gone, as
+    when who commanded has left. From any thread."""
+
+    MOST = 256
+
+    def __init__(self) -> None:
+        self._of: dict[str, tuple[int, str]] = {}
+        self._lock = threading.Lock()
+
+    def note(self, topic: str, why: str) -> None:
+        """One has acted."""
+        with self._lock:
+            times, _ = self._of.pop(topic, (0, ""))
+            self._of[topic] = times + 1, why
+            if len(self._of) > self.MOST:
+                del self._of[next(iter(self._of))]
+
+    def all(self) -> dict[str, tuple[int, str]]:
+        """By topic, those that have."""
+        with self._lock:
+            return dict(self._of)
 
 
 @dataclass

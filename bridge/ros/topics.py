@@ -13,6 +13,7 @@ import math
 import threading
 import time
 from collections.abc import Iterable
+from functools import partial
 
 from msgspec import UNSET, UnsetType, structs
 
@@ -83,6 +84,8 @@ class PublisherNode(TopicNode):
         if self.control is not None:
             self.control.on_taken = lambda agent: robot.audit.record("control_taken", who(str(agent)), self.topic)
         self.deadman = DeadMan(self.rule.deadman_s) if self.rule.deadman_message is not None else None
+        if self.deadman is not None:
+            self.deadman.on_trip = partial(robot.trips.note, self.topic)
         self._stop_cdr = b""
         self._stopped_at = -math.inf
         self._watch: Alarm | None = None

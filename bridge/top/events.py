@@ -10,7 +10,7 @@ from msgspec import UNSET
 
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import AgentInfo
-from macs_zenoh.protocol.robot_state import RobotStatus
+from macs_zenoh.protocol.robot_state import RobotStatus, tripped
 
 SHORT = 8
 """Of a session's id so much tells it from others."""
@@ -138,20 +138,16 @@ def _controls(who: str, before: RobotStatus, after: RobotStatus, at_s: float) ->
         if (holder := has.get(topic)) != had.get(topic):
             text = f"{holder} has control of {topic} on {who}" if holder else f"nobody has control of {topic} on {who}"
             yield Event(at_s, "control", who, text, holder or "")
-    tripped, trips = _trips(before), _trips(after)
-    for topic, (count, last) in trips.items():
-        if count > tripped.get(topic, (0, ""))[0]:
-            yield Event(at_s, "dead-man", who, f"the dead-man of {topic} on {who} has acted: {last}")
+    had_tripped = tripped(before)
+    for topic, told in tripped(after).items():
+        if told.times > (had_tripped[topic].times if topic in had_tripped else 0):
+            yield Event(at_s, "dead-man", who, f"the dead-man of {topic} on {who} has acted: {told.why}")
 
 
 def _holders(status: RobotStatus) -> dict[str, str]:
     return {
         node.name: node.control.holder for node in status.nodes if node.control is not UNSET and node.control.holder
     }
-
-
-def _trips(status: RobotStatus) -> dict[str, tuple[int, str]]:
-    return {node.name: (node.deadman.trips, node.deadman.last) for node in status.nodes if node.deadman is not UNSET}
 
 
 def _registered(status: RobotStatus) -> set[tuple[str, str, str]]:

@@ -32,6 +32,13 @@ class DeadManStatus(Struct, frozen=True):
     last: str = ""
 
 
+class TripsStatus(Struct, frozen=True):
+    """How often the dead-man of a topic has acted, and why the last time."""
+
+    times: Count = 0
+    why: str = ""
+
+
 class GoalStatus(Struct, frozen=True):
     """A goal that an action works on, or whose result waits; ``status`` as ROS numbers it."""
 
@@ -83,11 +90,24 @@ class RobotStatus(Struct, frozen=True):
     stop: StopStatus
     nodes: list[NodeStatus]
     drops: dict[str, Count] = {}
+    trips: dict[str, TripsStatus] | UnsetType = UNSET
+    """By topic, also where nobody commands it any more."""
     ros_domain: int | None = None
     beside: str | UnsetType = UNSET
     """What its agent cannot do for its safety, where that is a program beside the robot."""
     max_timed_command_age_s: float | UnsetType = UNSET
     """It asks what time commands were made, and how old they may be; 0: of any age."""
+
+
+def tripped(status: RobotStatus) -> dict[str, TripsStatus]:
+    """By topic: of an older robot those of the nodes that it has now."""
+    if status.trips is not UNSET:
+        return status.trips
+    return {
+        node.name: TripsStatus(node.deadman.trips, node.deadman.last)
+        for node in status.nodes
+        if node.deadman is not UNSET
+    }
 
 
 class TopicQos(Struct, frozen=True):

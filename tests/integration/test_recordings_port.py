@@ -128,8 +128,9 @@ async def test_a_page_from_elsewhere_begins_nothing(site: Site) -> None:
     assert (await site.state())["recording"] is None
 
 
-async def test_record_list_and_download(site: Site) -> None:
-    """Started and stopped from the port: the file is in the list, whole, and what is downloaded is the file."""
+async def test_record_list_and_download(site: Site, tmp_path: Path) -> None:
+    """Started and stopped from the port: the file is in the list, whole, and what is downloaded is the file. The
+    record has who did each of it."""
     status, begun = await site.post("start", commands=True, topics=["/chatter"])
     assert status == 200
     status, again = await site.post("start")
@@ -153,6 +154,14 @@ async def test_record_list_and_download(site: Site) -> None:
     with Bag(site.folder / begun["name"]) as bag:
         about = dict(bag.metadata())["macs.recording"]
     assert (about["topics"], about["commands"]) == ("/chatter", "true")
+
+    def noted() -> list[tuple[str, str]]:
+        lines = [json.loads(line) for line in (tmp_path / "audit.jsonl").read_text().splitlines()]
+        assert {line["by"]["token"] for line in lines if line["event"] == "recording"} <= {"desk"}
+        return [(line["what"], line["result"]) for line in lines if line["event"] == "recording"]
+
+    done = [("start", "done"), ("stop", "done"), (f"download {begun['name']}", "done")]
+    await until(lambda: [each for each in noted() if each[1] == "done"] == done)
 
 
 async def test_what_happened(site: Site) -> None:

@@ -318,6 +318,44 @@ async def test_a_ring_is_written_at_a_stop_and_when_asked(site: Site, peer: Peer
     assert not (site.folder / "a.mcap").exists()
 
 
+@pytest.mark.parametrize("why", ["silence", "it left", "its publisher went"])
+async def test_a_ring_is_written_when_a_dead_man_acts(site: Site, peer: Peer, why: str) -> None:
+    """By the settings, whatever ended the commands: the file says on which topic and why, and has the stop message."""
+    settings = site.folder / "record.toml"
+    settings.write_text('[record]\non = ["stop", "deadman"]\nafter_s = 0.5\n')
+    driven = await peer.subscription(Twist, "/cmd_vel")
+    twist = Twist()
+    twist.linear.x = 0.5
+    async with (
+        Program("gateway", "--port", "0", "-e", site.endpoint) as gateway,
+        site.record("--commands", "--ring", "30s", "--settings", str(settings)) as recording,
+    ):
+        headset = await Headset.connect("127.0.0.1", gateway.port)
+        commands = await headset.advertise("/cmd_vel", "geometry_msgs/Twist", agents=[7])
+        await peer.sees("/cmd_vel", publishers=1, subscriptions=2)
+        await recording.has(site, topics=2)
+        await commands.publish(bytes(serialize_message(twist)))
+        assert (await get(driven)).linear.x == 0.5
+        if why == "it left":
+            await headset.close()
+        elif why == "its publisher went":
+            await commands.close()
+        assert (await get(driven)).linear.z == -1
+        await until(lambda: any("a_deadman_" in line for line in recording.said))
+        await headset.close()
+    (path,) = site.folder.glob("a_deadman_*.mcap")
+    assert problems(path) == []
+    (acted,) = json_lines(path, "/macs/deadman")
+    assert (acted["robot"], acted["topic"]) == (7, "/cmd_vel")
+    assert acted["why"]
+    with Bag(path) as bag:
+        carried_out = [
+            deserialize_message(message.data, Twist).linear.z
+            for message in bag.messages(lambda channel: channel.topic == "/7/cmd_vel")
+        ]
+    assert -1 in carried_out
+
+
 async def test_a_recording_ends_for_nobody_who_is_not_named(site: Site) -> None:
     """Others than those of [record] allow neither end it nor have its ring written; those do, one file at a time, and
     no more files than ring_files."""

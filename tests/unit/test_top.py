@@ -6,6 +6,7 @@ import io
 
 import msgspec
 import pytest
+from msgspec import structs
 from rich.console import Console
 
 from bridge.top.events import KINDS, Event, of_robot
@@ -21,6 +22,7 @@ from macs_zenoh.protocol.robot_state import (
     NodeStatus,
     RobotStatus,
     StopStatus,
+    TripsStatus,
 )
 from macs_zenoh.protocol.routers import Router, Trips
 
@@ -71,6 +73,14 @@ def kinds(events: list[Event]) -> list[str]:
         (status(drive()), status(drive("unity/256")), "control", "unity/256 has control of /cmd_vel on ros/7"),
         (status(drive("unity/256")), status(drive()), "control", "nobody has control of /cmd_vel on ros/7"),
         (status(drive()), status(drive(trips=1)), "dead-man", "the dead-man of /cmd_vel on ros/7 has acted: silence"),
+        (
+            structs.replace(status(drive()), trips={"/arm": TripsStatus(1, "silence")}),
+            structs.replace(
+                status(), trips={"/arm": TripsStatus(1, "silence"), "/cmd_vel": TripsStatus(1, "it left")}
+            ),
+            "dead-man",
+            "the dead-man of /cmd_vel on ros/7 has acted: it left",
+        ),
         (
             status(),
             status(drops={"stopped": 3}),
