@@ -72,7 +72,9 @@ def on_site(args: argparse.Namespace, work: Callable[[Site], Awaitable[int]], *,
             robots.session(settings.mesh, timeout_s=args.wait) as mesh,
             joined(mesh, joining[0], id=joining[1]) as agent,
         ):
-            return await work(Site(agent, chosen, args.wait))
+            nobody = not agent.directory.of_type(ROS)
+            elsewhere = robots.here(await robots.elsewhere(mesh, timeout_s=args.wait)) if nobody else ""
+            return await work(Site(agent, chosen, args.wait, elsewhere))
 
     return running.until_stopped(run, interrupted=0 if endless else running.INTERRUPTED)
 
@@ -89,8 +91,8 @@ def looking(args: argparse.Namespace, work: Callable[[Looking], Awaitable[int]])
         async with robots.operator(settings.mesh, caller, timeout_s=args.wait) as operator:
             online = [agent for agent in await operator.online() if agent.type == ROS]
 
-            def ask(robot: int, verb: str) -> Awaitable[bytes]:
-                return operator.ask(robot, verb, timeout_s=args.wait)
+            def ask(robot: int, verb: str, data: bytes) -> Awaitable[bytes]:
+                return operator.ask(robot, verb, data, timeout_s=args.wait)
 
             elsewhere = "" if online else robots.here(await operator.elsewhere())
             return await work(Looking(lambda: online, ask, chosen, args.wait, elsewhere))

@@ -89,9 +89,11 @@ async def _ping(operator: Operator, args: argparse.Namespace) -> int:
     from bridge.graph.probes import Times, summary
 
     times, sent, problem = Times(), 0, ""
-    found = next((each for each in await operator.online() if each.key == (ROS, args.robot)), None)
+    online = [each for each in await operator.online() if each.type == ROS]
+    found = next((each for each in online if each.id == args.robot), None)
     if found is None:
-        raise Unreachable(f"robot {args.robot}", "it is not online (macs ls)")
+        elsewhere = "" if online else robots.here(await operator.elsewhere())
+        raise Unreachable(f"robot {args.robot}", f"it is not online{elsewhere} (macs ls)")
     data = bytes(args.size)
     try:
         for number in range(1, args.count + 1):

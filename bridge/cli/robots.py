@@ -129,11 +129,7 @@ class Operator:
 
     async def elsewhere(self) -> Counter[str]:
         """How many agents there are in other namespaces."""
-        found: Counter[str] = Counter()
-        for key in set(await self._mesh.tokens(keyexpr.everywhere(PRESENCE), timeout_s=self._timeout_s)):
-            if namespace := keyexpr.namespace_of(PRESENCE, key):
-                found[namespace] += 1
-        return found
+        return await elsewhere(self._mesh, timeout_s=self._timeout_s)
 
     async def why_silent(self, robot: AgentInfo, gateways: Collection[str], *, timeout_s: float) -> str:
         """Why a robot that is online does not serve a verb; empty when it need not: it is behind a gateway, or it
@@ -167,6 +163,15 @@ class Operator:
         key, frame = call((ROS, robot), verb, self._caller, data, Metadata(*self._caller), self._layout)
         traffic = Traffic.COMMAND if urgent else Traffic.CALL
         return await self._mesh.query(key, frame, timeout_s=timeout_s, traffic=traffic)
+
+
+async def elsewhere(mesh: Mesh, *, timeout_s: float) -> Counter[str]:
+    """How many agents a session sees in other namespaces."""
+    found: Counter[str] = Counter()
+    for key in set(await mesh.tokens(keyexpr.everywhere(PRESENCE), timeout_s=timeout_s)):
+        if namespace := keyexpr.namespace_of(PRESENCE, key):
+            found[namespace] += 1
+    return found
 
 
 @asynccontextmanager

@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 async def _stop(settings: Settings, args: argparse.Namespace) -> int:
-    outcomes = []
+    outcomes, elsewhere = [], ""
     caller = robots.chosen_caller(args, settings.operator)
     async with robots.operator(settings.mesh, caller, timeout_s=args.timeout) as operator:
         ids = await _chosen(operator, args)
@@ -99,11 +99,13 @@ async def _stop(settings: Settings, args: argparse.Namespace) -> int:
             for task in asked:
                 task.cancel()
             await asyncio.gather(*asked, return_exceptions=True)
+        if not ids:
+            elsewhere = robots.here(await operator.elsewhere())
     if args.json:
         ordered = sorted(outcomes, key=lambda outcome: outcome.id)
         output.say_if_possible(json.dumps([asdict(outcome) for outcome in ordered]))
     elif not outcomes:
-        output.say_if_possible("no such robot is online")
+        output.say_if_possible(f"no such robot is online{elsewhere}")
     return 0 if outcomes and all(outcome.done for outcome in outcomes) else 1
 
 

@@ -95,7 +95,7 @@ def _add_info(verbs: Any) -> None:
     parser = named.add_verb(
         verbs,
         "info",
-        "type of a topic and which robots have it; -v: QoS, who is registered, who has control",
+        "type of a topic and which robots have it; -v: QoS, who is registered, who has control, the type's definition",
         "example:\n  macs topic info /cmd_vel -v\n\n"
         "what it prints:\n  Type: geometry_msgs/msg/Twist\n  Publisher count: 0\n  Subscription count: 1 (robot 7)",
         _info,
@@ -221,10 +221,12 @@ def _info(args: argparse.Namespace) -> int:
         if not about["robots"]:
             near = closest(name, [topic.name for topic in lists.topics(offers)])
             raise Unreachable(f"topic {name}", f"no robot has it{f'; did you mean {near}?' if near else ''}")
+        told = await site.definitions(lists.types_at(name, offers)) if args.details else {}
         if args.json:
-            named.emit(about)
+            named.emit({**about, "definitions": lists.definitions(told)} if args.details else about)
         else:
-            output.say("\n".join(map(plain, lists.shown_topic(about, verbose=args.details))))
+            shown = lists.shown_topic(about, verbose=args.details) + lists.shown_definitions(told)
+            output.say("\n".join(map(plain, shown)))
         return 0
 
     return named.looking(args, work)

@@ -6,7 +6,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
+
 from macs_zenoh.protocol.robot_state import NodeStatus, Offered, RobotStatus, TopicQos
+from macs_zenoh.protocol.schemas import DefinitionsReply
 
 HIDDEN = ("/parameter_events", "/rosout")
 """Topics that every ROS node has; nobody looks for them here."""
@@ -106,6 +109,37 @@ def about_topic(name: str, offers: Mapping[int, Offered], states: Mapping[int, R
             }
         )
     return {**known.facts(), "robots": robots}
+
+
+def types_at(name: str, offers: Mapping[int, Offered]) -> dict[int, str]:
+    """The type of a topic, by robot that has it."""
+    found = {robot: offered.publishers.get(name) or offered.subscribers.get(name) for robot, offered in offers.items()}
+    return {robot: of_type for robot, of_type in sorted(found.items()) if of_type}
+
+
+def definitions(told: Mapping[int, DefinitionsReply]) -> list[dict[str, Any]]:
+    """How robots define types, for programs; those that define them alike are together."""
+    alike: dict[bytes, list[int]] = {}
+    for robot, reply in told.items():
+        alike.setdefault(msgspec.json.encode([reply.definitions, reply.missing]), []).append(robot)
+    found = []
+    for text, robots in alike.items():
+        types, missing = msgspec.json.decode(text)
+        found.append({"robots": robots, "types": types, "missing": missing})
+    return found
+
+
+def shown_definitions(told: Mapping[int, DefinitionsReply]) -> list[str]:
+    """The same for people."""
+    lines = []
+    for each in definitions(told):
+        robots = ", ".join(map(str, each["robots"]))
+        lines += ["", f"Definition (robot{'' if len(each['robots']) == 1 else 's'} {robots}):"]
+        for name, definition in each["types"].items():
+            lines.append(f"  {name} {definition['hash']}".rstrip())
+            lines += [f"    {line}" for line in definition["text"].splitlines()]
+        lines += [f"  {name}: {why}" for name, why in each["missing"].items()]
+    return lines
 
 
 def _holder(nodes: Iterable[NodeStatus]) -> str | None:

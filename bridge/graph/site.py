@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable, Collection, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
 import msgspec
 
+from macs_zenoh import robot_types
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError, Refused, TooLong, Unreachable, UsageError
 from macs_zenoh.protocol import ping
@@ -20,10 +21,12 @@ from macs_zenoh.protocol.limits import ANSWER_BYTES
 from macs_zenoh.protocol.messages import ROS, NodeType
 from macs_zenoh.protocol.offers import absolute, closest, type_behind
 from macs_zenoh.protocol.robot_state import Offered, RobotStatus
+from macs_zenoh.protocol.schemas import DefinitionsReply
 
 log = logging.getLogger("macs.graph")
 
 Told = TypeVar("Told", Offered, RobotStatus)
+_T = TypeVar("_T")
 
 PINGS = 5
 """Of so many comparisons of two clocks the closest one counts."""
@@ -49,13 +52,13 @@ class Clock:
 
 
 class Looking:
-    """The robots that somebody sees. ``known`` are those online, ``ask(robot, verb)`` asks one; ``timeout_s`` bounds
-    each answer; ``elsewhere`` follows "none is online"."""
+    """The robots that somebody sees. ``known`` are those online, ``ask(robot, verb, data)`` asks one; ``timeout_s``
+    bounds each answer; ``elsewhere`` follows "none is online"."""
 
     def __init__(
         self,
         known: Callable[[], Collection[AgentInfo]],
-        ask: Callable[[int, str], Awaitable[bytes]],
+        ask: Callable[[int, str, bytes], Awaitable[bytes]],
         chosen: Chosen,
         timeout_s: float,
         elsewhere: str = "",
@@ -110,20 +113,19 @@ class Looking:
         """How these robots are, likewise."""
         return await self._told(robots, "status", RobotStatus)
 
+    async def definitions(self, types: Mapping[int, str]) -> dict[int, DefinitionsReply]:
+        """How each of these robots defines its type, with what that needs, likewise."""
+
+        def asked(robot: int, of_type: str) -> Awaitable[DefinitionsReply]:
+            return robot_types.definitions(lambda verb, data: self._call(robot, verb, data), [of_type])
+
+        return await _each(types, [asked(robot, of_type) for robot, of_type in types.items()])
+
     async def _told(self, robots: Collection[int], verb: str, kind: type[Told]) -> dict[int, Told]:
-        answers = await asyncio.gather(*(self._ask(robot, verb, kind) for robot in robots), return_exceptions=True)
-        told: dict[int, Told] = {}
-        for robot, answer in zip(robots, answers, strict=True):
-            if isinstance(answer, MacsError):
-                log.warning("robot %d does not tell what it has: %s", robot, answer)
-            elif isinstance(answer, BaseException):
-                raise answer
-            else:
-                told[robot] = answer
-        return told
+        return await _each(robots, [self._ask(robot, verb, kind) for robot in robots])
 
     async def _ask(self, robot: int, verb: str, kind: type[Told]) -> Told:
-        answer = await self._call(robot, verb)
+        answer = await self._call(robot, verb, b"")
         try:
             if len(answer) > ANSWER_BYTES:
                 raise TooLong("an answer", len(answer), ANSWER_BYTES)
@@ -135,12 +137,13 @@ class Looking:
 class Site(Looking):
     """The robots that an agent sees, who may do more with them than look."""
 
-    def __init__(self, agent: Agent, chosen: Chosen, timeout_s: float) -> None:
+    def __init__(self, agent: Agent, chosen: Chosen, timeout_s: float, elsewhere: str = "") -> None:
         super().__init__(
             lambda: agent.directory.of_type(ROS),
-            lambda robot, verb: agent.call(ROS, robot, verb, timeout_s=timeout_s),
+            lambda robot, verb, data: agent.call(ROS, robot, verb, data, timeout_s=timeout_s),
             chosen,
             timeout_s,
+            elsewhere,
         )
         self.agent = agent
 
@@ -159,6 +162,19 @@ class Site(Looking):
             clock = Clock(said.time_s - (sent_s + heard_s) / 2, (heard_s - sent_s) / 2)
             best = clock if best is None or clock.within_s < best.within_s else best
         return best
+
+
+async def _each(robots: Iterable[int], answers: Iterable[Awaitable[_T]]) -> dict[int, _T]:
+    """What each robot told; of those that did not it is logged why."""
+    told: dict[int, _T] = {}
+    for robot, answer in zip(robots, await asyncio.gather(*answers, return_exceptions=True), strict=True):
+        if isinstance(answer, MacsError):
+            log.warning("robot %d does not tell what it has: %s", robot, answer)
+        elif isinstance(answer, BaseException):
+            raise answer
+        else:
+            told[robot] = answer
+    return told
 
 
 def type_of(name: str, kind: NodeType, offers: Mapping[int, Offered]) -> str:

@@ -88,6 +88,11 @@ async def test_a_namespace_is_a_mesh_of_its_own(endpoint: str) -> None:
             code, _, errors = await ended(*argv, "-e", endpoint)
             assert code == 1
             assert "online here; 1 in 'site1' (--namespace site1) (macs ls)" in errors
+        for argv in (["topic", "echo", "/pose"], ["service", "call", "/set", "data: true"], ["ping", "7"]):
+            code, _, errors = await ended(*argv, "-e", endpoint)
+            assert (code, "online here; 1 in 'site1' (--namespace site1) (macs ls)" in errors) == (1, True), errors
+        code, said, _ = await ended("stop", "-e", endpoint)
+        assert (code, said) == (1, "no such robot is online here; 1 in 'site1' (--namespace site1)\n")
 
 
 @pytest.mark.alone

@@ -103,6 +103,15 @@ async def test_what_robots_have_is_listed(site: Site) -> None:
     assert code == 0
     assert shown.startswith("Type: geometry_msgs/msg/Twist\nPublisher count: 0\nSubscription count: 1 (robot 7)\n")
     assert "Reliability: RELIABLE" in shown
+    definition = shown[shown.index("\nDefinition (robot 7):\n") :]
+    assert re.match(r"\nDefinition \(robot 7\):\n  geometry_msgs/msg/Twist( RIHS01_[0-9a-f]{64})?\n", definition)
+    assert "    Vector3  linear\n    Vector3  angular\n" in definition
+    assert re.search(r"\n  geometry_msgs/msg/Vector3( RIHS01_[0-9a-f]{64})?\n(    .*\n)*    float64 x\n", definition)
+    told = await macs("topic", "info", "/cmd_vel", "-v", "--json", "-e", site.endpoint)
+    (defined,) = told["definitions"]
+    assert (defined["robots"], defined["missing"]) == ([7], {})
+    assert set(defined["types"]) == {"geometry_msgs/msg/Twist", "geometry_msgs/msg/Vector3"}
+    assert "definitions" not in await macs("topic", "info", "/cmd_vel", "--json", "-e", site.endpoint)
     code, _, log = await site.macs("topic", "info", "/cmdvel")
     assert code == 1
     assert "did you mean /cmd_vel?" in log
