@@ -61,15 +61,14 @@ class Condition:
         return [self._event(STOPS, value, keep="stop", trigger=STOP if is_new and before is not None else "")]
 
     def _controls(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
-        events = []
-        known = {(node.role, node.name): node for node in before.nodes} if before is not None else {}
-        for node in now.nodes:
-            old = known.get((node.role, node.name))
-            holder, held = _holder(node), _holder(old) if old is not None else None
-            if holder != held:
-                who = {"topic": node.name, "holder": holder, "before": held}
-                events.append(self._event(CONTROL, who, keep=f"control {node.name}"))
-        return events
+        had, has = _holders(before) if before is not None else {}, _holders(now)
+        return [
+            self._event(
+                CONTROL, {"topic": topic, "holder": has.get(topic), "before": had.get(topic)}, keep=f"control {topic}"
+            )
+            for topic in {**had, **has}
+            if had.get(topic) != has.get(topic)
+        ]
 
     def _deadmen(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
         """Those that have acted since. Of what was before the first look nobody knows when: it is in the state."""
@@ -79,12 +78,12 @@ class Condition:
         return [
             self._event(DEADMAN, {"topic": topic, "trips": told.times, "why": told.why}, trigger=DEAD_MAN)
             for topic, told in tripped(now).items()
-            if told.times > (known[topic].times if topic in known else 0)
+            if _more(known[topic].times if topic in known else 0, told.times)
         ]
 
     def _drops(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
         was = before.drops if before is not None else {}
-        more = {name: count - was.get(name, 0) for name, count in now.drops.items() if count != was.get(name, 0)}
+        more = {name: count for name, all_ in now.drops.items() if (count := _more(was.get(name, 0), all_))}
         return [self._event(DROPS, {"more": more, "in_all": now.drops})] if more else []
 
     def _event(self, channel: str, value: dict[str, Any], *, keep: str = "", trigger: str = "") -> Event:
@@ -95,6 +94,16 @@ class Condition:
 def stop_topic(status: RobotStatus) -> str:
     """The topic of a robot's emergency stop; empty for none."""
     return next((node.name for node in status.nodes if node.role == "emergency stop"), "")
+
+
+def _more(before: int, now: int) -> int:
+    """What has been added; a robot that has been started again counts from none."""
+    return now - before if now >= before else now
+
+
+def _holders(status: RobotStatus) -> dict[str, str]:
+    """By topic, who has control."""
+    return {node.name: holder for node in status.nodes if (holder := _holder(node))}
 
 
 def _holder(node: NodeStatus) -> str | None:
