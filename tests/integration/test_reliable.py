@@ -117,7 +117,7 @@ async def test_nothing_is_lost_while_both_routers_are_away(routers: Routers) -> 
         lost = plain.heard[-1] - plain.heard[0] + 1 - len(plain.heard)
         assert 4 * HZ < lost < back + HZ
         assert plain.heard == sorted(set(plain.heard))
-        assert source.drops["no_route"] <= lost
+        assert source.drops["no_route"] <= lost + HZ // 10  # the first after the outage go before we hear of the link
         assert receiver.drops["missed"] == 0
 
 

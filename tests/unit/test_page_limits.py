@@ -12,6 +12,7 @@ import reference_pages
 from bridge.gateway.routes import STRANGERS_PER_S
 from macs_zenoh.protocol import limits
 from macs_zenoh.protocol.directory import Directory
+from macs_zenoh.protocol.named import Names
 from macs_zenoh.protocol.robot_nodes import NODES
 
 ROOT = Path(__file__).parents[2]
@@ -60,7 +61,9 @@ LIMITS = {
         *(limits.NODES_EACH, NODES),
     ],
     "registrations, groups, questions who is online": [limits.REQUESTS_PER_S],
-    "agents of one Zenoh session": [Directory.PER_SESSION],
+    "claims by token of who is online": [Directory.PER_SESSION, Directory.IN_ALL],
+    "sessions that claim the same agent, block of ids, name, or type of a name": [Directory.PER_AGENT],
+    "names, and message types that names take": [Names.NAMES, Names.TYPES, Names.NAMES_IN_ALL, Names.TYPES_IN_ALL],
     "destinations that nobody has": [STRANGERS_PER_S],
 }
 
