@@ -460,21 +460,28 @@ class Mesh:
     def watch_tokens(self, key: str, on_change: Callable[[str, bool], None]) -> Subscription:
         """Call ``on_change(key, alive)`` for every token that exists, comes or goes."""
         news: deque[tuple[str, bool]] = deque()
+        lock, waking = threading.Lock(), False
 
         def receive(sample: zenoh.Sample) -> None:
+            nonlocal waking
             keep_attached()
-            news.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
-            if len(news) == 1:  # to wake the loop for each costs more than the rest
+            with lock:  # Zenoh calls from more than one thread
+                news.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+                awake, waking = waking, True
+            if not awake:  # to wake the loop for each costs more than the rest
                 self._from_thread(tell)
 
         def tell() -> None:
+            nonlocal waking
             try:
                 for _ in range(TOKENS_AT_ONCE):
                     if not news:
                         return
                     on_change(*news.popleft())
             finally:
-                if news:
+                with lock:
+                    more = waking = bool(news)
+                if more:
                     self._loop.call_soon(tell)
 
         return Subscription(
