@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 
 import pytest
 
 import macs_zenoh
-from macs_zenoh.errors import NotServed, Refused
+from macs_zenoh.errors import Refused
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol import ping
 from macs_zenoh.protocol.existing import CDR
@@ -33,6 +32,7 @@ from macs_zenoh.protocol.wire import PROBE, encode_frame, encode_message
 from macs_zenoh.streams import Streams
 from tests.support.given import Connect, StartGateway
 from tests.support.local import patient
+from tests.support.matching import answer_of, matched
 from tests.support.sockets import Socket, socket
 from tests.support.waiting import PATIENCE_S, until
 
@@ -138,6 +138,7 @@ async def test_the_sender_is_who_the_key_says(
             GROUP.of(group=3, type=UNITY, from_type=ROS, from_id=7),
             BROADCAST.of(from_type=ROS, from_id=7),
         ):
+            await matched(robot, key)  # the group's is subscribed to once the headset is in it
             said = [true, forged, forged, forged, true]
             frames = [encode_frame(UNITY, message=encode_message(raw, b"%d" % n)) for n, raw in enumerate(said)]
             robot.put(key, b"".join(frames))
@@ -271,14 +272,7 @@ async def test_a_registration_for_somebody_else_is_refused(router: str, start_ga
         async def ask(verb: str, node: AddNode | RemoveNode, caller: int) -> None:
             metadata = Metadata(UNITY, caller, message_manager=node.manager)
             key, frame = call((ROS, robot.id), verb, (UNITY, caller), encode_data(node), metadata)
-            deadline = time.monotonic() + PATIENCE_S
-            while True:
-                try:
-                    await mesh.query(key, frame, timeout_s=PATIENCE_S)
-                    return
-                except NotServed:  # it is online a moment before it serves
-                    assert time.monotonic() < deadline
-                    await asyncio.sleep(0.01)
+            await answer_of(mesh, key, frame)  # it is online a moment before it serves
 
         adding = AddNode(UNITY, 600, 1, "nd__chatter", "/chatter", "std_msgs/String")
         removing = RemoveNode(UNITY, 600, 1, "nd__chatter")
@@ -299,11 +293,13 @@ async def test_a_probe_is_no_loss(router: str, start_gateway: StartGateway, conn
     headset = await connect(gateway)
     async with await Mesh.open(patient(router)) as mesh:
         last = gateway.blocks[0] * 256 + 255
-        for agent_id in (last, headset.id):
-            mesh.put(unicast_key(UNITY, agent_id, UNITY, last), PROBE)
-        mesh.put(BROADCAST.of(from_type=UNITY, from_id=last), PROBE)
+        to_it, to_all = unicast_key(UNITY, headset.id, UNITY, last), BROADCAST.of(from_type=UNITY, from_id=last)
+        for key in (to_it, to_all):
+            await matched(mesh, key)
+        for key in (unicast_key(UNITY, last, UNITY, last), to_it, to_all):
+            mesh.put(key, PROBE)
         message = encode_message(Metadata(message_manager="Greeting").encode(), b"next")
-        mesh.put(unicast_key(UNITY, headset.id, UNITY, last), encode_frame(UNITY, message=message))
+        mesh.put(to_it, encode_frame(UNITY, message=message))
         assert bytes((await headset.receive(PATIENCE_S)).data) == b"next"
         assert gateway.drops == {"wrong_sender": 1}  # the greeting named nobody
 
@@ -322,12 +318,11 @@ async def test_an_agent_is_told_the_true_sender(router: str) -> None:
     ):
         agent.serve("look", look)
         forged = Metadata(ROS, 8, 5, "Greeting")
-        robot.put(
-            unicast_key(ROS, 9, ROS, 7), encode_frame(ROS, (9,), message=encode_message(forged.encode(), b"text"))
-        )
+        key = unicast_key(ROS, 9, ROS, 7)
+        await matched(robot, key)
+        robot.put(key, encode_frame(ROS, (9,), message=encode_message(forged.encode(), b"text")))
         message = await asyncio.wait_for(agent.receive(), PATIENCE_S)
-        key, frame = call((ROS, 9), "look", (ROS, 7), b"", forged)
-        await robot.query(key, frame, timeout_s=PATIENCE_S)
+        await answer_of(robot, *call((ROS, 9), "look", (ROS, 7), b"", forged))
         assert message.metadata == asked[0] == Metadata(ROS, 7, 5, "Greeting")
 
 
