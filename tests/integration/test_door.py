@@ -55,6 +55,7 @@ from macs_zenoh.protocol.websocket import SUBPROTOCOL, TOKEN_SUBPROTOCOL
 from macs_zenoh.protocol.wire import encode_frame, split_message
 from macs_zenoh.serving import Call
 from tests.support.certificates import Authority
+from tests.support.gateways import way_in
 from tests.support.given import StartGateway
 from tests.support.local import patient
 from tests.support.programs import Program, ended, free_port, macs
@@ -98,14 +99,9 @@ class Door(NamedTuple):
 
     def way(self, port: str) -> tuple[int, Way]:
         """How it is reached there."""
-        ports = self.gateway.listeners
-        if port == "plain":
-            return ports.port, Way()
-        if port == "tls":
-            return ports.tls_port, Way(tls=True, authority=self.authority)
-        if port == "web":
-            return ports.web_port, Way(websocket=True)
-        return self.other.listeners.web_port, Way(websocket=True, tls=True, authority=self.authority)
+        if port == "web_tls":
+            return self.other.listeners.web_port, Way(websocket=True, tls=True, authority=self.authority)
+        return way_in(self.gateway, port, self.authority)
 
     async def come(self, port: str, token: str | None = None, **options: object) -> Headset:
         """A headset by way of one of the ports."""

@@ -6,6 +6,7 @@ import asyncio
 import struct
 import time
 from collections.abc import AsyncIterator, Hashable
+from contextlib import asynccontextmanager
 
 import pytest
 
@@ -73,6 +74,14 @@ async def ready(gateway: Gateway, headset: Socket) -> None:
     await until(lambda: (1, 7) in gateway.directory and (2, headset.id) in gateway.directory)
 
 
+async def drive_and_pause(headset: Socket) -> None:
+    """Ten commands at 20 Hz, numbered; then nothing comes for more than a second."""
+    for number in range(10):
+        headset.writer.write(frame(number))
+        await asyncio.sleep(0.05)
+    await asyncio.sleep(1.1)
+
+
 def drops(gateway: Gateway, headset: Socket) -> dict[str, int]:
     return dict(gateway.agents.find(2, headset.id).all_drops())
 
@@ -85,10 +94,7 @@ async def test_a_headset_whose_network_stood_still_does_not_make_up_for_it(
     gateway = await start_gateway()
     async with socket(gateway) as headset:
         await ready(gateway, headset)
-        for number in range(10):
-            headset.writer.write(frame(number))
-            await asyncio.sleep(0.05)
-        await asyncio.sleep(1.1)
+        await drive_and_pause(headset)
         arm = ("nd__arm", MOVE[1])
         waited = [frame(100 + number) + frame(200 + number, arm) for number in range(20)]
         headset.writer.write(b"".join([*waited[:10], frame(1, STOP), *waited[10:]]))
@@ -182,10 +188,7 @@ async def test_the_last_command_goes_on_though_its_sender_leaves(start_gateway: 
     gateway = await start_gateway()
     async with socket(gateway) as headset:
         await ready(gateway, headset)
-        for number in range(10):
-            headset.writer.write(frame(number))
-            await asyncio.sleep(0.05)
-        await asyncio.sleep(1.1)
+        await drive_and_pause(headset)
         headset.writer.write(frame(99))
         await headset.writer.drain()
         headset.writer.close()
@@ -232,8 +235,9 @@ class Answering:
     """It says a command so often, and its connection carries a frame so often: what has waited takes three times as
     long as it waited."""
 
-    def __init__(self, link: Socket) -> None:
+    def __init__(self, link: Socket, connection: Connection) -> None:
         self.link = link
+        self.connection = connection
         self.moves = asyncio.Event()
         self.moves.set()
         self.said = 0
@@ -277,9 +281,27 @@ class Answering:
         """Somebody does again."""
         self._says.set()
 
+    @property
+    def drops(self) -> dict[str, int]:
+        """What its gateway has dropped of what it said."""
+        return dict(self.connection.all_drops())
+
     def close(self) -> None:
         for task in self._tasks:
             task.cancel()
+
+
+@asynccontextmanager
+async def answering(gateway: Gateway) -> AsyncIterator[Answering]:
+    """Such a headset, of which its gateway knows by now how soon it answers."""
+    async with socket(gateway) as link:
+        await ready(gateway, link)
+        headset = Answering(link, gateway.agents.find(2, link.id))
+        try:
+            await until(lambda: headset.connection.pace.recency.is_quick)
+            yield headset
+        finally:
+            headset.close()
 
 
 async def test_what_waited_is_not_carried_out_however_slowly_it_comes(
@@ -287,28 +309,20 @@ async def test_what_waited_is_not_carried_out_however_slowly_it_comes(
 ) -> None:
     """A connection stands still for two seconds and then carries little more than is said: for seconds what comes is
     from then, and nothing of it is carried out. What is said later is, also a single command after a pause."""
-    gateway = await start_gateway()
-    async with socket(gateway) as link:
-        await ready(gateway, link)
-        connection = gateway.agents.find(2, link.id)
-        headset = Answering(link)
-        try:
-            await until(lambda: connection.pace.recency.is_quick)
-            headset.moves.clear()
-            await until(lambda: taken(robot) and taken(robot)[-1] <= headset.said - 100)
-            behind, before, since = headset.said, len(taken(robot)), time.monotonic()
-            headset.moves.set()
-            await until(lambda: taken(robot)[-1] >= behind)
-            assert taken(robot)[before] >= behind, taken(robot)[before - 3 : before + 3]
-            assert drops(gateway, link)["too_old"] >= 90, f"after {time.monotonic() - since} s"
-            headset.pause()
-            await until(lambda: taken(robot)[-1] == headset.said - 1)
-            await asyncio.sleep(1.5)
-            await until(lambda: connection.pace.recency.age_at_most(time.monotonic()) < 0.3)
-            link.writer.write(frame(1_000_000))
-            await until(lambda: taken(robot)[-1] == 1_000_000)
-        finally:
-            headset.close()
+    async with answering(await start_gateway()) as headset:
+        headset.moves.clear()
+        await until(lambda: taken(robot) and taken(robot)[-1] <= headset.said - 100)
+        behind, before, since = headset.said, len(taken(robot)), time.monotonic()
+        headset.moves.set()
+        await until(lambda: taken(robot)[-1] >= behind)
+        assert taken(robot)[before] >= behind, taken(robot)[before - 3 : before + 3]
+        assert headset.drops["too_old"] >= 90, f"after {time.monotonic() - since} s"
+        headset.pause()
+        await until(lambda: taken(robot)[-1] == headset.said - 1)
+        await asyncio.sleep(1.5)
+        await until(lambda: headset.connection.pace.recency.age_at_most(time.monotonic()) < 0.3)
+        headset.link.writer.write(frame(1_000_000))
+        await until(lambda: taken(robot)[-1] == 1_000_000)
 
 
 async def test_after_a_long_pause_a_driver_is_asked_with_the_first_command(
@@ -316,52 +330,36 @@ async def test_after_a_long_pause_a_driver_is_asked_with_the_first_command(
 ) -> None:
     """Who has not driven for long is asked no more; when he drives on, no more is lost than it takes to ask: the
     second command comes behind the answer."""
-    gateway = await start_gateway()
-    async with socket(gateway) as link:
-        await ready(gateway, link)
-        connection = gateway.agents.find(2, link.id)
-        headset = Answering(link)
-        try:
-            await until(lambda: connection.pace.recency.is_quick)
-            headset.pause()
-            monkeypatch.setattr(questions, "ASKED_FOR_S", 0.5)
-            await until(lambda: connection.pace.recency.age_at_most(time.monotonic()) > 2.0)
-            monkeypatch.undo()
-            before, old = len(taken(robot)), drops(gateway, link).get("too_old", 0)
-            link.writer.write(frame(1_000_000))
-            await until(lambda: drops(gateway, link).get("too_old") == old + 1)
-            await until(lambda: not connection.pace.in_doubt)
-            link.writer.write(frame(1_000_001))
-            await until(lambda: taken(robot)[-1] == 1_000_001)
-            assert len(taken(robot)) == before + 1
-        finally:
-            headset.close()
+    async with answering(await start_gateway()) as headset:
+        headset.pause()
+        monkeypatch.setattr(questions, "ASKED_FOR_S", 0.5)
+        await until(lambda: headset.connection.pace.recency.age_at_most(time.monotonic()) > 2.0)
+        monkeypatch.undo()
+        before, old = len(taken(robot)), headset.drops.get("too_old", 0)
+        headset.link.writer.write(frame(1_000_000))
+        await until(lambda: headset.drops.get("too_old") == old + 1)
+        await until(lambda: not headset.connection.pace.in_doubt)
+        headset.link.writer.write(frame(1_000_001))
+        await until(lambda: taken(robot)[-1] == 1_000_001)
+        assert len(taken(robot)) == before + 1
 
 
 async def test_who_lets_go_while_his_network_stands_still_stops(start_gateway: StartGateway, robot: Agent) -> None:
     """What he said before is too old, and the zero is as well, but nobody says it again: it goes on, and nothing that
     was said before it does."""
-    gateway = await start_gateway()
-    async with socket(gateway) as link:
-        await ready(gateway, link)
-        connection = gateway.agents.find(2, link.id)
-        headset = Answering(link)
-        try:
-            await until(lambda: connection.pace.recency.is_quick)
-            headset.moves.clear()
-            await until(lambda: taken(robot) and taken(robot)[-1] <= headset.said - 100)
-            headset.let_go()
-            said = headset.said
-            headset.moves.set()
-            await until(lambda: velocities(robot) == [STILL])
-            assert taken(robot)[-1] < said - 90
-            await until(lambda: not connection.pace.in_doubt)
-            headset.drive()
-            await until(lambda: taken(robot)[-1] > said)
-            assert not [number for number in taken(robot) if said - 90 <= number < said]
-            assert drops(gateway, link)["too_old"] >= 90
-        finally:
-            headset.close()
+    async with answering(await start_gateway()) as headset:
+        headset.moves.clear()
+        await until(lambda: taken(robot) and taken(robot)[-1] <= headset.said - 100)
+        headset.let_go()
+        said = headset.said
+        headset.moves.set()
+        await until(lambda: velocities(robot) == [STILL])
+        assert taken(robot)[-1] < said - 90
+        await until(lambda: not headset.connection.pace.in_doubt)
+        headset.drive()
+        await until(lambda: taken(robot)[-1] > said)
+        assert not [number for number in taken(robot) if said - 90 <= number < said]
+        assert headset.drops["too_old"] >= 90
 
 
 class Said(Pace):

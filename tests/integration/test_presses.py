@@ -4,12 +4,14 @@ agent does so for itself."""
 from __future__ import annotations
 
 import asyncio
+from collections.abc import AsyncIterator
 from contextlib import suppress
 
 import pytest
 
 import macs_zenoh
 from bridge.gateway import Gateway
+from bridge.headset.client import Headset
 from macs_zenoh import presses
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError
@@ -132,86 +134,76 @@ class Slow:
         return b""
 
 
-async def test_a_release_does_not_overtake_the_question_for_its_stop(
-    router: str, start_gateway: StartGateway, connect: Connect
-) -> None:
+Site = tuple[Gateway, Slow, Headset]
+
+
+@pytest.fixture
+async def site(router: str, start_gateway: StartGateway, connect: Connect) -> AsyncIterator[Site]:
+    """A gateway, such a robot, which can be asked, and a headset."""
+    gateway = await start_gateway()
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
+        robot = Slow(agent)
+        headset = await connect(gateway)
+        await can_be_asked(gateway, 7)
+        yield gateway, robot, headset
+
+
+async def test_a_release_does_not_overtake_the_question_for_its_stop(site: Site) -> None:
     """It waits until the robot has answered, and then it comes; what else the headset sends does not wait for it."""
-    gateway = await start_gateway()
-    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
-        robot = Slow(agent)
-        headset = await connect(gateway)
-        await can_be_asked(gateway, 7)
-        await headset.send_frame(said(PRESS, ids=(7,)))
-        await until(
-            lambda: {PRESS, b"asked true"} <= set(robot.came)
-        )  # in one go with its release it is not asked for
-        await headset.send_frame(said(RELEASE, ids=(7,)))
-        await headset.send_frame(said(b"else", ids=(7,), about=Metadata()))
-        await until(lambda: b"else" in robot.came)
-        assert RELEASE not in robot.came
-        robot.answer.set()
-        await until(lambda: RELEASE in robot.came)
-        assert robot.came.count(RELEASE) == 1
+    _, robot, headset = site
+    await headset.send_frame(said(PRESS, ids=(7,)))
+    await until(lambda: {PRESS, b"asked true"} <= set(robot.came))  # in one go with its release it is not asked for
+    await headset.send_frame(said(RELEASE, ids=(7,)))
+    await headset.send_frame(said(b"else", ids=(7,), about=Metadata()))
+    await until(lambda: b"else" in robot.came)
+    assert RELEASE not in robot.came
+    robot.answer.set()
+    await until(lambda: RELEASE in robot.came)
+    assert robot.came.count(RELEASE) == 1
 
 
-async def test_a_press_takes_the_place_of_a_release_that_waits(
-    router: str, start_gateway: StartGateway, connect: Connect
-) -> None:
+async def test_a_press_takes_the_place_of_a_release_that_waits(site: Site) -> None:
     """Who has released and stops again wants it stopped: the release is not sent any more, and that is counted."""
-    gateway = await start_gateway()
-    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
-        robot = Slow(agent)
-        headset = await connect(gateway)
-        await can_be_asked(gateway, 7)
-        await headset.send_frame(said(PRESS, ids=(7,)))
-        await until(lambda: b"asked true" in robot.came)
-        await headset.send_frame(said(RELEASE, ids=(7,)))
-        await headset.send_frame(said(b"else", ids=(7,), about=Metadata()))
-        await until(lambda: b"else" in robot.came)
-        await headset.send_frame(said(PRESS, ids=(7,)))
-        await until(lambda: robot.came.count(PRESS) == 2)
-        robot.answer.set()
-        await asyncio.sleep(2 * presses.SETTLED_S)
-        await headset.send_frame(said(b"last", ids=(7,), about=Metadata()))
-        await until(lambda: b"last" in robot.came)
-        assert RELEASE not in robot.came
-        (connection,) = gateway.agents.online()
-        assert connection.drops["too_old"] == 1
+    gateway, robot, headset = site
+    await headset.send_frame(said(PRESS, ids=(7,)))
+    await until(lambda: b"asked true" in robot.came)
+    await headset.send_frame(said(RELEASE, ids=(7,)))
+    await headset.send_frame(said(b"else", ids=(7,), about=Metadata()))
+    await until(lambda: b"else" in robot.came)
+    await headset.send_frame(said(PRESS, ids=(7,)))
+    await until(lambda: robot.came.count(PRESS) == 2)
+    robot.answer.set()
+    await asyncio.sleep(2 * presses.SETTLED_S)
+    await headset.send_frame(said(b"last", ids=(7,), about=Metadata()))
+    await until(lambda: b"last" in robot.came)
+    assert RELEASE not in robot.came
+    (connection,) = gateway.agents.online()
+    assert connection.drops["too_old"] == 1
 
 
-async def test_what_a_headset_released_counts_when_it_has_left(
-    router: str, start_gateway: StartGateway, connect: Connect
-) -> None:
+async def test_what_a_headset_released_counts_when_it_has_left(site: Site) -> None:
     """Its release does not wait any longer than the headset is there."""
-    gateway = await start_gateway()
-    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
-        robot = Slow(agent)
-        headset = await connect(gateway)
-        await can_be_asked(gateway, 7)
-        await headset.send_frame(said(PRESS, ids=(7,)))
-        await until(lambda: {PRESS, b"asked true"} <= set(robot.came))
-        await headset.send_frame(said(RELEASE, ids=(7,)))
-        await headset.close()
-        await until(lambda: RELEASE in robot.came)
-        robot.answer.set()
+    _, robot, headset = site
+    await headset.send_frame(said(PRESS, ids=(7,)))
+    await until(lambda: {PRESS, b"asked true"} <= set(robot.came))
+    await headset.send_frame(said(RELEASE, ids=(7,)))
+    await headset.close()
+    await until(lambda: RELEASE in robot.came)
+    robot.answer.set()
 
 
 async def test_a_question_that_is_lost_keeps_no_other_from_being_asked(
-    router: str, start_gateway: StartGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+    site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Who presses again is asked for again, though the first question has no answer yet; not for every press."""
     monkeypatch.setattr(presses, "ANSWER_S", 60.0)
-    gateway = await start_gateway()
-    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
-        robot = Slow(agent)
-        headset = await connect(gateway)
-        await can_be_asked(gateway, 7)
-        await headset.send_frame(said(PRESS, ids=(7,)) * 20)
-        await until(lambda: b"asked true" in robot.came)
-        await asyncio.sleep(presses.AGAIN_S)
-        await headset.send_frame(said(PRESS, ids=(7,)))
-        await until(lambda: robot.came.count(b"asked true") == 2)
-        robot.answer.set()
+    _, robot, headset = site
+    await headset.send_frame(said(PRESS, ids=(7,)) * 20)
+    await until(lambda: b"asked true" in robot.came)
+    await asyncio.sleep(presses.AGAIN_S)
+    await headset.send_frame(said(PRESS, ids=(7,)))
+    await until(lambda: robot.came.count(b"asked true") == 2)
+    robot.answer.set()
 
 
 async def test_an_agent_asks_for_its_own_stop(router: str) -> None:

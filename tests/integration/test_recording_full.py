@@ -24,17 +24,6 @@ from tests.support.waiting import until
 SIZE = 4 << 20
 
 
-class Recording(Program):
-    """`macs record`, with what it says of its file."""
-
-    said: list[str]
-
-    def _heard(self, line: str, *, is_log: bool) -> bool:
-        if not is_log:
-            self.__dict__.setdefault("said", []).append(line)
-        return super()._heard(line, is_log=is_log)
-
-
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 4 MiB of its own."""
@@ -59,7 +48,7 @@ async def test_a_full_disk(small_disk: Path) -> None:
         Router() as router,
         macs_zenoh.join("unity", connect=[router.endpoint]) as sender,
         macs_zenoh.join("unity", connect=[router.endpoint]) as receiver,
-        Recording("record", "--headsets", "--compress", "none", "-o", str(file), "-e", router.endpoint) as recording,
+        Program("record", "--headsets", "--compress", "none", "-o", str(file), "-e", router.endpoint) as recording,
     ):
         await until(lambda: receiver.key in sender.directory)
         sent, ended = 0, asyncio.create_task(recording.wait())

@@ -46,6 +46,7 @@ from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
 from macs_zenoh.protocol.wire import encode_frame, encode_message, split_message
 from macs_zenoh.streams import Streams
 from tests.support.certificates import Authority
+from tests.support.gateways import way_in
 from tests.support.given import StartGateway
 from tests.support.local import patient
 from tests.support.networks import Loss, Network, network
@@ -127,12 +128,7 @@ class Site:
 
     def way(self, port: str) -> tuple[int, Way]:
         """How it is reached there."""
-        ports = self.gateway.listeners
-        if port == "tls":
-            return ports.tls_port, Way(tls=True, authority=self.authority)
-        if port == "web":
-            return ports.web_port, Way(websocket=True)
-        return ports.port, Way()
+        return way_in(self.gateway, port, self.authority)
 
     @asynccontextmanager
     async def headset(self, port: str, **options: object) -> AsyncIterator[tuple[Headset, Network]]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack
 from typing import Any, NamedTuple
 
 import pytest
@@ -12,13 +10,13 @@ import pytest
 from bridge.rmw_zenoh import ends
 from bridge.rmw_zenoh.ends import ZenohPublisher
 from bridge.rmw_zenoh.session import ZenohSession
-from bridge.rmw_zenoh.types import KnownTypes, UnknownMessage
+from bridge.rmw_zenoh.types import UnknownMessage
 from bridge.ros.shapes import Structure
 from bridge.ros.side import ActionType
 from bridge.ros.types import InterfaceName
-from macs_zenoh.config import MeshSettings
-from macs_zenoh.mesh.ros_network import RosNetwork, RosNode
+from macs_zenoh.mesh.ros_network import RosNode
 from macs_zenoh.protocol.rmw_zenoh.qos import Durability, Qos
+from tests.support.rmw_sides import both_sides
 from tests.support.waiting import PATIENCE_S, until
 
 pytest.importorskip("xxhash", reason="being a ROS node needs xxhash: pip install 'macs-zenoh[rmw-zenoh]'")
@@ -53,13 +51,8 @@ class Site(NamedTuple):
 
 @pytest.fixture
 async def site(router: str) -> AsyncIterator[Site]:
-    async with AsyncExitStack() as stack:
-        networks = [
-            await stack.enter_async_context(await RosNetwork.open(MeshSettings(connect=[router]))) for _ in range(2)
-        ]
-        ours = ZenohSession(networks[0], await asyncio.to_thread(KnownTypes))
-        stack.push_async_callback(asyncio.to_thread, ours.close)
-        yield Site(ours, networks[1].node(0, "base"), [])
+    async with both_sides(router) as (ours, theirs):
+        yield Site(ours, theirs.node(0, "base"), [])
 
 
 async def test_a_message_of_that_moment_is_published(site: Site) -> None:

@@ -27,6 +27,7 @@ from macs_zenoh.protocol.rmw_zenoh.qos import Qos
 from macs_zenoh.type_hashes import Hashes
 from macs_zenoh.typed import Types, response_of
 from tests.integration.test_rmw_types import CDR, FIBONACCI, Counting, defined
+from tests.support.rmw_sides import both_sides
 from tests.support.waiting import PATIENCE_S, until
 
 pytest.importorskip("xxhash", reason="being a ROS node needs xxhash: pip install 'macs-zenoh[rmw-zenoh]'")
@@ -63,13 +64,8 @@ class Site(NamedTuple):
 
 @pytest.fixture
 async def site(router: str) -> AsyncIterator[Site]:
-    async with AsyncExitStack() as stack:
-        networks = [
-            await stack.enter_async_context(await RosNetwork.open(MeshSettings(connect=[router]))) for _ in range(2)
-        ]
-        ours = ZenohSession(networks[0], await asyncio.to_thread(KnownTypes))
-        stack.push_async_callback(asyncio.to_thread, ours.close)
-        yield Site(ours, networks[1], [])
+    async with both_sides(router) as (ours, theirs):
+        yield Site(ours, theirs, [])
 
 
 async def test_silent_nodes_are_asked_once(site: Site) -> None:

@@ -29,6 +29,7 @@ from macs_zenoh.protocol.sessions import new_secret as new_session
 from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
 from macs_zenoh.protocol.wire import split_message
 from tests.support.certificates import Authority
+from tests.support.gateways import way_in
 from tests.support.given import StartGateway
 from tests.support.waiting import PATIENCE_S, until
 
@@ -61,12 +62,7 @@ class Scene:
 
     def way(self, port: str) -> tuple[int, Way]:
         """How the gateway is reached there."""
-        ports = self.gateway.listeners
-        if port == "tls":
-            return ports.tls_port, Way(tls=True, authority=self.authority)
-        if port == "web":
-            return ports.web_port, Way(websocket=True)
-        return ports.port, Way()
+        return way_in(self.gateway, port, self.authority)
 
     async def owner(self) -> tuple[Headset, str]:
         """A headset with the first token, and the secret of its session."""

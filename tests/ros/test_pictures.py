@@ -218,19 +218,25 @@ async def test_a_topic_that_ends_takes_its_pictures_along(router: str, domain: i
         await until(lambda: "/camera/image/compressed" in made)
 
 
+@asynccontextmanager
+async def refused(router: str, agent: RobotAgent) -> AsyncIterator[list[str]]:
+    """Somebody would like the pictures and does not get them: what he is told."""
+    await until(lambda: "/camera/image/compressed" in agent.nodes.robot.made)
+    async with macs_zenoh.join("unity", settings=patient(router)) as headset:
+        await until(lambda: (1, ROBOT) in headset.directory)
+        taker = await headset.subscribe("/camera/image/compressed", robot=ROBOT)
+        told: list[str] = []
+        taker.on_refused(lambda _robot, reason: told.append(reason))
+        await until(lambda: told)
+        yield told
+
+
 async def test_what_cannot_be_shown_is_counted_and_told(router: str, domain: int, peer: Peer) -> None:
     """A depth image: by name, with the encodings that can."""
     message = image(GREY.astype(numpy.uint16), "16UC1")
-    async with robot(router, domain) as agent, published(peer, message):
-        await until(lambda: "/camera/image/compressed" in agent.nodes.robot.made)
-        async with macs_zenoh.join("unity", settings=patient(router)) as headset:
-            await until(lambda: (1, ROBOT) in headset.directory)
-            taker = await headset.subscribe("/camera/image/compressed", robot=ROBOT)
-            told: list[str] = []
-            taker.on_refused(lambda _robot, reason: told.append(reason))
-            await until(lambda: told)
-            assert "'16UC1' is none of rgb8, bgr8" in told[0]
-            assert agent.nodes.drops["no_jpeg"]
+    async with robot(router, domain) as agent, published(peer, message), refused(router, agent) as told:
+        assert "'16UC1' is none of rgb8, bgr8" in told[0]
+        assert agent.nodes.drops["no_jpeg"]
 
 
 async def test_what_the_library_refuses_is_counted_and_told(
@@ -238,16 +244,9 @@ async def test_what_the_library_refuses_is_counted_and_told(
 ) -> None:
     """An image higher than a JPEG may be, as one whose encoding is not known: in one line, and not at each frame."""
     message = image(picture(RED, width=2, height=65_600), "rgb8")
-    async with robot(router, domain) as agent, published(peer, message):
-        await until(lambda: "/camera/image/compressed" in agent.nodes.robot.made)
-        async with macs_zenoh.join("unity", settings=patient(router)) as headset:
-            await until(lambda: (1, ROBOT) in headset.directory)
-            taker = await headset.subscribe("/camera/image/compressed", robot=ROBOT)
-            told: list[str] = []
-            taker.on_refused(lambda _robot, reason: told.append(reason))
-            await until(lambda: told)
-            assert "no picture can be made of /camera/image: " in told[0]
-            await until(lambda: agent.nodes.drops["no_jpeg"] > 2)
+    async with robot(router, domain) as agent, published(peer, message), refused(router, agent) as told:
+        assert "no picture can be made of /camera/image: " in told[0]
+        await until(lambda: agent.nodes.drops["no_jpeg"] > 2)
     said = [
         record for record in caplog.records if record.levelno > logging.DEBUG and "/camera/image" in record.message
     ]

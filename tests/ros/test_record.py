@@ -65,14 +65,7 @@ OWN = "as2_ca_msgs/msg/InterAgentMessage"
 
 
 class Recording(Program):
-    """`macs record`, with what it says of its files, and what its agent answers."""
-
-    said: list[str]
-
-    def _heard(self, line: str, *, is_log: bool) -> bool:
-        if not is_log:
-            self.__dict__.setdefault("said", []).append(line)
-        return super()._heard(line, is_log=is_log)
+    """`macs record`, and what its agent answers."""
 
     async def told(self, agent: Agent) -> dict[str, Any]:
         """How it is getting on."""

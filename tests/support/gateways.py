@@ -7,7 +7,9 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+from bridge.gateway import Gateway
 from bridge.headset.client import Headset
+from bridge.headset.stream import Way
 from tests.support.programs import Program, free_port
 from tests.support.waiting import PATIENCE_S
 
@@ -26,6 +28,15 @@ async def site(*options: str) -> AsyncIterator[tuple[str, Program]]:
         Program("gateway", "--port", "0", "-e", endpoint, *options) as gateway,
     ):
         yield endpoint, gateway
+
+
+def way_in(gateway: Gateway, port: str, authority: str) -> tuple[int, Way]:
+    """How its port for ``plain``, ``tls`` or ``web``, without TLS, is reached; whose certificate is to be trusted."""
+    if port == "tls":
+        return gateway.listeners.tls_port, Way(tls=True, authority=authority)
+    if port == "web":
+        return gateway.listeners.web_port, Way(websocket=True)
+    return gateway.listeners.port, Way()
 
 
 async def answers(headset: Headset, timeout_s: float = PATIENCE_S) -> None:

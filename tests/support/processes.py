@@ -33,6 +33,8 @@ class Process:
     def __init__(self, *command: str, env: Mapping[str, str] | None = None, within: Sequence[str] = ()) -> None:
         """``within`` comes before the command, as ``ip netns exec site``; ``env`` is beside what is set here."""
         self.command = (*within, *command)
+        self.said: list[str] = []
+        """What it wrote to standard output."""
         self.log: list[str] = []
         """What it wrote to standard error."""
         self._env = {**os.environ, **(env or {})}
@@ -132,8 +134,7 @@ class Process:
     async def _read(self, stream: asyncio.StreamReader, *, is_log: bool = False) -> None:
         while raw := await stream.readline():
             line = raw.decode(errors="replace").rstrip()
-            if is_log:
-                self.log.append(line)
+            (self.log if is_log else self.said).append(line)
             if self._heard(line, is_log=is_log):
                 self._ready.set()
 
