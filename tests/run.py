@@ -12,6 +12,7 @@ import os
 import re
 import subprocess
 import sys
+from typing import NamedTuple
 
 from tests.support import tools
 from tests.support.thorough import THOROUGH
@@ -23,22 +24,33 @@ WORKERS = min(4 * CORES, 12)
 TIERS = "not chaos and not kin"
 
 
-def part(name: str, *argv: str, workers: int = 0) -> tuple[bool, int, int]:
-    """Run pytest; whether it went well, and how many tests passed and failed."""
+class Part(NamedTuple):
+    """What came of one run of pytest."""
+
+    good: bool
+    passed: int
+    failed: int
+    named: list[str]
+    """Its lines about what failed: the next part is minutes long."""
+
+
+def part(name: str, *argv: str, workers: int = 0) -> Part:
+    """Run pytest."""
     print(f"::: {name}", flush=True)
     shared = ("-n", str(workers), "--dist", "worksteal") if workers else ()
     process = subprocess.Popen([sys.executable, "-m", "pytest", *shared, *argv], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    closing = ""
+    closing, named = "", []
     for line in process.stdout:
         print(line, end="", flush=True)
+        named += [line] if line.startswith(("FAILED ", "ERROR ")) else []
         closing = line if re.search(r"\d+ (passed|failed).* in [\d.]+s", line) else closing
     counts = {word: int(number) for number, word in re.findall(r"(\d+) (passed|failed|error)", closing)}
     good = process.wait() == 0
-    return good, counts.get("passed", 0), counts.get("failed", 0) + counts.get("error", 0)
+    return Part(good, counts.get("passed", 0), counts.get("failed", 0) + counts.get("error", 0), named)
 
 
-def run(words: list[str]) -> list[tuple[bool, int, int]]:
+def run(words: list[str]) -> list[Part]:
     """The parts that were asked for."""
     order = ["--backwards"] if "--backwards" in words else []
     if "--fast" in words:
@@ -55,8 +67,9 @@ def main() -> int:
     parts = run(sys.argv[1:])
     if (advice := tools.advice()) is not None:
         print(advice)
-    print(f"{sum(passed for _, passed, _ in parts)} passed, {sum(failed for *_, failed in parts)} failed")
-    return 0 if all(good for good, *_ in parts) else 1
+    print("".join(line for each in parts for line in each.named), end="")
+    print(f"{sum(each.passed for each in parts)} passed, {sum(each.failed for each in parts)} failed")
+    return 0 if all(each.good for each in parts) else 1
 
 
 if __name__ == "__main__":
