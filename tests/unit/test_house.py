@@ -19,7 +19,6 @@ FUNCTION_LINES = 60
 
 LARGER = {
     "bridge/gateway/connection.py": "one agent, with its socket or between two",
-    "bridge/gateway/web.py": "one port with its pages, login and WebSocket",
     "bridge/headset/client.py": "all that a headset can do is one class to its users",
     "bridge/ros/nodes.py": "one table of nodes, and what waits for them under the same lock",
     "macs_zenoh/protocol/tcp_agent.py": "one state machine",

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import pytest
 
-from bridge.gateway.web import _AtOnce
+from bridge.gateway.websocket import AtOnce
 
 
 async def awaited(coroutine: Any) -> tuple[Any, int]:
@@ -18,7 +18,7 @@ async def awaited(coroutine: Any) -> tuple[Any, int]:
         others[0] += 1
 
     try:
-        return await cast(Any, _AtOnce(coroutine, other)), others[0]
+        return await cast(Any, AtOnce(coroutine, other)), others[0]
     except ValueError as error:
         return error, others[0]
 
