@@ -29,15 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--group", type=int, help="group of this robot, 1 to 255 (default: 0, none)")
     options.add_metrics_option(parser)
     options.add_mesh_options(parser)
-    parser.add_argument(
-        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help="ROS arguments, to the end of the line"
-    )
+    options.add_ros_args(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     settings = options.settings(args)
     settings = changed(settings, robot=changed(settings.robot, id=args.id, group=args.group))
-    ros_args = ["--ros-args", *args.ros_args] if args.ros_args else []
+    ros_args = options.ros_args(args)
     return running.until_stopped(lambda: _serve(settings, ros_args, args.metrics))
 
 

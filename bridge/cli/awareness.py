@@ -35,9 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-autostart", action="store_true", help="wait to be configured and activated")
     options.add_metrics_option(parser)
     options.add_mesh_options(parser)
-    parser.add_argument(
-        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help="ROS arguments, to the end of the line"
-    )
+    options.add_ros_args(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -50,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
         transport=args.transport,
     )
     settings = changed(settings, awareness=awareness)
-    ros_args = ["--ros-args", *args.ros_args] if args.ros_args else []
+    ros_args = options.ros_args(args)
     return running.until_stopped(
         lambda: _serve(settings, ros_args, autostart=not args.no_autostart, metrics=args.metrics)
     )

@@ -24,13 +24,7 @@ ANSWER_S = 5.0
 
 def add_verb(verbs: Any, name: str, summary: str, text: str, run: Callable[..., int]) -> argparse.ArgumentParser:
     """A verb below one of `macs`, with examples."""
-    parser: argparse.ArgumentParser = verbs.add_parser(
-        name,
-        help=summary,
-        description=f"{summary[0].upper()}{summary[1:]}.",
-        epilog=text,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = options.add_verb(verbs, name, summary, text)
     parser.set_defaults(run_below=run)
     return parser
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+from typing import Any
 
 from bridge.logs import FORMAT, FORMATS, JSON, TEXT, log_to_stderr
 from bridge.principal import GRAMMAR, Principal
@@ -66,6 +67,30 @@ def _principal(text: str) -> Principal:
         return Principal.parse(text)
     except UsageError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def add_verb(verbs: Any, name: str, summary: str, text: str) -> argparse.ArgumentParser:
+    """A verb below one of `macs`; what it prints and its examples are behind its options."""
+    parser: argparse.ArgumentParser = verbs.add_parser(
+        name,
+        help=summary,
+        description=f"{summary[0].upper()}{summary[1:]}.",
+        epilog=text,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    return parser
+
+
+def add_ros_args(parser: argparse.ArgumentParser) -> None:
+    """ROS's own arguments: the last of a line."""
+    parser.add_argument(
+        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help="ROS arguments, to the end of the line"
+    )
+
+
+def ros_args(args: argparse.Namespace) -> list[str]:
+    """What `add_ros_args` was told, as ROS wants it."""
+    return ["--ros-args", *args.ros_args] if args.ros_args else []
 
 
 def add_mesh_options(

@@ -28,12 +28,10 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from msgspec import structs
-
-from bridge.cli import named, options, output, robots, running
+from bridge.cli import observing, options, output, robots, running
 
 if TYPE_CHECKING:
     from bridge.top.events import Event
@@ -54,9 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--filter", metavar="TEXT", default="", help="only rows that have this in them")
     parser.add_argument("--once", action="store_true", help="print it once and end")
     parser.add_argument("--json", action="store_true", help="print all of it as one JSON object and end")
-    parser.add_argument("--wait", type=named.positive, default=5.0, metavar="S", help="for a router (default: 5)")
-    options.add_as_option(parser)
-    options.add_mesh_options(parser)
+    observing.add_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,36 +61,23 @@ def run(args: argparse.Namespace) -> int:
     live = not (args.once or args.json) and sys.stdout.isatty() and sys.stdin.isatty()
 
     async def top() -> int:
-        from bridge.top.observer import Observer
         from bridge.top.screen import Screen, View
 
-        async with AsyncExitStack() as stack:
-            mesh = await stack.enter_async_context(robots.session(settings.mesh, timeout_s=args.wait))
-            admin = mesh
-            if settings.mesh.namespace:
-                outside = structs.replace(settings.mesh, namespace=None)
-                admin = await stack.enter_async_context(robots.session(outside, timeout_s=args.wait))
-            events: list[Event] = []
-            observer = Observer(mesh, robots.Operator(mesh, caller, args.wait), events.extend, admin)
+        events: list[Event] = []
+        async with observing.observed(settings, caller, args.wait, events.extend) as (observer, looking):
             view = View(args.view, pattern=args.filter)
             screen = Screen(observer.picture, view, where=", ".join(settings.mesh.routers))
-            await observer.begin()
-            looking = asyncio.ensure_future(observer.run())
-            try:
-                if live:
-                    await _live(screen, observer, looking, events)
-                else:
-                    await asyncio.wait([looking], timeout=RATES_S)
-                    output.say(output.as_json(facts(observer)) if args.json else _plain(screen))
-            finally:
-                looking.cancel()
-                observer.close()
+            if live:
+                await _live(screen, looking, events)
+            else:
+                await asyncio.wait([looking], timeout=RATES_S)
+                output.say(output.as_json(facts(observer)) if args.json else _plain(screen))
         return 0
 
     return running.until_stopped(top)
 
 
-async def _live(screen: Screen, observer: Observer, looking: asyncio.Future[None], events: list[Event]) -> None:
+async def _live(screen: Screen, looking: asyncio.Future[None], events: list[Event]) -> None:
     """Draw until q is pressed."""
     from rich.console import Console
     from rich.live import Live

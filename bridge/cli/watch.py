@@ -25,7 +25,7 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
-from bridge.cli import named, options, output, robots, running
+from bridge.cli import named, observing, options, output, robots, running
 from macs_zenoh.plain import plain
 from macs_zenoh.timeouts import within
 
@@ -39,9 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="for programs: a JSON object in each line")
     parser.add_argument("--only", metavar="EVENTS", default="", help="only these, as stopped,released,control")
     named.add_end_options(parser)
-    parser.add_argument("--wait", type=named.positive, default=5.0, metavar="S", help="for a router (default: 5)")
-    options.add_as_option(parser)
-    options.add_mesh_options(parser)
+    observing.add_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -50,8 +48,6 @@ def run(args: argparse.Namespace) -> int:
     only = _only(args.only)
 
     async def watch() -> int:
-        from bridge.top.observer import Observer
-
         told = 0
         enough = asyncio.Event()
 
@@ -65,18 +61,10 @@ def run(args: argparse.Namespace) -> int:
             if args.count and told >= args.count:
                 enough.set()
 
-        async with robots.session(settings.mesh, timeout_s=args.wait) as mesh:
-            operator = robots.Operator(mesh, caller, args.wait)
-            observer = Observer(mesh, operator, tell)
-            await observer.begin()
+        async with observing.observed(settings, caller, args.wait, tell) as (_, looking):
             output.note("watching; Ctrl-C ends it")
-            looking = asyncio.ensure_future(observer.run())
-            try:
-                with contextlib.suppress(asyncio.TimeoutError):
-                    await within(_either(looking, enough), args.timeout)
-            finally:
-                looking.cancel()
-                observer.close()
+            with contextlib.suppress(asyncio.TimeoutError):
+                await within(_either(looking, enough), args.timeout)
         return 1 if args.count and told < args.count else 0
 
     return running.until_stopped(watch)

@@ -7,6 +7,7 @@ import json
 import math
 from typing import Any, NamedTuple, NoReturn
 
+from bridge.cli.options import add_verb
 from macs_zenoh.errors import UsageError
 from macs_zenoh.protocol import addresses
 from macs_zenoh.protocol.websocket import WEBSOCKET_PATH
@@ -59,7 +60,7 @@ def add_verbs(verbs: Any) -> None:
 
 def add_run(verbs: Any) -> None:
     """Add ``run``, which only the command line has."""
-    run = _verb(verbs, "run", "several verbs on one connection, from a file or from stdin", RUN_HELP)
+    run = add_verb(verbs, "run", "several verbs on one connection, from a file or from stdin", RUN_HELP)
     run.add_argument("file", metavar="FILE", help="a line per command; - reads stdin, line by line as it comes")
     run.add_argument("--keep-going", action="store_true", help="go on after a line that failed")
 
@@ -113,7 +114,7 @@ examples:
 
 
 def _add_online(verbs: Any) -> None:
-    _verb(
+    add_verb(
         verbs,
         "online",
         "who is online, and which id this headset got",
@@ -122,7 +123,7 @@ def _add_online(verbs: Any) -> None:
 
 
 def _add_sub(verbs: Any) -> None:
-    sub = _verb(
+    sub = add_verb(
         verbs,
         "sub",
         "print a robot's topic, a line per message",
@@ -143,7 +144,7 @@ def _add_sub(verbs: Any) -> None:
 
 
 def _add_pub(verbs: Any) -> None:
-    pub = _verb(
+    pub = add_verb(
         verbs,
         "pub",
         "publish to a robot's topic",
@@ -182,7 +183,7 @@ def _add_pub(verbs: Any) -> None:
 
 
 def _add_call(verbs: Any) -> None:
-    call = _verb(
+    call = add_verb(
         verbs,
         "call",
         "call a service that runs on a robot",
@@ -199,7 +200,7 @@ def _add_call(verbs: Any) -> None:
 
 
 def _add_serve(verbs: Any) -> None:
-    serve = _verb(
+    serve = add_verb(
         verbs,
         "serve",
         "run a service for ROS nodes on a robot",
@@ -214,7 +215,7 @@ def _add_serve(verbs: Any) -> None:
 
 
 def _add_goal(verbs: Any) -> None:
-    goal = _verb(
+    goal = add_verb(
         verbs,
         "goal",
         "give a goal to an action that runs on a robot",
@@ -231,7 +232,7 @@ def _add_goal(verbs: Any) -> None:
 
 
 def _add_ask(verbs: Any) -> None:
-    ask = _verb(
+    ask = add_verb(
         verbs,
         "ask",
         "ask a robot or the gateway something by the name of its manager",
@@ -252,7 +253,7 @@ def _add_ask(verbs: Any) -> None:
 
 
 def _add_send(verbs: Any) -> None:
-    send = _verb(
+    send = add_verb(
         verbs,
         "send",
         "send text to agents by id, by group or to all",
@@ -270,7 +271,7 @@ def _add_send(verbs: Any) -> None:
 
 
 def _add_listen(verbs: Any) -> None:
-    listen = _verb(
+    listen = add_verb(
         verbs,
         "listen",
         "print messages that belong to no topic or service",
@@ -293,17 +294,6 @@ def _add_script_verbs(verbs: Any) -> None:
     verbs.add_parser("sleep", add_help=False).add_argument("seconds", type=_number, metavar="S")
     for name in ("pause", "resume", "drop"):
         verbs.add_parser(name, add_help=False)
-
-
-def _verb(verbs: Any, name: str, summary: str, text: str) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = verbs.add_parser(
-        name,
-        help=summary,
-        description=f"{summary[0].upper()}{summary[1:]}.",
-        epilog=text,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    return parser
 
 
 TYPE_IS_OPTIONAL = frozenset({"sub", "pub", "call"})
