@@ -42,10 +42,11 @@ async def two_ports(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[t
     options = ("-e", endpoint, "--settings", str(settings))
     async with (
         Program("router", "-l", endpoint, "--settings", str(settings)),
-        Program("gateway", "--port", str(near), *options),
-        Program("gateway", "--port", str(far), *options),
+        Program("gateway", "--port", str(near), *options) as first,
+        Program("gateway", "--port", str(far), *options) as second,
     ):
         yield near, far
+        print(*first.log, *second.log, sep="\n")  # what was lost, and where, beside a test that fails
 
 
 @pytest.fixture
