@@ -183,6 +183,19 @@ async def headset_at(
     return Headset(watched)
 
 
+def by_grip(headset: Headset) -> tuple[Act, Act]:
+    """How it is driven by the right controller, and let go of."""
+
+    async def take() -> None:
+        await headset.squeeze("right", held=True)
+        await headset.stick("right", 0, -1)
+
+    async def let_go() -> None:
+        await headset.squeeze("right", held=False)
+
+    return take, let_go
+
+
 def about_up(radians: float) -> tuple[float, float, float, float]:
     """The quaternion of a turn to the left."""
     return 0.0, math.sin(radians / 2), 0.0, math.cos(radians / 2)

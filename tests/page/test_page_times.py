@@ -16,14 +16,13 @@ import pytest
 pytest.importorskip("rclpy")
 
 from tests.page.conftest import HELD, Site, says
-from tests.page.driving import Heard, heard_at, hold
+from tests.page.driving import Heard, heard_at, hold, within
 from tests.support.browser import OFFLINE, Watched, needs_browser
 from tests.support.links import Link, counted
 from tests.support.waiting import until
 
 pytestmark = [needs_browser, pytest.mark.timeout(240)]
 
-TRIES = 6
 ZERO_MS = 100.0
 DEADMAN_MS = 500.0 + ZERO_MS
 """As the site's rule has it."""
@@ -39,15 +38,6 @@ LETTING_GO: dict[str, tuple[str, float]] = {
     "page closed": ("close", DEADMAN_MS),
     "connection cut": ("macsPage.headset.abort()", DEADMAN_MS),
 }
-
-
-async def within(limit_ms: float, measure: Callable[[], Awaitable[float]]) -> list[float]:
-    """Measure until it is soon enough once; fail if it never is."""
-    took: list[float] = []
-    while len(took) < TRIES and (not took or took[-1] > limit_ms):
-        took.append(await measure())
-    assert took[-1] <= limit_ms, f"at most {limit_ms:.0f} ms are wanted: {', '.join(f'{ms:.0f}' for ms in took)}"
-    return took
 
 
 async def drives(page: Watched, heard: Heard) -> None:

@@ -14,9 +14,9 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from tests.page.conftest import Act, Site
+from tests.page.conftest import Site
 from tests.page.driving import heard_at
-from tests.page.headsets import PATIENT_ROBOT, PICTURES, Headset, Pictures, headset_at, needs_headset
+from tests.page.headsets import PATIENT_ROBOT, PICTURES, Pictures, by_grip, headset_at, needs_headset
 from tests.support.browser import needs_browser
 from tests.support.waiting import until
 
@@ -26,17 +26,6 @@ RULES = PATIENT_ROBOT
 
 LOCKOUT_S = float(os.environ.get("MACS_LOCKOUT_S", "1.0"))
 """Longer than its default: on a busy machine pictures come late without being frozen."""
-
-
-def by_grip(headset: Headset) -> tuple[Act, Act]:
-    async def take() -> None:
-        await headset.squeeze("right", held=True)
-        await headset.stick("right", 0, -1)
-
-    async def let_go() -> None:
-        await headset.squeeze("right", held=False)
-
-    return take, let_go
 
 
 async def test_a_frozen_picture_turns_driving_off(site: Site) -> None:
