@@ -1,5 +1,6 @@
 /** The page: who may see it, its connection, its views, its stop. */
 
+import { CommandClock } from "../macs-clock.js";
 import { Headset } from "../macs.js";
 import { Types } from "../ros.js";
 import { digits, h, say, show } from "./dom.js";
@@ -23,6 +24,7 @@ class Page {
     this.may = new Set(me.may);
     const scheme = location.protocol === "https:" ? "wss:" : "ws:";
     this.headset = new Headset(`${scheme}//${location.host}/macs`, { silenceMs: SILENCE_MS, retryMs: RETRY_MS });
+    this.clock = new CommandClock(this.headset);
     this.topics = new Topics(this.headset);
     this.types = new Types("", (url) => this.get(url).then((answer) => answer ?? { error: "the gateway does not answer" }));
     this.tell = (kind, text) => this.#tell(kind, text);

@@ -7,6 +7,7 @@
  * be taken anew: nothing drives on by itself.
  */
 
+import { refused } from "../shared/words.js";
 import { digits, h, panel, say, show } from "./dom.js";
 
 export const COMMANDS = {
@@ -56,14 +57,16 @@ export class Drive {
   #gamepad = undefined;
   #online = true;
 
-  constructor(robot, topic, type, { headset, types, stop, tell }) {
+  constructor(robot, topic, type, { headset, clock, types, stop, tell }) {
     this.robot = robot;
     this.topic = topic;
     this.headset = headset;
+    this.clock = clock;
     this.stop = stop;
     this.tell = tell;
     this.shape = COMMANDS[type];
     this.node = headset.advertise(topic, type, { robots: [robot] });
+    clock.mean([robot]);
     this.debt = 0;
     this.away = false;
     this.element = this.#build();
@@ -94,13 +97,24 @@ export class Drive {
       show(this.takeButton, holder === null);
       show(this.giveBackButton, holder === own);
     }
-    const deadman = node?.deadman;
-    show(this.deadmanText, Boolean(deadman?.silence_s));
-    if (deadman?.silence_s) {
-      const trips = deadman.trips ? ` · acted ${deadman.trips} times` : "";
-      say(this.deadmanText, `Dead-man ${deadman.silence_s} s${trips}`);
-    }
+    this.#tellLimits(node?.deadman, status);
     this.#judge();
+  }
+
+  /** What the robot does by itself about commands that end, or are old. */
+  #tellLimits(deadman, status) {
+    const limits = [];
+    if (deadman?.silence_s) limits.push(`Dead-man ${deadman.silence_s} s${deadman.trips ? ` · acted ${deadman.trips} times` : ""}`);
+    const { known = false, maxAgeS = null } = this.clock.of(this.robot) ?? {};
+    if (known && maxAgeS) limits.push(`Commands at most ${maxAgeS} s old`);
+    else if (status && !this.#compares) limits.push("This robot does not compare clocks: it takes commands of any age");
+    show(this.limitsText, limits.length > 0);
+    say(this.limitsText, limits.join(" · "));
+  }
+
+  /** Whether the robot wants to know when commands were made. */
+  get #compares() {
+    return this.clock.tells(this.robot) || typeof this.status?.max_timed_command_age_s === "number";
   }
 
   get held() {
@@ -153,6 +167,7 @@ export class Drive {
   close() {
     this.release("the panel was closed");
     this.#unlisten.forEach((end) => end());
+    this.clock.mean([]);
     this.closed = true;
     if (!this.owing) this.node.deregister({ robots: [this.robot] }); // else when the last zero has gone
     this.element.remove();
@@ -219,14 +234,16 @@ export class Drive {
     return true;
   }
 
-  /** Forward and left, each from -1 to 1. */
-  #point(forward, turn) {
+  /** Forward and left, each from -1 to 1, as it was at `at`. */
+  #point(forward, turn, at = performance.now()) {
     const limited = (value) => Math.max(-1, Math.min(1, value));
     const first = !this.#forward && !this.#turn;
     this.#forward = limited(forward);
     this.#turn = limited(turn);
     this.knob.style.transform = `translate(${-50 - 38 * this.#turn * 2}%, ${-50 - 38 * this.#forward * 2}%)`;
-    if (first && this.#source !== null && (this.#forward || this.#turn)) this.#send();
+    // what was done before the last command was made is in the next one
+    const isNew = at > this.node.lastMadeAt;
+    if (first && isNew && this.#source !== null && (this.#forward || this.#turn)) this.#send(at);
   }
 
   #tick() {
@@ -236,13 +253,14 @@ export class Drive {
     const still = now - this.#tickedAt;
     this.#tickedAt = now;
     if (still > STILL_MS) this.release(`the page stood still for ${Math.round(still)} ms`);
-    else this.#send();
+    else this.#send(now);
   }
 
-  #send() {
+  #send(madeAt) {
     const x = this.#forward * this.mostForward.valueAsNumber;
     const z = this.#turn * this.mostTurn.valueAsNumber;
-    const sent = this.node.publish(this.type.write(this.shape({ x }, { z })), { robots: [this.robot], freshMs: FRESH_MS });
+    const message = this.type.write(this.shape({ x }, { z }));
+    const sent = this.node.publish(message, { robots: [this.robot], freshMs: FRESH_MS, madeAt });
     if (sent) this.#shown(x, z);
     else this.release("the connection is not fresh");
   }
@@ -267,7 +285,14 @@ export class Drive {
     else if (this.stop.isStopped(this.robot) || this.status?.stopped) this.#bar("the robot is stopped");
     else if (this.stop.isWanted(this.robot)) this.#bar("a stop is pressed");
     else if (this.holder && this.holder !== own) this.#bar(`${this.holder} has control`);
-    else this.#bar("");
+    else this.#bar(this.#uncompared());
+  }
+
+  /** A robot that compares clocks and has not yet would take commands of any age, or none. */
+  #uncompared() {
+    if (!this.#compares || this.clock.of(this.robot)?.known) return "";
+    const { reason = "" } = this.node.refusals.get(this.robot) ?? {};
+    return `robot ${this.robot} has not compared clocks yet${reason && ` (${reason})`}`;
   }
 
   #bar(why) {
@@ -285,7 +310,7 @@ export class Drive {
       this.#unlisten.push(() => target.removeEventListener(type, callback, options));
     };
     on(this.pad, "pointerdown", (event) => {
-      if (event.button !== 0 || !this.#take("pointer")) return;
+      if (event.button !== 0 || isLate(event) || !this.#take("pointer")) return;
       this.pointer = event.pointerId;
       this.pad.setPointerCapture(event.pointerId);
       this.pad.focus({ preventScroll: true });
@@ -294,7 +319,8 @@ export class Drive {
     on(this.pad, "pointermove", (event) => {
       if (!this.#isPointer(event)) return;
       // while another button is down, the end of the first is told as a move
-      if (event.buttons & 1) this.#follow(event);
+      if (isLate(event)) this.release("the page stood still");
+      else if (event.buttons & 1) this.#follow(event);
       else this.release("let go");
     });
     for (const type of ["pointerup", "pointercancel", "lostpointercapture"]) {
@@ -311,7 +337,12 @@ export class Drive {
       this.#judge();
     });
     on(this.headset, "refused", ({ detail: { robot, name, kind, reason } }) => {
-      if (name === this.topic && (!robot || robot === this.robot) && this.held) this.release(`${kind}: ${reason}`);
+      if (name === this.topic && (!robot || robot === this.robot) && this.held) this.release(refused(kind, reason));
+    });
+    on(this.clock, "known", () => this.setStatus(this.status));
+    on(this.clock, "anew", () => {
+      this.release("another clock begins");
+      this.#judge();
     });
   }
 
@@ -323,7 +354,7 @@ export class Drive {
     const { left, top, width, height } = this.pad.getBoundingClientRect();
     const right = (2 * (event.clientX - left)) / width - 1;
     const down = (2 * (event.clientY - top)) / height - 1;
-    this.#point(-down / 0.76, -right / 0.76);
+    this.#point(-down / 0.76, -right / 0.76, event.timeStamp);
   }
 
   #key(event, down) {
@@ -334,11 +365,12 @@ export class Drive {
     }
     if (!(event.code in KEYS)) return;
     event.preventDefault();
+    if (down && isLate(event)) return;
     if (down && !event.repeat && (this.#source === "keys" || this.#take("keys"))) this.#keys.add(event.code);
     if (!down) this.#keys.delete(event.code);
     if (this.#source !== "keys") return;
     const sum = (axis) => [...this.#keys].reduce((all, code) => all + KEYS[code][axis], 0);
-    if (this.#keys.size) this.#point(sum(0), sum(1));
+    if (this.#keys.size) this.#point(sum(0), sum(1), event.timeStamp);
     else this.release("let go");
   }
 
@@ -364,8 +396,8 @@ export class Drive {
     this.takeButton = h("button", { type: "button", class: "small", onclick: () => this.#ask("take") }, "Take control");
     this.giveBackButton = h("button", { type: "button", class: "small", onclick: () => this.#ask("release") }, "Give it back");
     this.controlRow = h("p", { class: "control-row", hidden: true }, this.controlText, this.takeButton, this.giveBackButton);
-    this.deadmanText = h("p", { class: "muted", hidden: true });
-    const settings = h("div", { class: "drive-settings" }, ...forwardRow, ...turnRow, this.controlRow, this.deadmanText);
+    this.limitsText = h("p", { class: "muted", hidden: true });
+    const settings = h("div", { class: "drive-settings" }, ...forwardRow, ...turnRow, this.controlRow, this.limitsText);
     const body = h("div", { class: "drive" }, this.pad, h("div", { class: "drive-side" }, this.hint, settings));
     return panel(`Drive · ${this.topic}`, { id: "drive", tools: [this.speed] }, body);
   }
@@ -379,6 +411,9 @@ export class Drive {
     }
   }
 }
+
+/** What was done so long ago, while the page stood still, takes hold of nothing. */
+const isLate = (event) => performance.now() - event.timeStamp > STILL_MS;
 
 const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
 

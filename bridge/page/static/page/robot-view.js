@@ -131,8 +131,8 @@ class Shown {
     this.drive = null;
     this.online = false;
     this.status = null;
-    const { headset, topics, types, may } = page;
-    this.parts = { headset, topics, types, may, stop: page.stop, tell: page.tell };
+    const { headset, clock, topics, types, may } = page;
+    this.parts = { headset, clock, topics, types, may, stop: page.stop, tell: page.tell };
     this.areas = Object.fromEntries(["cameras", "control", "plots", "tables"].map((name) => [name, h("div", { class: `area ${name}` })]));
     place.append(...Object.values(this.areas));
     const plot = (topic, type, path) => this.#plot(topic, type, [path], `${topic} · ${path}`);

@@ -9,6 +9,7 @@
 import { CommandClock, ROBOTS } from "../macs-clock.js";
 import { Headset } from "../macs.js";
 import { Types } from "../ros.js";
+import { refused } from "../shared/words.js";
 import { get, persisted, soon } from "./asking.js";
 import { stamp } from "./axes.js";
 import { lockout } from "./freshness.js";
@@ -418,7 +419,7 @@ export class CommandLink {
       const ours = name === this.#drive?.topic;
       if (ours) {
         this.#refusal = reason;
-        this.#letGo(`${kind}: ${reason}`);
+        this.#letGo(refused(kind, reason));
         this.#askStatus();
       }
       this.#say("refused", `${robot ? `robot ${robot}` : "the gateway"} refused ${name}: ${reason}`);

@@ -1,0 +1,13 @@
+/** What robots say in kinds, told in words. Pure. */
+
+const REFUSED = {
+  too_old: "the command came too late",
+  repeated: "the command came twice",
+  out_of_order: "the command came behind a later one",
+  no_clock: "the robot does not know how late it is here",
+};
+
+/** Why a command was not carried out: `kind` as robots name it, and what they say besides. */
+export function refused(kind, reason) {
+  return `${REFUSED[kind] ?? kind}: ${reason}`;
+}
