@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
 
 pytest.importorskip("rclpy")
 
+from bridge.settings import ROBOT_HIDES
 from tests.page.conftest import Site
 from tests.page.headsets import PATIENT_ROBOT, PICTURES, Pictures, headset_at, needs_headset
 from tests.support.browser import needs_browser
 from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
-RULES = PATIENT_ROBOT
-"""The robot is patient."""
+RULES = f"""{PATIENT_ROBOT}
+hide = {json.dumps([*ROBOT_HIDES, "/camera/**"])}
+"""
+"""The robot is patient, and has no picture of its own."""
 
 OFFERED = f"'{PICTURES}' in macsXr.offers.publishers"
 HERE = {"cameras": [PICTURES]}
+BARRED_ALL = """
+window.barred = new Set([macsXr.telling.state.barred]);
+macsXr.links.addEventListener('state', ({ detail }) => window.barred.add(detail.barred));
+"""
+"""Notes each reason for which driving is off, and none."""
 
 
 async def test_a_camera_that_dies_turns_driving_off(site: Site) -> None:
@@ -31,6 +40,41 @@ async def test_a_camera_that_dies_turns_driving_off(site: Site) -> None:
     await headset.frame(3)
     await until(lambda: headset.state("barred.startsWith('the picture is ')"))
     async with Pictures(site.domain):
+        await until(lambda: headset.state("barred === ''"))
+
+
+async def test_a_page_that_is_loaded_again_waits_for_the_picture_of_before(site: Site) -> None:
+    """Nobody chose a picture: the first one guards. Its camera dies, and the page that is loaded then knows of it: the
+    robot is none without pictures, and is not driven until they are back."""
+    async with Pictures(site.domain):
+        headset = await headset_at(site)
+        await headset.ready()
+    await until(lambda: headset.value(f"!({OFFERED})"))
+    await headset.page.reload()
+    await until(
+        lambda: headset.value("Boolean(window.macsXr) && macsXr.drive !== undefined && macsXr.drive !== 'null'")
+    )
+    assert not await headset.value(OFFERED)
+    await until(lambda: headset.state("barred === 'no picture has come yet'"))
+    async with Pictures(site.domain):
+        await until(lambda: headset.state("barred === ''"))
+
+
+async def test_a_picture_that_is_said_again_and_again_is_none(site: Site) -> None:
+    """A camera that hangs sends its last picture: it is one that has just come to who loads the page anew, and old."""
+    async with Pictures(site.domain) as pictures:
+        headset = await headset_at(site, settings=HERE)
+        await headset.ready()
+        pictures.repeat()
+        await until(lambda: headset.state("barred.startsWith('the picture is ')"))
+        await headset.page.reload()
+        await until(lambda: headset.value("Boolean(window.macsXr?.target)"))
+        await headset.value(BARRED_ALL)
+        await until(lambda: headset.value("[...macsXr.room.screens.values()][0]?.shown > 2"))
+        await headset.frame(10)
+        assert "" not in await headset.value("[...window.barred]")
+        assert await headset.state("barred") == "no picture has come yet"
+        pictures.go_on()
         await until(lambda: headset.state("barred === ''"))
 
 

@@ -7,7 +7,20 @@ import pytest
 from tests.page.test_macs_js import ran
 from tests.support.browser import needs_node
 
-PARTS = ("axes", "hold", "freshness", "gestures", "settings", "decode", "clock", "targets", "guards", "opened", "halt")
+PARTS = (
+    "axes",
+    "hold",
+    "freshness",
+    "kept",
+    "gestures",
+    "settings",
+    "decode",
+    "clock",
+    "targets",
+    "guards",
+    "opened",
+    "halt",
+)
 
 
 @needs_node

@@ -78,6 +78,8 @@ const parts = {
     const { Freshness, lockout } = await load("xr/freshness.js");
     const seen = new Freshness();
     assert.equal(seen.ageMs(0), null);
+    assert.equal(seen.note(5e9 - 100, -80), false, "the first one may be the last one of a camera that hangs");
+    assert.equal(seen.ageMs(-80), null);
     for (let at = 0; at < 1000; at += 100) assert.ok(seen.note(5e9 + at, at + 20)); // whatever the clocks say
     assert.equal(seen.ageMs(920), 0);
     assert.equal(seen.ageMs(1250), 330);
@@ -95,11 +97,35 @@ const parts = {
     after.note(101000, 131500);
     after.note(131000, 162000);
     assert.equal(after.ageMs(162000), 500, "who was quickest a minute ago counts no more");
+    const again = new Freshness(seen.least);
+    again.note(5e9 + 2000, 2400);
+    again.note(5e9 + 2100, 2500);
+    assert.equal(again.ageMs(2500), 380, "as late as it is, also for who has just come");
+    assert.equal(new Freshness().least, null);
     assert.equal(lockout([100, 299], 300), "");
     assert.match(lockout([100, 301], 300), /0\.3 s old/);
     assert.match(lockout([null], 300), /no picture/);
     assert.equal(lockout([5000], 0), "");
     assert.equal(lockout([], 300), "");
+  },
+
+  async kept() {
+    const { KeptGuards } = await load("xr/kept-guards.js");
+    const store = () => ({ getItem: (name) => store.kept?.[name] ?? null, setItem: (name, text) => (store.kept = { [name]: text }) });
+    const kept = new KeptGuards(store());
+    kept.note(1, { topic: "/camera", type: "sensor_msgs/msg/Image" });
+    kept.note(2, null);
+    kept.noteLeast([["1 /camera picture", { ms: 20, at: 1000 }]]);
+    const after = new KeptGuards(store());
+    assert.deepEqual([...after.guards], [[1, { topic: "/camera", type: "sensor_msgs/msg/Image" }]]);
+    assert.deepEqual(after.least, kept.least);
+    for (let robot = 10; robot < 1000; robot++) after.note(robot, { topic: "/camera", type: "" });
+    assert.equal(new KeptGuards(store()).guards.size, 64, "bounded");
+    for (const bad of ["{", "null", "[]", '{"guards": {}}', '{"guards": [[1, {"topic": 7}], null, 5], "least": [["x", {"ms": null}]]}']) {
+      const one = new KeptGuards({ getItem: () => bad, setItem() {} });
+      assert.deepEqual([one.guards.size, one.least], [0, []], bad);
+    }
+    assert.equal(new KeptGuards(null).guards.size, 0);
   },
 
   async gestures() {

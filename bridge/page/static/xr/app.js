@@ -7,6 +7,7 @@ import { h } from "../page/dom.js";
 import { Hands } from "./hands.js";
 import { Immersion } from "./immersion.js";
 import { Input } from "./input.js";
+import { KeptGuards } from "./kept-guards.js";
 import { Links } from "./links.js";
 import { Looking } from "./looking.js";
 import { Overlay } from "./overlay.js";
@@ -42,7 +43,8 @@ class Scene {
     const heading = h("h1", { class: "visually-hidden" }, "Headset");
     document.body.replaceChildren(h("main", {}, heading, this.canvas));
     this.stage = new Stage(this.canvas);
-    this.links = new Links(me);
+    this.kept = new KeptGuards(tabStore());
+    this.links = new Links(me, this.kept);
     this.room = new Room(this.stage, this.settings);
     this.immersion = new Immersion(this.stage.renderer);
     this.overlay = new Overlay({ canvas: this.canvas, settings: this.settings, me, on: this.#actions() });
@@ -62,8 +64,6 @@ class Scene {
     this.named = namedBy(location.hash, keptAs(CHOSEN));
     this.offers = { publishers: {}, subscribers: {} };
     this.wishes = [];
-    /** robot → the picture that driving it depends on: {topic, type}. */
-    this.guards = new Map();
     /** How long the work of each of the last frames took, in ms. */
     this.frameMs = [];
     this.frames = 0;
@@ -387,8 +387,8 @@ class Scene {
   #wish(anew = false) {
     const { publishers } = this.offers;
     const { seen } = this.target ?? {};
-    const guard = this.target && guardOf(publishers, this.settings.values, SHOWN, this.guards.get(seen), anew);
-    if (this.target) this.guards.set(seen, guard);
+    const guard = this.target && guardOf(publishers, this.settings.values, SHOWN, this.kept.guards.get(seen), anew);
+    if (this.target) this.kept.note(seen, guard);
     this.links.guard(guard ? [pictureKey(seen, guard.topic)] : []);
     this.wishes = this.target ? wishes(seen, publishers, this.settings.values, SHOWN, guard) : [];
     this.room.setPanels(this.wishes.filter(({ eye }) => eye === "left").map(({ panel }) => panel));
@@ -411,6 +411,14 @@ async function get(path) {
     return response.ok ? await response.json() : null;
   } catch {
     return null;
+  }
+}
+
+function tabStore() {
+  try {
+    return sessionStorage;
+  } catch {
+    return null; // a browser that keeps nothing
   }
 }
 

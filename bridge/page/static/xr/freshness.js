@@ -7,27 +7,43 @@
  */
 
 /** The quickest picture of so long ago is still the measure. */
-const WINDOW_MS = 30000;
+export const WINDOW_MS = 30000;
 
 export class Freshness {
   #stamp = null;
+  #known = false;
   #arrivedAt = null;
   #late = 0;
   #least = [Infinity, Infinity];
   #turnedAt = null;
 
-  /** A picture came. `stamp` is its own time, 0 where it says none. Whether it is another one than before. */
+  /** `before`: how little later than their stamps pictures came lately, as `least` has it; null: nobody knows. */
+  constructor(before = null) {
+    if (before !== null) this.#least[1] = before;
+  }
+
+  /** How little later than their stamps pictures came lately, in ms of two clocks; null: none has come that has a stamp. */
+  get least() {
+    const least = Math.min(...this.#least);
+    return least === Infinity ? null : least;
+  }
+
+  /**
+   * A picture came. `stamp` is its own time, 0 where it says none. Whether it is another one than before: the first one is
+   * none, for it may be the last one of a camera that hangs, said again.
+   */
   note(stamp, now) {
     if (stamp && stamp === this.#stamp) return false;
+    this.#known ||= !stamp || this.#stamp !== null;
     this.#stamp = stamp;
     this.#arrivedAt = now;
     this.#late = stamp ? this.#lateness(now - stamp, now) : 0;
-    return true;
+    return this.#known;
   }
 
-  /** How old the newest one is; null before the first. */
+  /** How old the newest one is; null before there was another one than the first. */
   ageMs(now) {
-    return this.#arrivedAt === null ? null : now - this.#arrivedAt + this.#late;
+    return this.#known ? now - this.#arrivedAt + this.#late : null;
   }
 
   #lateness(difference, now) {

@@ -18,8 +18,10 @@ export class Links extends EventTarget {
   #stop = null;
   #kept = readKept();
 
-  constructor(me) {
+  /** `me` is what this token may, `guards` what is kept of the page before. */
+  constructor(me, guards) {
     super();
+    this.guards = guards;
     this.mayStop = me.may.includes("stop");
     const scheme = location.protocol === "https:" ? "wss:" : "ws:";
     const url = `${scheme}//${location.host}/macs`;
@@ -41,7 +43,7 @@ export class Links extends EventTarget {
     this.commands.onmessage = ({ data }) => this.#take(data);
     this.sight.onmessage = ({ data }) => this.#see(data);
     this.commands.postMessage({ op: "begin", url, me, kept: this.#kept, sight: port1 }, [port1]);
-    this.sight.postMessage({ op: "begin", url, commands: port2 }, [port2]);
+    this.sight.postMessage({ op: "begin", url, commands: port2, least: guards.least }, [port2]);
   }
 
   /** What hands did in the frame that began at `at`. */
@@ -149,6 +151,7 @@ export class Links extends EventTarget {
       this.#pictures.set(message.key, message);
     } else if (message.op === "rates") {
       this.sightUp = message;
+      this.guards.noteLeast(message.least);
       this.rates = new Map(message.topics.map((topic) => [topic.key, { ...topic, at: performance.now() }]));
     } else {
       this.#tell(message.op, message);

@@ -11,7 +11,7 @@ import { Rate } from "../page/topics.js";
 import { Types, numberAt } from "../ros.js";
 import { persisted, soon } from "./asking.js";
 import { Frames, cloud, joints, map, poseOf, scan, stampMs } from "./decode.js";
-import { Freshness } from "./freshness.js";
+import { Freshness, WINDOW_MS } from "./freshness.js";
 import { Poke } from "./poke.js";
 import { bounded } from "./sizes.js";
 
@@ -21,14 +21,16 @@ const TOLD_MS = 250;
 /** What is no picture is shown so often at most. */
 const OTHERS_MS = 33;
 const VALUE_LINES = 8;
+/** Of so many pictures it is known how late they come. */
+const LEASTS = 64;
 const BITMAP = { imageOrientation: "flipY", premultiplyAlpha: "none", colorSpaceConversion: "none" };
 
 /** One topic of a robot that is received. */
 class Watched {
-  constructor(wish) {
+  constructor(wish, least) {
     Object.assign(this, wish);
     this.rate = new Rate();
-    this.freshness = new Freshness();
+    this.freshness = new Freshness(least);
     this.waiting = null;
     this.busy = false;
     this.unshown = 0;
@@ -42,9 +44,15 @@ export class SightLink {
   #watched = new Map();
   #nodes = new Map();
   #frames = new Map();
+  /** key → {ms, at}: how little later than their stamps pictures came, by the time of day, and when that was so. */
+  #least;
 
-  /** `tell(message, transfer)` tells the scene, `commands` is the port to the worker of commands. */
-  constructor({ url, tell, commands }) {
+  /**
+   * `tell(message, transfer)` tells the scene, `commands` is the port to the worker of commands, `least` what the page before
+   * was told of that.
+   */
+  constructor({ url, tell, commands, least = [] }) {
+    this.#least = new Map(least);
     this.tell = tell;
     this.commands = commands;
     this.types = new Types("", soon);
@@ -72,7 +80,7 @@ export class SightLink {
       }
       this.#leave(one);
     }
-    for (const wish of wanted.values()) this.#begin(new Watched(wish));
+    for (const wish of wanted.values()) this.#begin(new Watched(wish, this.#leastOf(wish.key)));
   }
 
   /** The scene has shown what it was given. */
@@ -97,6 +105,21 @@ export class SightLink {
     one.reader = type;
     const options = { robots: [one.robot], bufferSize: one.shown === "frames" ? 10 : 1 };
     this.#nodes.set(one.topic, this.headset.subscribe(one.topic, one.type, options, (message) => this.#take(message)));
+  }
+
+  /** By this worker's clock, which began when it did; null where it was too long ago. */
+  #leastOf(key) {
+    const { ms, at } = this.#least.get(key) ?? { at: -Infinity };
+    return Math.abs(performance.timeOrigin + performance.now() - at) < WINDOW_MS ? ms - performance.timeOrigin : null;
+  }
+
+  #noteLeast() {
+    for (const { key, guards, freshness } of this.#watched.values()) {
+      if (!guards || freshness.least === null) continue;
+      this.#least.delete(key); // the newest is the last one
+      this.#least.set(key, { ms: performance.timeOrigin + freshness.least, at: performance.timeOrigin + performance.now() });
+    }
+    for (const key of this.#least.keys()) if (this.#least.size > LEASTS) this.#least.delete(key);
   }
 
   #guard(one, guards) {
@@ -237,7 +260,8 @@ export class SightLink {
       problem: one.problem || (this.#nodes.get(one.topic)?.refusals.get(one.robot)?.reason ?? ""),
     }));
     const { connected, id, badMessages } = this.headset;
-    this.tell({ op: "rates", topics, connected, id, badMessages });
+    this.#noteLeast();
+    this.tell({ op: "rates", topics, connected, id, badMessages, least: [...this.#least] });
   }
 }
 

@@ -5,8 +5,8 @@ import { SightLink } from "./sight-link.js";
 let link = null;
 
 const ops = {
-  begin: ({ url, commands }) => {
-    link = new SightLink({ url, commands, tell: (message, transfer = []) => self.postMessage(message, transfer) });
+  begin: ({ url, commands, least }) => {
+    link = new SightLink({ url, commands, least, tell: (message, transfer = []) => self.postMessage(message, transfer) });
   },
   watch: ({ wishes }) => link.watch(wishes),
   shown: ({ key }) => link.shown(key),
