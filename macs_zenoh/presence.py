@@ -119,7 +119,7 @@ class Presence:
     def declare(self, agent_type: int, agent_id: int, group: int, epoch: int = 0, *, asleep: int = 0) -> Token:
         """Be online under this id, until the token is closed. Subscribe the inbox before: who is seen is sent to.
 
-        ``epoch`` is another one for each agent that this session gives the id, ``asleep`` for each time that its
+        ``epoch`` is another one than that of who had the id in this session before, ``asleep`` for each time that its
         connection has ended.
         """
         agent = AgentInfo(agent_type, agent_id, group, self._mesh.zid, epoch, asleep)

@@ -252,7 +252,7 @@ def _inbox(principal: Principal) -> str:
     kind, number = principal.agent
     if principal.kind == "gateway":
         return UNICAST.every(type=kind, block=principal.number)
-    return UNICAST.every(type=kind, block=block_of(number), id=number)
+    return UNICAST.every(type=kind, id=number)
 
 
 def _tried(endpoint: Endpoint, called: bool) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from bridge.principal import Principal
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.mesh import Mesh
-from macs_zenoh.protocol.keyexpr import LEASE, PING, PRESENCE, UNICAST, block_of, marked, type_name
+from macs_zenoh.protocol.keyexpr import LEASE, PING, PRESENCE, UNICAST, marked, type_name
 from macs_zenoh.protocol.messages import ROS, Metadata
 from macs_zenoh.protocol.routing import call, inbox
 from macs_zenoh.protocol.wire import PROBE
@@ -64,7 +64,7 @@ class Trial:
     async def _hears(self, place: Place, kind: int, number: int) -> bool:
         """Send to our own inbox with one session and listen with the other."""
         heard: list[str] = []
-        key = UNICAST.of(type=kind, block=block_of(number), id=number, from_type=kind, from_id=number)
+        key = UNICAST.of(type=kind, id=number, from_type=kind, from_id=number)
         gateway = self._principal.kind == "gateway"
         ours = UNICAST.every(type=kind, block=self._principal.number) if gateway else inbox(kind, number)
         listening = place.second.subscribe(ours, lambda batch: heard.extend(sent_to for sent_to, _ in batch))

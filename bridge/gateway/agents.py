@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, KeysView
 
 from macs_zenoh.mesh import Token
+from macs_zenoh.protocol.ids import Epochs
 from macs_zenoh.protocol.messages import UNITY
 from macs_zenoh.protocol.registrations import AgentKey
 
@@ -24,6 +25,7 @@ class Agents:
         self._group_of: dict[Connection, Group] = {}
         self.former: dict[AgentKey, Connection] = {}
         """Who had an id until a moment ago: answers to it may be on their way."""
+        self._epochs = Epochs()
 
     def __len__(self) -> int:
         return len(self._by_id)
@@ -57,6 +59,10 @@ class Agents:
             self._group_of[connection] = group
             self._groups.setdefault(group, set()).add(connection)
         return before, emptied if emptied not in self._groups else None
+
+    def epoch(self, connection: Connection) -> int:
+        """Which of those that had its id it is, as others see it."""
+        return self._epochs.of(connection.key, connection.peer.connection_number)
 
     def group_of(self, connection: Connection) -> int:
         """The group that others see an agent in, 0 for none: while it changes often, not always the last one."""

@@ -42,8 +42,8 @@ class Groups:
         if group:
             self._subscriptions.add(GROUP.every(type=kind, group=group), self._delivery.group)
         # the token last: whoever sees the agent can reach it
-        number, asleep = connection.peer.connection_number, connection.seen_asleep
-        token = self._presence.declare(kind, agent_id, group, number, asleep=asleep)
+        epoch, asleep = self._agents.epoch(connection), connection.seen_asleep
+        token = self._presence.declare(kind, agent_id, group, epoch, asleep=asleep)
         before, emptied = self._agents.join(connection, token)
         self.emptied(emptied)
         loop = asyncio.get_running_loop()

@@ -196,9 +196,8 @@ class Renumbering:
         self._on_change(connection)
         self._agents.renumber(connection, new_id)
         self._declarations.declare(connection)
-        number = connection.peer.connection_number
-        group = self._agents.group_of(connection)
-        token = self._presence.declare(old[0], new_id, group, number, asleep=connection.seen_asleep)
+        group, epoch = self._agents.group_of(connection), self._agents.epoch(connection)
+        token = self._presence.declare(old[0], new_id, group, epoch, asleep=connection.seen_asleep)
         old_token = self._agents.replace_token(connection, token)
         log.info("%s has id %d now", before, new_id)
         self._later(ANSWER_S, lambda: self._forget_former(old, connection))

@@ -505,7 +505,7 @@ class Gateway:
     def _is_here(self, agent: AgentInfo) -> bool:
         """Whether it is one of ours: when its presence changes twice in a moment, it can seem to be gone."""
         connection = self.agents.find(agent.type, agent.id) if agent.zid == self.mesh.zid else None
-        return connection is not None and connection.peer.connection_number == agent.epoch
+        return connection is not None and self.agents.epoch(connection) == agent.epoch
 
     def _tell(self, changes: list[Change]) -> None:
         self._roll.changed()

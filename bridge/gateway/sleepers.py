@@ -173,6 +173,6 @@ class Sleepers:
             showing.cancel()
         connection.seen_asleep = asleep
         kind, agent_id = connection.key
-        group, number = self._agents.group_of(connection), connection.peer.connection_number
-        token = self._presence.declare(kind, agent_id, group, number, asleep=asleep)
+        group, epoch = self._agents.group_of(connection), self._agents.epoch(connection)
+        token = self._presence.declare(kind, agent_id, group, epoch, asleep=asleep)
         self._agents.replace_token(connection, token).close()

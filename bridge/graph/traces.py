@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from macs_zenoh.errors import Unreachable
 from macs_zenoh.protocol import trace
-from macs_zenoh.protocol.keyexpr import STREAM, UNICAST, block_of
+from macs_zenoh.protocol.keyexpr import STREAM, UNICAST
 from macs_zenoh.protocol.messages import ROS, node_name
 from macs_zenoh.protocol.offers import absolute
 from macs_zenoh.protocol.trace import ROUTER, Hop, Offset, Point, Report, TraceRequest, at_share
@@ -113,7 +113,7 @@ class Tracing:
     def _key(self) -> str:
         """How the keys begin of what is traced."""
         if self._commands:
-            return UNICAST.every(type=ROS, block=block_of(self._robot), id=self._robot).removesuffix("**")
+            return UNICAST.every(type=ROS, id=self._robot).removesuffix("**")
         return STREAM.of(type=ROS, id=self._robot, node=node_name(self._topic))
 
     async def begin(self) -> None:

@@ -24,7 +24,7 @@ from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError, Unreachable, WireError
 from macs_zenoh.mesh import Sample
 from macs_zenoh.protocol.directory import AgentInfo
-from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST, block_of
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST
 from macs_zenoh.protocol.limits import ANSWER_BYTES
 from macs_zenoh.protocol.messages import ROS, decode_data
 from macs_zenoh.protocol.name_patterns import matches
@@ -232,7 +232,7 @@ class Recorder:
             by_robots = [UNICAST.every(type="unity", from_type=ROS)]
         else:
             robots = sorted(self._wanted.robots)
-            to_robots = [UNICAST.every(type=ROS, block=block_of(robot), id=robot) for robot in robots]
+            to_robots = [UNICAST.every(type=ROS, id=robot) for robot in robots]
             by_robots = [UNICAST.every(type="unity", from_type=ROS, from_id=robot) for robot in robots]
         others = [UNICAST.every(type="unity")] if self._wanted.headsets else []
         groups = GROUP.every() if self._wanted.headsets else GROUP.every(type=ROS)

@@ -38,7 +38,6 @@ from macs_zenoh.protocol.keyexpr import (
     WANTED,
     FieldValue,
     Key,
-    block_of,
     distinct,
     inside,
     is_recovery,
@@ -142,7 +141,7 @@ def headset_ids(gateway: Gateway) -> list[int]:
 
 
 def agents(client: Client) -> list[Fields]:
-    """Whom a client speaks for, as fields of `PRESENCE`; without an id: every agent of the type."""
+    """Whom a client speaks for, as fields of `CALL`; without an id: every agent of the type."""
     if isinstance(client, Robot):
         return [{"type": ROS, "id": client.id}]
     if isinstance(client, Operator):
@@ -155,13 +154,16 @@ def senders(client: Client) -> list[Fields]:
     return [{f"from_{name}": value for name, value in agent.items()} for agent in agents(client)]
 
 
-def inboxes(client: Client) -> list[Fields]:
-    """The same as fields of `UNICAST`: a block instead of all its ids. Nobody can write to an operator without id."""
-    if isinstance(client, Operator) and client.id is None:
-        return []
+def present(client: Client) -> list[Fields]:
+    """The same as fields of `PRESENCE`: a block instead of all its ids."""
     if isinstance(client, Gateway):
         return [{"type": UNITY, "block": block} for block in client.blocks] or [{"type": UNITY}]
-    return [{**agent, "block": block_of(int(agent["id"]))} for agent in agents(client)]
+    return agents(client)
+
+
+def inboxes(client: Client) -> list[Fields]:
+    """The same as fields of `UNICAST`. Nobody can write to an operator without id."""
+    return [] if isinstance(client, Operator) and client.id is None else present(client)
 
 
 # -- who may what ------------------------------------------------------------------------------------------------
@@ -417,7 +419,7 @@ class _Inbound:
 
 
 def _own_tokens(policy: Policy, client: Client) -> Iterator[str]:
-    for agent in agents(client):
+    for agent in present(client):
         yield PRESENCE.every(**agent, **({"group": client.group} if isinstance(client, Robot) else {}))
     if isinstance(client, Operator):
         yield PRESENCE.every(type=NOBODY)
@@ -444,8 +446,8 @@ def _tokens_seen(policy: Policy, client: Client) -> Iterator[str]:
     if isinstance(client, Operator):
         yield from (key.every() for key in (PRESENCE, LEASE, NAME, WANTED))
         return
-    yield from _every(PRESENCE, agents(client))
-    yield from _every(PRESENCE, _collapsed(policy, client, lambda other: policy.related(client, other), agents))
+    yield from _every(PRESENCE, present(client))
+    yield from _every(PRESENCE, _collapsed(policy, client, lambda other: policy.related(client, other), present))
     if isinstance(client, Gateway):
         yield LEASE.every()
     if (name := awareness_name(client)) is not None:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import NamedTuple
 
 from bridge.security import access
-from bridge.security.expected import Expected, agent_of, inbox_of, presence_of, sender_of
+from bridge.security.expected import Expected, agent_of, presence_of, sender_of
 from bridge.security.policy import Client, Gateway, Operator, Policy, Robot
 from macs_zenoh.protocol import keyexpr
 from macs_zenoh.protocol.keyexpr import (
@@ -113,7 +113,7 @@ class Attempts:
         expected, sender, here = self._expected, sender_of(name), self._here
         reached = [other for other in here if expected.reaches(name, other)]
         for receiver in here:
-            key = UNICAST.of(**inbox_of(receiver), **sender)
+            key = UNICAST.of(**agent_of(receiver), **sender)
             hearers = [other for other in here if receiver in reached and expected.has_inbox(other, receiver)]
             yield f"to {receiver.name} by id", key, receiver.name, hearers
         for group in sorted({robot.group for robot in self._policy.robots if robot.group}):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bridge.security import access
 from bridge.security.policy import Client, Gateway, Operator, Policy, Robot
-from macs_zenoh.protocol.keyexpr import FieldValue, block_of
+from macs_zenoh.protocol.keyexpr import FieldValue
 
 
 class Expected:
@@ -73,12 +73,6 @@ def agent_of(client: Client) -> dict[str, FieldValue]:
 def sender_of(client: Client) -> dict[str, FieldValue]:
     """That agent as the end of a key."""
     return {f"from_{name}": value for name, value in agent_of(client).items()}
-
-
-def inbox_of(client: Client) -> dict[str, FieldValue]:
-    """That agent as fields of `UNICAST`."""
-    found = agent_of(client)
-    return {**found, "block": block_of(int(found["id"]))}
 
 
 def presence_of(client: Client) -> dict[str, FieldValue]:

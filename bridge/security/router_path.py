@@ -14,7 +14,7 @@ from pathlib import Path
 
 from bridge.security import access
 from bridge.security.attempts import MARK, Attempt, Attempts, Question, Result, token
-from bridge.security.expected import Expected, agent_of, inbox_of, presence_of, sender_of
+from bridge.security.expected import Expected, agent_of, presence_of, sender_of
 from bridge.security.files import client_overrides
 from bridge.security.policy import Client, Gateway, Operator, Policy, Robot
 from macs_zenoh.config import MeshSettings
@@ -137,7 +137,7 @@ class RouterPath:
         """What everybody tries to hear: each inbox, group, stream and name, and everything at once."""
         keys = {BROADCAST.every(), NAMED_ALL.every(), PING.of(zid=MARK), keyexpr.EVERYTHING}
         for client in self._policy.clients:
-            keys.add(UNICAST.every(**inbox_of(client)))
+            keys.add(UNICAST.every(**agent_of(client)))
             if isinstance(client, Robot):
                 keys.add(STREAM.of(type=ROS, id=client.id, node=MARK))
                 if client.ros_namespace:
@@ -204,7 +204,7 @@ class RouterPath:
             if isinstance(client, Operator):
                 key = PING.of(zid=f"{MARK}-{client.name}")
             else:
-                key = UNICAST.of(**inbox_of(client), **sender_of(client))
+                key = UNICAST.of(**agent_of(client), **sender_of(client))
             payload = PROBE + f" echo {number} {client.name}".encode()
             events[client.name] = self._echoes[payload] = asyncio.Event()
             self._saying[client.name].put_unasked(key, payload)

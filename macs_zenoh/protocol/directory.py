@@ -32,9 +32,9 @@ class AgentInfo(NamedTuple):
     """One agent as the mesh sees it.
 
     ``type`` is the number; ``group`` 0 means none. ``zid`` is the Zenoh session that declared it, the agent's own or
-    its gateway's, as it is `published`. ``epoch`` counts those that had this id in that session one after the other:
-    what belongs to one of them does not belong to the next. ``asleep``, if it is not 0: its connection has ended for
-    the so many-th time, and it is expected back; nothing that it does goes on.
+    its gateway's, as it is `published`. ``epoch`` tells those apart that had this id in that session one after the
+    other (`ids.Epochs`): what belongs to one of them does not belong to the next. ``asleep``, if it is not 0: its
+    connection has ended for the so many-th time, and it is expected back; nothing that it does goes on.
     """
 
     type: int

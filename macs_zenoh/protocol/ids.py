@@ -9,7 +9,7 @@ Two parts of a mesh that could not see each other may have chosen the same; `Con
 
 from __future__ import annotations
 
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
@@ -100,6 +100,34 @@ class FreeIds:
             self._given.remove(agent_id)
             if block_of(agent_id) in self._blocks:
                 self._used.append(agent_id)
+
+
+class Epochs:
+    """Which of those that had an id one after the other in one session somebody is: a number that differs from that
+    of the one before, and comes again.
+
+    It is in the key of his presence, and Zenoh keeps what it has for a key for as long as a session is open, in the
+    session and in its routers: 3 KB, and each makes the next dearer (measured with 1.10.2). So keys must come again.
+    """
+
+    MOST = 8
+    """For so many an id has one after the other nobody sees two as the same one, not even who was away meanwhile."""
+    AGENTS = 64 << 10
+
+    def __init__(self) -> None:
+        self._last: OrderedDict[tuple[int, int], tuple[int, int]] = OrderedDict()
+        """Whose an id is or was: which of all connections, and its epoch."""
+
+    def of(self, agent: tuple[int, int], connection: int) -> int:
+        """That of a connection, by its number among all; the next one if it is new."""
+        last, epoch = self._last.get(agent, (0, 0))
+        if last != connection:
+            epoch = epoch % self.MOST + 1
+            self._last[agent] = connection, epoch
+            self._last.move_to_end(agent)
+            if len(self._last) > self.AGENTS:
+                self._last.popitem(last=False)
+        return epoch
 
 
 def free_id(taken: Collection[int], leased_blocks: Collection[int] = ()) -> int | None:

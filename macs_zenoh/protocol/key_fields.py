@@ -58,6 +58,7 @@ class PresenceFields(NamedTuple):
     """Of a key of `PRESENCE`."""
 
     type: int
+    block: int
     id: int
     group: int
     zid: str

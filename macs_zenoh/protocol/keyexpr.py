@@ -96,12 +96,15 @@ class Key(Generic[_F]):
     subscriber: str
     payload: str
     fields: tuple[str, ...] = field(init=False)
+    _in_blocks: bool = field(init=False, repr=False, compare=False)
+    """Whether an id's block stands before it, which follows from the id."""
     _names: frozenset[str] = field(init=False, repr=False, compare=False)
     _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fields", tuple(re.findall(r"\{(\w+)\}", self.template)))
         object.__setattr__(self, "_names", frozenset(self.fields))
+        object.__setattr__(self, "_in_blocks", {"block", "id"} <= self._names)
         pattern = re.sub(r"\{(\w+)\}", r"([^/*$?#]+)", self.template)
         object.__setattr__(self, "_pattern", re.compile(pattern))
 
@@ -111,7 +114,9 @@ class Key(Generic[_F]):
         return self.template.partition("{")[0]
 
     def of(self, **values: FieldValue) -> str:
-        """The concrete key for these fields. Raises UsageError when one is missing, unknown or cannot be written."""
+        """The concrete key for these fields; an id's block need not be given. Raises UsageError when one is missing,
+        unknown, cannot be written or is another id's block."""
+        self._complete(values)
         if values.keys() != self._names and (missing := self._names - values.keys()):
             raise UsageError(f"key {self.template}: no value for {', '.join(sorted(missing))}")
         return self._fill(values)
@@ -119,9 +124,9 @@ class Key(Generic[_F]):
     def every(self, **values: FieldValue) -> str:
         """The key expression for all keys with these fields; fields not given match anything.
 
-        A tail in which nothing is given becomes ``**``, so ``UNICAST.every(type=1, block=0, id=7)`` is
-        ``macs/to/ros/0/7/**``.
+        A tail in which nothing is given becomes ``**``, so ``UNICAST.every(type=1, id=7)`` is ``macs/to/ros/0/7/**``.
         """
+        self._complete(values)
         given = [name in values for name in self.fields]
         last = max((i for i, here in enumerate(given) if here), default=-1)
         tail = self.fields[last + 1 :]
@@ -139,9 +144,19 @@ class Key(Generic[_F]):
         if match is None:
             return None
         try:
-            return self.read(*map(_read, self.fields, match.groups()))
+            fields = self.read(*map(_field, self.fields, match.groups()))
         except (UsageError, ValueError):
             return None
+        at = self.fields.index("block") if self._in_blocks else 0
+        return None if self._in_blocks and fields[at] != block_of(fields[at + 1]) else fields
+
+    def _complete(self, values: dict[str, FieldValue]) -> None:
+        """Put the block of an id beside it."""
+        if not self._in_blocks or not isinstance(agent_id := values.get("id"), int):
+            return
+        block = block_of(agent_id)
+        if values.setdefault("block", block) != block:
+            raise UsageError(f"id {agent_id} is in block {block}, not {values['block']}")
 
     def _fill(self, values: dict[str, FieldValue], template: str | None = None) -> str:
         if not values.keys() <= self._names:
@@ -356,6 +371,16 @@ def _write(name: str, value: FieldValue) -> str:
     return "%40" + chunk[1:] if chunk.startswith("@") else chunk  # Zenoh's wildcards do not match what starts with @
 
 
+def _field(name: str, text: str) -> FieldValue:
+    return _read(name, text) if name in _NEW else _known(name, text)
+
+
+@lru_cache(maxsize=WRITTEN)
+def _known(name: str, text: str) -> FieldValue:
+    """`_read`, remembered likewise."""
+    return _read(name, text)
+
+
 def _read(name: str, text: str) -> FieldValue:
     value: FieldValue = unquote(text)
     if name in _TYPES:
@@ -399,7 +424,7 @@ STREAM = Key(
     payload="one frame whose management data lists the registrants",
 )
 PRESENCE = Key(
-    "macs/live/{type}/{id}/{group}/{zid}",
+    "macs/live/{type}/{block}/{id}/{group}/{zid}",
     PresenceFields,
     publisher="an agent, or the gateway it is behind (liveliness token)",
     subscriber="every agent and gateway",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from .keyexpr import BROADCAST, CALL, GROUP, STREAM, UNICAST, block_of
+from .keyexpr import BROADCAST, CALL, GROUP, STREAM, UNICAST
 from .messages import EVERYBODY, Metadata
 from .wire import MACS, Header, Layout, encode_frame, encode_message
 
@@ -31,7 +31,7 @@ def keys_of(header: Header, from_type: int, from_id: int) -> list[str]:
 @lru_cache(maxsize=8192)
 def unicast_key(agent_type: int, agent_id: int, from_type: int, from_id: int) -> str:
     """The inbox key of one agent, for one sender."""
-    return UNICAST.of(type=agent_type, block=block_of(agent_id), id=agent_id, from_type=from_type, from_id=from_id)
+    return UNICAST.of(type=agent_type, id=agent_id, from_type=from_type, from_id=from_id)
 
 
 @lru_cache(maxsize=4096)
@@ -57,7 +57,7 @@ def call_of(
 
 def inbox(agent_type: int, agent_id: int) -> str:
     """What an agent subscribes to for frames sent to its id."""
-    return UNICAST.every(type=agent_type, block=block_of(agent_id), id=agent_id)
+    return UNICAST.every(type=agent_type, id=agent_id)
 
 
 def takes_group_copy(header: Header, agent_id: int, sender: tuple[int, int], agent_type: int) -> bool:

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 
 import zenoh
 
+from macs_zenoh.protocol.keyexpr import PRESENCE
 from tests.attack.inputs import HUGE, LONG, MIB, unknown_keys
 from tests.attack.raw import ROS, UNITY, frame, header, management, message, metadata
 from tests.attack.table import Target, attack
@@ -187,15 +188,16 @@ def tokens_with_long_names(target: Target) -> None:
     """Presence, name and lease tokens whose chunks have 20 000 characters, or are no numbers."""
     long = "z" * 20_000
     keys = [
-        f"macs/live/unity/4000/0/{long}",
-        "macs/live/unity/99999/0/a",
-        "macs/live/unity/4001/999/a",
-        "macs/live/300/1/0/a",
+        f"macs/live/unity/15/4000/0/{long}",
+        "macs/live/unity/390/99999/0/a",
+        "macs/live/unity/15/4001/999/a",
+        "macs/live/300/0/1/0/a",
+        "macs/live/unity/16/4001/0/a",
         f"macs/name/{long}/ros/77/a1",
         f"macs/ca/wanted/{long}/x/a1",
         "macs/block/999/a1",
         f"macs/block/7/{long}",
-        "macs/live/ros/4002/0/not hexadecimal",
+        "macs/live/ros/15/4002/0/not hexadecimal",
     ]
     with session(target) as mesh:
         while target.running():
@@ -350,7 +352,11 @@ def twenty_thousand_tokens(target: Target) -> None:
         for number in range(20_000):
             if not target.running():
                 break
-            tokens.append(mesh.liveliness().declare_token(f"macs/live/unity/{4000 + number}/0/{mesh.zid()}"))
+            tokens.append(
+                mesh.liveliness().declare_token(
+                    PRESENCE.of(type=UNITY, id=4000 + number, group=0, zid=str(mesh.zid()))
+                )
+            )
         while target.rest(0.2):
             pass
 
@@ -364,7 +370,7 @@ def one_agent_of_many_sessions(target: Target) -> None:
             tokens = []
             for _ in range(20_000):
                 number += 1
-                tokens.append(mesh.liveliness().declare_token(f"macs/live/unity/4000/0/{number:032x}"))
+                tokens.append(mesh.liveliness().declare_token(f"macs/live/unity/15/4000/0/{number:032x}"))
                 if not target.running():
                     return
             for token in tokens:
@@ -380,7 +386,7 @@ def tokens_that_come_and_go(target: Target) -> None:
             tokens = []
             for _ in range(200):
                 number += 1
-                key = f"macs/live/unity/{4000 + number % 50_000}/{number % 256}/{mesh.zid()}"
+                key = PRESENCE.of(type=UNITY, id=4000 + number % 50_000, group=number % 256, zid=str(mesh.zid()))
                 tokens.append(mesh.liveliness().declare_token(key))
             for token in tokens:
                 token.undeclare()
@@ -405,7 +411,11 @@ def a_thousand_agents_and_questions(target: Target) -> None:
     with session(target) as mesh:
         tokens = []
         for number in range(1000):
-            tokens.append(mesh.liveliness().declare_token(f"macs/live/unity/{4000 + number}/0/{mesh.zid()}"))
+            tokens.append(
+                mesh.liveliness().declare_token(
+                    PRESENCE.of(type=UNITY, id=4000 + number, group=0, zid=str(mesh.zid()))
+                )
+            )
         asking = frame(management("OnlineAgentsGetter", agent_type=2, agent_id=1), metadata())
         flood(target, asking, agents=2)
 
@@ -415,7 +425,7 @@ def sessions_that_come_and_go(target: Target) -> None:
     """Zenoh sessions with a presence token each, that end at once."""
     while target.running():
         with suppress(zenoh.ZError), session(target) as mesh:
-            token = mesh.liveliness().declare_token(f"macs/live/unity/4000/0/{mesh.zid()}")
+            token = mesh.liveliness().declare_token(f"macs/live/unity/15/4000/0/{mesh.zid()}")
             time.sleep(0.01)
             token.undeclare()
 

@@ -291,7 +291,7 @@ async def test_what_access_rules_allow_and_forbid(guarded: Router) -> None:
 
         thief = await doctor("-e", endpoint, "--as", "ros/8", "--quick", cfg=credentials("robot-7"))
         assert thief.wrong == {"presence_denied": "error", "inbox_denied": "error"}
-        assert "macs/live/ros/8/**" in thief.find("presence_denied")["remedy"]
+        assert "macs/live/ros/0/8/**" in thief.find("presence_denied")["remedy"]
         assert thief.code == 1
 
         observer = await doctor("-e", endpoint, "--as", "observer", "--quick", cfg=credentials("observer"))

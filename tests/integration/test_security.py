@@ -154,22 +154,22 @@ async def test_nobody_answers_for_another(site: Site) -> None:
 
 TOKENS = [
     # who declares, the token, who sees it
-    ("robot-7", "macs/live/ros/7/3/a1", {"robot-7", "robot-8", "hall-1", "hall-2", "anna"}),
-    ("robot-7", "macs/live/ros/7/4/a1", set()),
-    ("robot-7", "macs/live/ros/8/3/a1", set()),
-    ("robot-7", "macs/live/unity/7/0/a1", set()),
-    ("robot-9", "macs/live/ros/9/0/a1", {"robot-9", "anna"}),
-    ("hall-1", "macs/live/unity/256/0/a1", {"robot-7", "robot-8", "hall-1", "hall-2", "anna"}),
-    ("hall-1", "macs/live/unity/512/0/a1", set()),
-    ("hall-1", "macs/live/ros/7/3/a2", set()),
+    ("robot-7", "macs/live/ros/0/7/3/a1", {"robot-7", "robot-8", "hall-1", "hall-2", "anna"}),
+    ("robot-7", "macs/live/ros/0/7/4/a1", set()),
+    ("robot-7", "macs/live/ros/0/8/3/a1", set()),
+    ("robot-7", "macs/live/unity/0/7/0/a1", set()),
+    ("robot-9", "macs/live/ros/0/9/0/a1", {"robot-9", "anna"}),
+    ("hall-1", "macs/live/unity/1/256/0/a1", {"robot-7", "robot-8", "hall-1", "hall-2", "anna"}),
+    ("hall-1", "macs/live/unity/2/512/0/a1", set()),
+    ("hall-1", "macs/live/ros/0/7/3/a2", set()),
     ("hall-1", "macs/block/1/a1", {"hall-1", "hall-2", "anna"}),
     ("hall-1", "macs/block/2/a1", set()),
-    ("hall-2", "macs/live/unity/512/0/a2", {"robot-7", "hall-1", "hall-2", "anna"}),
+    ("hall-2", "macs/live/unity/2/512/0/a2", {"robot-7", "hall-1", "hall-2", "anna"}),
     ("robot-7", "macs/name/drone7/ros/7/a1", {"robot-7", "robot-8", "anna"}),
     ("robot-7", "macs/name/drone8/ros/7/a1", set()),
     ("robot-8", "macs/ca/wanted/drone8/t/a1", {"robot-7", "robot-8", "anna"}),
     ("robot-9", "macs/ca/wanted/drone8/t/a2", set()),
-    ("anna", "macs/live/ros/7/3/a3", set()),
+    ("anna", "macs/live/ros/0/7/3/a3", set()),
     ("anna", "macs/block/1/a3", set()),
 ]
 
@@ -248,7 +248,7 @@ async def test_a_stolen_gateway_certificate_is_no_robot(site: Site) -> None:
             macs_zenoh.join("unity", id=514, settings=stolen) as other,
         ):
             thief.serve("add_node", answer)
-            forged = thief.mesh.declare_token("macs/live/ros/7/3/a1")
+            forged = thief.mesh.declare_token("macs/live/ros/0/7/3/a1")
             inbox = listening(thief.mesh, "macs/to/ros/0/7/**")
             thief.mesh.put_unasked("macs/from/ros/7/nd__x", b"forged")
             thief.mesh.put_unasked("macs/to/unity/2/513/ros/7", b"forged")
@@ -322,7 +322,7 @@ async def test_a_client_that_says_it_is_a_router_may_no_more(site: Site) -> None
         inbox = listening(hall, "macs/to/unity/2/**")
         stream = listening(hall, "macs/from/ros/7/**")
         taken = [listening(thief, key) for key in ("macs/to/ros/0/7/**", "macs/from/**", "macs/ca/to/drone7/**")]
-        tokens = [thief.declare_token(f"macs/live/ros/{number}/3/a8") for number in (7, 8)]
+        tokens = [thief.declare_token(f"macs/live/ros/0/{number}/3/a8") for number in (7, 8)]
         while not by_name:  # what it may do
             thief.put_unasked("macs/to/unity/2/767/ros/7", b"forged")
             thief.put_unasked("macs/from/ros/7/nd__x", b"forged")
@@ -334,7 +334,7 @@ async def test_a_client_that_says_it_is_a_router_may_no_more(site: Site) -> None
             await asyncio.sleep(0.05)
         assert {bytes(payload) for _, payload in (*stream, *inbox)} == {b"true"}
         assert {bytes(payload) for got in taken for _, payload in got} == {b"forged", b"x"}  # its own
-        assert await anna.tokens("macs/live/**", timeout_s=PATIENCE_S) == ["macs/live/ros/8/3/a8"]
+        assert await anna.tokens("macs/live/**", timeout_s=PATIENCE_S) == ["macs/live/ros/0/8/3/a8"]
         for token in tokens:
             token.close()
 
@@ -368,14 +368,14 @@ async def test_who_left_the_plan_may_nothing(tmp_path: Path) -> None:
     after = Site(without, found.directory)
     async with Router(after.file()), after.session("robot-7") as thief, after.session("anna") as anna:
         heard = [listening(thief, key) for key in ("macs/to/ros/0/7/**", "macs/all/**")]
-        token = thief.declare_token("macs/live/ros/7/3/a1")
+        token = thief.declare_token("macs/live/ros/0/7/3/a1")
         async with (
             macs_zenoh.join("ros", id=7, group=3, settings=after.settings("robot-7b")) as robot,
             macs_zenoh.join("unity", id=256, settings=after.settings("hall-1")) as headset,
         ):
             await until(lambda: ("ros", 7) in online(headset))
             thief.put_unasked("macs/to/unity/1/256/ros/7", b"forged")
-            assert await thief.tokens("macs/live/**") == ["macs/live/ros/7/3/a1"]  # its own session knows that
+            assert await thief.tokens("macs/live/**") == ["macs/live/ros/0/7/3/a1"]  # its own session knows that
             headset.send(b"command", to="ros", ids=[7])
             headset.broadcast(b"to all")
             assert [(await asyncio.wait_for(robot.receive(), PATIENCE_S)).data for _ in range(2)] == [
@@ -385,5 +385,5 @@ async def test_who_left_the_plan_may_nothing(tmp_path: Path) -> None:
             robot.send(b"back", to="unity", ids=[256])
             assert (await asyncio.wait_for(headset.receive(), PATIENCE_S)).data == b"back"
             assert heard == [[], []]
-            assert "macs/live/ros/7/3/a1" not in await anna.tokens("macs/live/**")
+            assert "macs/live/ros/0/7/3/a1" not in await anna.tokens("macs/live/**")
         token.close()

@@ -120,7 +120,7 @@ def online(agent: macs_zenoh.Agent) -> set[tuple[str, int]]:
 async def linked(found: Site) -> None:
     """Wait until a robot on one router and a gateway on the other see each other."""
     async with found.session("robot-7", "site") as robot, found.session("hall-1", "cloud") as hall:
-        token = robot.declare_token("macs/live/ros/7/3/a1")
+        token = robot.declare_token("macs/live/ros/0/7/3/a1")
         while not await hall.tokens("macs/live/**"):
             await asyncio.sleep(0.05)
         token.close()

@@ -250,7 +250,7 @@ def test_a_token_says_who_it_is(agent: AgentInfo) -> None:
     """A key with and without an epoch; one that is no number is none of ours."""
     assert AgentInfo.parse(agent.presence) == agent
     for wrong in ("x", "-1", "\u0661", "9" * 20, "1.2"):
-        assert AgentInfo.parse(f"macs/live/ros/7/0/a1.{wrong}") is None
+        assert AgentInfo.parse(f"macs/live/ros/0/7/0/a1.{wrong}") is None
 
 
 def test_ids_are_per_type() -> None:
@@ -272,8 +272,9 @@ def test_other_keys_are_not_presence() -> None:
         UNICAST.of(type=1, block=0, id=7, from_type=2, from_id=8),
         "",
         "macs/live/**",
+        "macs/live/ros/1/7/0/a1",
     ]
-    assert [directory.token(other, True, 0.0) for other in others] == [[], [], [], []]
+    assert [directory.token(other, True, 0.0) for other in others] == [[]] * len(others)
     assert len(directory) == 0
 
 

@@ -277,7 +277,7 @@ def _(facts: Facts) -> None:
 
 @makes("other_namespace", NOTE)
 def _(facts: Facts) -> None:
-    facts.endpoints[0].elsewhere = ["site1/macs/live/ros/1/0/aa"]
+    facts.endpoints[0].elsewhere = ["site1/macs/live/ros/0/1/0/aa"]
 
 
 @makes("ros_unnamed", NOTE)
@@ -288,7 +288,7 @@ def _(facts: Facts) -> None:
 @makes("wrong_namespace", WARNING)
 def _(facts: Facts) -> None:
     facts.programs = facts.programs[1:]
-    facts.endpoints[0].elsewhere = ["site1/macs/live/ros/1/0/aa"]
+    facts.endpoints[0].elsewhere = ["site1/macs/live/ros/0/1/0/aa"]
 
 
 @makes("program_silent", WARNING)

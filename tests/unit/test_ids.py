@@ -11,6 +11,7 @@ from macs_zenoh.protocol.ids import (
     GATEWAY_PATIENCE_S,
     PATIENCE_S,
     Contests,
+    Epochs,
     FreeIds,
     Verdict,
     free_blocks,
@@ -20,6 +21,36 @@ from macs_zenoh.protocol.ids import (
 from macs_zenoh.protocol.keyexpr import block_of
 
 zids = st.text("0123456789abcdef", min_size=1, max_size=4)
+
+
+@given(st.lists(st.tuples(st.integers(1, 3), st.integers(1, 4)), min_size=1, max_size=200))
+def test_an_id_has_another_epoch_for_whoever_has_it_next(chosen: list[tuple[int, int]]) -> None:
+    """Of the same connection the same; of the next another one, and no more of them than there are for each id."""
+    epochs, now, seen = Epochs(), dict[int, tuple[int, int]](), dict[int, list[int]]()
+    for agent_id, step in chosen:
+        before, epoch = now.get(agent_id, (0, 0))
+        connection = before + step % 2  # the same one, or the next
+        if not connection:
+            continue
+        found = epochs.of((2, agent_id), connection)
+        assert (found == epoch) == (connection == before)
+        now[agent_id] = connection, found
+        if connection != before:
+            seen.setdefault(agent_id, []).append(found)
+    for found_all in seen.values():
+        assert set(found_all) <= set(range(1, Epochs.MOST + 1))
+        for at in range(len(found_all)):
+            assert len(set(found_all[at : at + Epochs.MOST])) == len(found_all[at : at + Epochs.MOST])
+
+
+def test_epochs_of_agents_that_are_long_gone_are_forgotten() -> None:
+    """Room is bounded, whatever ids robots choose; of who is there nothing is lost."""
+    epochs = Epochs()
+    epochs.of((2, 1), 1)
+    for number in range(Epochs.AGENTS):
+        assert epochs.of((3, number), 5) == 1
+    assert epochs.of((2, 1), 2) == 1
+    assert epochs.of((3, Epochs.AGENTS - 1), 5) == 1
 
 
 @given(st.sets(st.integers(0, BLOCKS - 1), max_size=BLOCKS - 1))

@@ -50,8 +50,10 @@ NUMBERS: dict[str, st.SearchStrategy[int | str]] = {
 
 
 def fields_of(space: Key) -> st.SearchStrategy[dict[str, int | str]]:
-    """Any fields of a key space."""
-    return st.fixed_dictionaries({name: NUMBERS.get(name, texts) for name in space.fields})
+    """Any fields of a key space; a block is that of the id."""
+    any_fields = st.fixed_dictionaries({name: NUMBERS.get(name, texts) for name in space.fields})
+    in_blocks = {"block", "id"} <= set(space.fields)
+    return any_fields.map(lambda fields: {**fields, "block": block_of(int(fields["id"]))} if in_blocks else fields)
 
 
 # -- what Zenoh would not survive ------------------------------------------------------------------------------------
@@ -71,6 +73,7 @@ def test_a_key_is_never_longer_than_zenoh_can_write(space_name: str) -> None:
         "é" * 40_000,
     ):
         fields: dict[str, int | str] = {name: 1 if name in NUMBERS else text for name in space.fields}
+        fields |= {"block": 0} if "block" in fields and "id" in fields else {}
         for make in (space.of, space.every):
             try:
                 key = make(**fields)
@@ -142,8 +145,9 @@ def test_the_key_spaces_are_disjoint(one: str, other: str) -> None:
 
 def test_a_tail_that_is_not_given_is_one_wildcard() -> None:
     """Fields missing at the end become `**`, those missing before a given one become `*`."""
-    assert UNICAST.every(type=1, block=0, id=7) == "macs/to/ros/0/7/**"
-    assert UNICAST.every(id=7) == "macs/to/*/*/7/**"
+    assert UNICAST.every(type=1, id=7) == "macs/to/ros/0/7/**"
+    assert UNICAST.every(id=7) == "macs/to/*/0/7/**"
+    assert CALL.every(id=7) == "macs/call/*/7/**"
     assert STREAM.every(node="nd_x") == "macs/from/*/*/nd_x"
     assert GROUP.every() == "macs/group/**"
 
@@ -294,6 +298,26 @@ def test_types_may_be_given_by_name() -> None:
         type=1, id=7, verb="offers", from_type=2, from_id=8
     )
     assert PRESENCE.every(type="unity") == PRESENCE.every(type=2)
+
+
+@pytest.mark.parametrize("space", [UNICAST, PRESENCE])
+def test_an_id_is_only_in_its_own_block(space: Key) -> None:
+    """Its block is put before it, and a key with another one is nobody's: who may say it is judged by the block."""
+    fields: dict[str, int | str] = {"type": 2, "id": 300, "group": 0, "zid": "a1", "from_type": 1, "from_id": 7}
+    mine = {name: fields[name] for name in space.fields if name != "block"}
+    key = space.of(**mine)
+    assert "/unity/1/300/" in key
+    assert space.of(**mine, block=1) == key
+    assert space.every(type=2, id=300) == space.every(type=2, block=1, id=300)
+    parsed = space.parse(key)
+    assert parsed is not None
+    assert parsed._asdict() == {**mine, "block": 1}
+    for other in (0, 2):
+        assert space.parse(key.replace("/1/300/", f"/{other}/300/")) is None
+        with pytest.raises(UsageError, match="block 1"):
+            space.of(**mine, block=other)
+        with pytest.raises(UsageError, match="block 1"):
+            space.every(type=2, block=other, id=300)
 
 
 def test_the_block_of_an_id_is_its_high_byte() -> None:

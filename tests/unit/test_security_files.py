@@ -127,11 +127,11 @@ def test_what_goes_to_several_reaches_whom_its_sender_may_reach() -> None:
 
 def test_presence_is_seen_by_who_has_to_do_with_it() -> None:
     """Robots that have nothing to do with each other, or with a gateway, do not see it; operators see all."""
-    assert may("hall-2", "liveliness_token", "egress", "macs/live/ros/7/3/a1")
-    assert not may("hall-2", "liveliness_token", "egress", "macs/live/ros/300/3/a1")
-    assert not may("robot-8", "liveliness_token", "egress", "macs/live/unity/512/0/a1")
-    assert not may("robot-7", "liveliness_token", "ingress", "macs/live/ros/7/4/a1")
-    assert may("anna", "liveliness_token", "egress", "macs/live/ros/300/3/a1")
+    assert may("hall-2", "liveliness_token", "egress", "macs/live/ros/0/7/3/a1")
+    assert not may("hall-2", "liveliness_token", "egress", "macs/live/ros/1/300/3/a1")
+    assert not may("robot-8", "liveliness_token", "egress", "macs/live/unity/2/512/0/a1")
+    assert not may("robot-7", "liveliness_token", "ingress", "macs/live/ros/0/7/4/a1")
+    assert may("anna", "liveliness_token", "egress", "macs/live/ros/1/300/3/a1")
 
 
 def test_only_what_a_node_may_hear_is_in_its_rules(site: Policy) -> None:
