@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args
 from msgspec import Meta
 
 from .protocol import endpoints
-from .protocol.keyexpr import expression_problem
+from .protocol.key_expressions import expression_problem
 from .sections import Millis, Section
 
 Mode = Literal["client", "peer", "router"]

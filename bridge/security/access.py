@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from bridge.security.policy import Client, Gateway, Operator, Policy, Robot, Router, kind_of
+from macs_zenoh.protocol.key_expressions import distinct
 from macs_zenoh.protocol.keyexpr import (
     ADMIN,
     BLOCK_SIZE,
@@ -38,7 +39,6 @@ from macs_zenoh.protocol.keyexpr import (
     WANTED,
     FieldValue,
     Key,
-    distinct,
     inside,
     is_recovery,
     with_recovery,

@@ -14,6 +14,7 @@ from bridge.security.policy import Client, Gateway, Operator, Policy, Robot, Rou
 from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.protocol import keyexpr
 from macs_zenoh.protocol.endpoints import protocol_of
+from macs_zenoh.protocol.key_expressions import begins
 from macs_zenoh.protocol.keyexpr import STREAM, type_name
 from macs_zenoh.protocol.messages import ROS, UNITY
 from macs_zenoh.sections import changed
@@ -288,7 +289,7 @@ def _low_pass(policy: Policy) -> Iterator[str]:
         yield "  ],"
 
 
-STREAMS = keyexpr.begins(STREAM.template)
+STREAMS = begins(STREAM.template)
 """How the keys of robots' topics begin, and no others."""
 
 
@@ -297,7 +298,7 @@ def _priorities(policy: Policy) -> Iterator[str]:
     entries: list[str] = []
     given = [(number, rule) for number, rule in enumerate(policy.traffic) if rule.priority is not None]
     for number, rule in given:
-        begin = keyexpr.begins(rule.match)
+        begin = begins(rule.match)
         if begin == STREAMS:
             yield f"  // priority of {rule.match} is left to the programs: a robot may have another for the topic"
         elif begin is not None:

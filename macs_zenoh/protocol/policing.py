@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar
 
 from ..config import Priority, TrafficRule
-from .keyexpr import fits
+from .key_expressions import fits
 from .rate import Rate
 
 BURST_S = 0.1

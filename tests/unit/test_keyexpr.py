@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from macs_zenoh.errors import UsageError
-from macs_zenoh.protocol import keyexpr
+from macs_zenoh.protocol import key_expressions, keyexpr
+from macs_zenoh.protocol.key_expressions import expression_problem, fits
 from macs_zenoh.protocol.key_fields import StreamFields
 from macs_zenoh.protocol.keyexpr import (
     CALL,
@@ -22,8 +23,6 @@ from macs_zenoh.protocol.keyexpr import (
     UNICAST,
     Key,
     block_of,
-    expression_problem,
-    fits,
     type_name,
     type_number,
 )
@@ -412,7 +411,7 @@ def test_an_expression_for_each_robot() -> None:
 def test_expressions_that_another_one_covers_are_left_out() -> None:
     """Each once, in their order; what is verbatim is covered by no wildcard."""
     keys = ["macs/all/**", "macs/all/ros/7", "macs/all/**", "macs/all/@adv/**", "macs/group/3/ros"]
-    assert keyexpr.distinct(keys) == ("macs/all/**", "macs/all/@adv/**", "macs/group/3/ros")
+    assert key_expressions.distinct(keys) == ("macs/all/**", "macs/all/@adv/**", "macs/group/3/ros")
 
 
 @pytest.mark.parametrize(
@@ -421,4 +420,4 @@ def test_expressions_that_another_one_covers_are_left_out() -> None:
 )
 def test_how_an_expression_begins(expression: str, begins: str | None) -> None:
     """Two chunks, where they have no wildcards."""
-    assert keyexpr.begins(expression) == begins
+    assert key_expressions.begins(expression) == begins
