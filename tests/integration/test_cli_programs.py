@@ -16,6 +16,7 @@ import pytest
 import macs_zenoh
 from bridge.headset.client import Headset
 from tests.support.programs import ROOT, Program, ended, free_port, macs
+from tests.support.thorough import some
 from tests.support.waiting import PATIENCE_S
 
 
@@ -107,12 +108,9 @@ async def test_servers_stop_on_a_signal(endpoint: str, number: signal.Signals) -
 
 
 @pytest.mark.parametrize("workers", [["--workers", "2"], ["--workers=2"]], ids=" ".join)
-async def test_a_worker_starts_no_workers(endpoint: str, workers: list[str]) -> None:
+async def test_a_worker_starts_no_workers(router: str, workers: list[str]) -> None:
     """However it is spelled: as many processes as were asked for, and each serves the one port."""
-    async with (
-        Program("router", "-l", endpoint),
-        Program("gateway", *workers, "-v", "--port", "0", "-e", endpoint) as gateway,
-    ):
+    async with Program("gateway", *workers, "-v", "--port", "0", "-e", router) as gateway:
         assert {len(children_of(pid)) for pid in children_of(gateway.pid)} == {0}
         assert len(children_of(gateway.pid)) == 2
         async with await Headset.connect("127.0.0.1", gateway.port) as headset:
@@ -128,25 +126,25 @@ def children_of(pid: int) -> list[int]:
     return found
 
 
-@pytest.mark.parametrize("workers", [[], ["--workers", "2"]], ids=["alone", "workers"])
+HOSTS = [
+    ("::", "[::]", ["127.0.0.1", "::1"]),
+    ("[::]", "[::]", ["127.0.0.1", "::1"]),
+    ("::1", "[::1]", ["::1"]),
+    ("0.0.0.0", "0.0.0.0", ["127.0.0.1"]),
+    ("localhost", "localhost", ["127.0.0.1"]),
+]
+"""What a gateway is told, what it says, and where it is found."""
+
+
 @pytest.mark.parametrize(
-    ("host", "shown", "dialled"),
-    [
-        ("::", "[::]", ["127.0.0.1", "::1"]),
-        ("[::]", "[::]", ["127.0.0.1", "::1"]),
-        ("::1", "[::1]", ["::1"]),
-        ("0.0.0.0", "0.0.0.0", ["127.0.0.1"]),
-        ("localhost", "localhost", ["127.0.0.1"]),
-    ],
+    ("host", "shown", "dialled", "workers"),
+    [(*host, []) for host in HOSTS] + [(*host, ["--workers", "2"]) for host in some(HOSTS)],
 )
 async def test_where_a_gateway_listens_can_be_pasted(
-    endpoint: str, host: str, shown: str, dialled: list[str], workers: list[str]
+    router: str, host: str, shown: str, dialled: list[str], workers: list[str]
 ) -> None:
     """`::` is both families, with and without brackets; what `ready:` says is what `macs headset` takes."""
-    async with (
-        Program("router", "-l", endpoint),
-        Program("gateway", "--host", host, "--port", "0", "-e", endpoint, *workers) as gateway,
-    ):
+    async with Program("gateway", "--host", host, "--port", "0", "-e", router, *workers) as gateway:
         where = gateway.ready.removeprefix("gateway on ")
         assert where == f"{shown}:{gateway.port}"
         assert (await macs("headset", where, "online"))["ros"] == []
@@ -158,31 +156,27 @@ async def test_where_a_gateway_listens_can_be_pasted(
 @pytest.mark.parametrize(
     ("first", "then"), [([], ["--workers", "2"]), (["--workers", "2"], []), (["--workers", "2"], ["--workers", "3"])]
 )
-async def test_a_port_is_free_when_its_gateway_is_gone(endpoint: str, first: list[str], then: list[str]) -> None:
+async def test_a_port_is_free_when_its_gateway_is_gone(router: str, first: list[str], then: list[str]) -> None:
     """A gateway that closed its connections leaves no port that others cannot have for a minute."""
-    async with Program("router", "-l", endpoint):
-        async with Program("gateway", "--port", "0", "-e", endpoint, *first) as gateway:
-            port = gateway.port
-            headsets = [await Headset.connect("127.0.0.1", port) for _ in range(4)]
-            await gateway.stop()
-            for headset in headsets:
-                await headset.close()
-        async with (
-            Program("gateway", "--port", str(port), "-e", endpoint, *then),
-            await Headset.connect("127.0.0.1", port) as headset,
-        ):
-            assert (await headset.online()).unity_agent_ids == [headset.id]
+    async with Program("gateway", "--port", "0", "-e", router, *first) as gateway:
+        port = gateway.port
+        headsets = [await Headset.connect("127.0.0.1", port) for _ in range(4)]
+        await gateway.stop()
+        for headset in headsets:
+            await headset.close()
+    async with (
+        Program("gateway", "--port", str(port), "-e", router, *then),
+        await Headset.connect("127.0.0.1", port) as headset,
+    ):
+        assert (await headset.online()).unity_agent_ids == [headset.id]
 
 
 @pytest.mark.parametrize("first", [[], ["--workers", "2"]], ids=["alone", "workers"])
-async def test_workers_share_with_no_other_gateway(endpoint: str, first: list[str]) -> None:
+async def test_workers_share_with_no_other_gateway(router: str, first: list[str]) -> None:
     """A port of another gateway is taken, also of one that shares it among its own workers."""
-    async with (
-        Program("router", "-l", endpoint),
-        Program("gateway", "--port", "0", "-e", endpoint, *first) as gateway,
-    ):
+    async with Program("gateway", "--port", "0", "-e", router, *first) as gateway:
         for second in ([], ["--workers", "2"]):
-            code, out, errors = await ended("gateway", "--port", str(gateway.port), "-e", endpoint, *second)
+            code, out, errors = await ended("gateway", "--port", str(gateway.port), "-e", router, *second)
             assert (code, out) == (1, "")
             assert f"127.0.0.1:{gateway.port} cannot be reached: cannot listen there" in errors.splitlines()[-1]
 

@@ -59,6 +59,7 @@ from tests.support.gateways import way_in
 from tests.support.given import StartGateway
 from tests.support.local import patient
 from tests.support.programs import Program, ended, free_port, macs
+from tests.support.thorough import examples
 from tests.support.waiting import PATIENCE_S, until
 
 PORTS = ["plain", "tls", "web", "web_tls"]
@@ -159,9 +160,10 @@ async def test_each_port_leads_to_the_same_agents(start_door: StartDoor, port: s
             assert (await two.receive(PATIENCE_S)).data == data
             await two.send(data, to=UNITY, ids=[one.id])
             assert (await one.receive(PATIENCE_S)).data == data
-        for number in range(2000):
+        numbers = range(examples(2000))
+        for number in numbers:
             await one.send(b"%d" % number, to=UNITY, ids=[two.id])
-        assert [int((await two.receive(PATIENCE_S)).data) for _ in range(2000)] == list(range(2000))
+        assert [int((await two.receive(PATIENCE_S)).data) for _ in numbers] == list(numbers)
 
 
 @pytest.mark.parametrize("port", PORTS)
@@ -778,7 +780,7 @@ async def test_a_flood_leaves_others_their_turn(start_door: StartDoor, what: str
     flooding = asyncio.create_task(asyncio.to_thread(flood))
     turns_s = []
     memory.settle()  # as gateways do; the tests' own heap takes 50 ms to go through
-    deadline = time.monotonic() + 2
+    deadline = time.monotonic() + examples(200) / 100
     began = time.thread_time()
     while time.monotonic() < deadline:
         await asyncio.sleep(0)

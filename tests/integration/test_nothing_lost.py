@@ -180,7 +180,7 @@ async def test_a_receiver_that_is_slower_than_its_sender(port: int) -> None:
     assert [n for _, n in reading.numbers] == list(range(count))
 
 
-@pytest.mark.parametrize("size", [1 << 10, 64 << 10, 1 << 20])
+@pytest.mark.parametrize("size", [pytest.param(1 << 10, marks=pytest.mark.soak), 64 << 10, 1 << 20])
 async def test_a_slower_receiver_behind_another_gateway(two_ports: tuple[int, int], size: int) -> None:
     """The same between two gateways: the receiver's says that it is full, and the sender's reads less."""
     sender, receiver = Headset.join(two_ports[0], 0), Headset.join(two_ports[1], 0)

@@ -84,7 +84,7 @@ def test_commands_on_a_page_are_commands(path: Path) -> None:
         said, problem = io.StringIO(), None
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
             try:
-                build_parser().parse_args(words)
+                build_parser(words[0] if words else "").parse_args(words)
             except SystemExit as end:
                 problem = said.getvalue().splitlines()[-1] if end.code else None
         if problem is not None:
