@@ -77,19 +77,23 @@ def imported(path: Path) -> frozenset[tuple[str, bool]]:
 
 def _imported(path: Path) -> Iterator[tuple[str, bool]]:
     package = path.relative_to(ROOT).with_suffix("").parts[:-1]
-    tree = parsed(path)
-    later = {id(node) for scope in ast.walk(tree) if runs_later(scope) for node in ast.walk(scope)}
-    for node in ast.walk(tree):
+    waiting: list[tuple[ast.AST, bool]] = [(parsed(path), True)]
+    while waiting:
+        node, at_once = waiting.pop()
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
             module = ".".join([*base, *([node.module] if node.module else [])])
             names = [module, *(f"{module}.{alias.name}" for alias in node.names)]
+        elif isinstance(node, ast.expr):
+            continue  # there are no statements in it
         else:
+            inside = at_once and not runs_later(node)
+            waiting += [(child, inside) for child in ast.iter_child_nodes(node)]
             continue
         for name in names:
-            yield name, id(node) not in later
+            yield name, at_once
 
 
 def runs_later(scope: ast.AST) -> bool:

@@ -76,6 +76,14 @@ def test_a_record_is_one_line() -> None:
     assert all(line.startswith("  ") for line in traceback)
 
 
+LAST = {"print", "basicConfig", "Formatter", "write", "writelines"}
+
+
+def _last(called: ast.expr) -> str:
+    """The last name of what is called."""
+    return getattr(called, "attr", "") or getattr(called, "id", "")
+
+
 def test_there_is_no_other_way_out() -> None:
     """No module of ours prints, or writes to stdout or stderr, but the one that filters; nor sets up a log."""
     found = []
@@ -85,7 +93,7 @@ def test_there_is_no_other_way_out() -> None:
         if path == ROOT / "bridge" / "page" / "libraries.py":  # run while the package is built, without what it needs
             continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call):
+            if isinstance(node, ast.Call) and _last(node.func) in LAST:
                 called = ast.unparse(node.func)
                 if called in ("print", "logging.basicConfig", "logging.Formatter") or called.endswith(
                     ("stdout.write", "stderr.write", "stdout.writelines", "stderr.writelines")
