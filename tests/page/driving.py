@@ -100,5 +100,13 @@ async def within(limit_ms: float, measure: Callable[[], Awaitable[float]]) -> li
     return took
 
 
-GAMEPAD = "{connected: true, axes: [0, -1], buttons: [{}, {}, {}, {}, {}, {pressed: true}]}"
+GAMEPADS = """
+const gamepad = (pressed) => ({connected: true, index: 0, axes: [0, -1], buttons: [{}, {}, {}, {}, {}, {pressed}]});
+const have = (...pads) => { navigator.getGamepads = () => pads };
+const seen = () => new Promise((done) => setTimeout(() => requestAnimationFrame(done), 150));
+"""
+GAMEPAD_HELD = f"(() => {{ {GAMEPADS} have(gamepad(true)) }})()"
 """Its shoulder button held, its stick pushed forward."""
+GAMEPAD = f"(async () => {{ {GAMEPADS} have(gamepad(false)); await seen(); have(gamepad(true)); await seen() }})()"
+"""The same, after it was seen with its button released."""
+NO_GAMEPAD = f"(async () => {{ {GAMEPADS} have(); await seen() }})()"

@@ -17,7 +17,7 @@ from bridge.tokens import store
 from macs_zenoh.protocol.rights import Rights
 from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
 from tests.page.conftest import HELD, Site, StartSite, driven, released, says, still
-from tests.page.driving import GAMEPAD, heard_at, held, hold, key, pointer
+from tests.page.driving import GAMEPAD, NO_GAMEPAD, heard_at, held, hold, key, pointer
 from tests.support.browser import AXE, OFFLINE, SCREENSHOTS, Watched, needs_browser
 from tests.support.thorough import some
 from tests.support.waiting import until
@@ -86,9 +86,8 @@ async def test_it_drives_by_pointer_and_by_keys(site: Site) -> None:
         await page.page.keyboard.up("KeyS")
         await until(lambda: heard.last == 0.0)
         await still(page)
-        pad = partial(page.value, f"navigator.getGamepads = () => [{GAMEPAD}]")
-        away = partial(page.value, "navigator.getGamepads = () => []; new Promise(requestAnimationFrame)")
-        await driven(page, pad, away, metres=0.2)
+        away = partial(page.value, NO_GAMEPAD)
+        await driven(page, partial(page.value, GAMEPAD), away, metres=0.2)
         await away()
         await until(lambda: heard.last == 0.0)
 

@@ -323,7 +323,7 @@ const parts = {
     headset.come(1, 2);
     await until(() => zeros().includes(2));
     assert.equal(told.events.length, 0);
-    const { DEBT_MS, Debts } = await load("xr/owed.js");
+    const { DEBT_MS, Debts } = await load("shared/owed.js");
     const debts = new Debts([1, 2], 0);
     assert.deepEqual([debts.pay([2, 3]), debts.pay([2, 3]), debts.robots], [[2], null, [1]]);
     assert.ok(debts.isOpen(DEBT_MS - 1) && !debts.isOpen(DEBT_MS), "not for ever");

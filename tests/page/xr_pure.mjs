@@ -9,7 +9,8 @@ const half = Math.SQRT1_2;
 
 const parts = {
   async axes() {
-    const { heading, orientation, position, pose, stamp, toScene } = await load("xr/axes.js");
+    const { heading, orientation, position, pose, toScene } = await load("xr/axes.js");
+    const { stamp } = await load("shared/twist.js");
     assert.deepEqual(position({ x: 0, y: 0, z: -1 }), { x: 1, y: 0, z: 0 }); // ahead
     assert.deepEqual(position({ x: 1, y: 0, z: 0 }), { x: 0, y: -1, z: 0 }); // right
     assert.deepEqual(position({ x: 0, y: 1, z: 0 }), { x: 0, y: 0, z: 1 }); // up
@@ -27,7 +28,7 @@ const parts = {
   },
 
   async hold() {
-    const { Hold, STILL_MS } = await load("xr/hold.js");
+    const { Hold, STILL_MS } = await load("shared/hold.js");
     const sample = (source = "right", forward = 1) => ({ source, forward, turn: 0 });
     const free = () => {
       const hold = new Hold();
@@ -239,7 +240,8 @@ const parts = {
 
   async targets() {
     const { driveTopic, guardOf, targets, wishes } = await load("xr/targets.js");
-    const { SHOWN, TWIST } = await load("xr/wire-types.js");
+    const { SHOWN } = await load("xr/wire-types.js");
+    const { TWIST } = await load("shared/twist.js");
     const any = { robots: "any", groups: "any" };
     const ids = (me) => targets([1, 2, 3], { 1: 0, 2: 5, 3: 5 }, me).map(({ id }) => id);
     assert.deepEqual(ids(any), ["robot/1", "robot/2", "robot/3", "group/5"]);
@@ -273,7 +275,7 @@ const parts = {
   },
 
   async opened() {
-    const { Opened } = await load("xr/opened.js");
+    const { Opened } = await load("shared/opened.js");
     const drive = { forward: 1, turn: 0 };
     const opened = new Opened();
     const read = (held, source = "right", kind = "controller") => [{ source, kind, drive: held ? drive : null, open: !held }];
@@ -295,7 +297,7 @@ const parts = {
   },
 
   async halt() {
-    const { Halt } = await load("xr/halt.js");
+    const { Halt } = await load("shared/halt.js");
     const me = { may: ["stop"], robots: "any", groups: "any" };
     const started = (kept = null) => {
       const headset = new EventTarget();

@@ -3,6 +3,7 @@
 import { CommandClock } from "../macs-clock.js";
 import { Headset } from "../macs.js";
 import { Types } from "../ros.js";
+import { Driver } from "../shared/driver.js";
 import { digits, h, say, show } from "./dom.js";
 import { LatencyView } from "./latency-view.js";
 import { asked, login } from "./login.js";
@@ -25,6 +26,13 @@ class Page {
     const scheme = location.protocol === "https:" ? "wss:" : "ws:";
     this.headset = new Headset(`${scheme}//${location.host}/macs`, { silenceMs: SILENCE_MS, retryMs: RETRY_MS });
     this.clock = new CommandClock(this.headset);
+    this.driver = new Driver({
+      headset: this.headset,
+      bars: () => "no robot is chosen",
+      changed: () => {},
+      say: (text) => this.tell("drive", text),
+      still: "the page stood still",
+    });
     this.topics = new Topics(this.headset);
     this.types = new Types("", (url) => this.get(url).then((answer) => answer ?? { error: "the gateway does not answer" }));
     this.tell = (kind, text) => this.#tell(kind, text);

@@ -2,7 +2,8 @@
 
 import { Calls } from "./calls.js";
 import { Camera, PICTURES } from "./camera.js";
-import { COMMANDS, Drive } from "./drive.js";
+import { TWIST } from "../shared/twist.js";
+import { Drive } from "./drive.js";
 import { Keyed, digits, h, say, show } from "./dom.js";
 import { Plot } from "./plot.js";
 import { TopicTable } from "./topic-table.js";
@@ -131,8 +132,8 @@ class Shown {
     this.drive = null;
     this.online = false;
     this.status = null;
-    const { headset, clock, topics, types, may } = page;
-    this.parts = { headset, clock, topics, types, may, stop: page.stop, tell: page.tell };
+    const { headset, driver, topics, types, may } = page;
+    this.parts = { headset, driver, topics, types, may, stop: page.stop, tell: page.tell };
     this.areas = Object.fromEntries(["cameras", "control", "plots", "tables"].map((name) => [name, h("div", { class: `area ${name}` })]));
     place.append(...Object.values(this.areas));
     const plot = (topic, type, path) => this.#plot(topic, type, [path], `${topic} · ${path}`);
@@ -159,7 +160,6 @@ class Shown {
 
   draw() {
     this.trail?.draw();
-    this.drive?.draw();
     for (const plot of this.plots.values()) plot.draw();
   }
 
@@ -226,7 +226,7 @@ class Shown {
       area.append(this.cameras.get(topic).element);
     }
     if (!this.drive && this.page.may.has("command")) {
-      const found = Object.entries(offers.subscribers ?? {}).find(([, type]) => type in COMMANDS);
+      const found = Object.entries(offers.subscribers ?? {}).find(([, type]) => type in TWIST);
       if (found) {
         this.drive = new Drive(this.robot, ...found, this.parts);
         this.drive.setOnline(this.online);

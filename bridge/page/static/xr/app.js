@@ -4,6 +4,7 @@
 
 import { asked, login } from "../page/login.js";
 import { h } from "../page/dom.js";
+import { TWIST } from "../shared/twist.js";
 import { Hands } from "./hands.js";
 import { Immersion } from "./immersion.js";
 import { Input } from "./input.js";
@@ -17,7 +18,7 @@ import { Settings } from "./settings.js";
 import { Stage } from "./stage.js";
 import { Telling } from "./telling.js";
 import { driveTopic, firstOf, guardOf, namedBy, pictureKey, targets, wishes } from "./targets.js";
-import { POSE_TYPES, SHOWN, TWIST } from "./wire-types.js";
+import { POSE_TYPES, SHOWN } from "./wire-types.js";
 
 const OFFERS_MS = 2000;
 const IDLE_MS = 100;

@@ -29,9 +29,3 @@ export function toScene({ x, y, z }) {
 export function heading({ x, y, z, w }) {
   return Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z));
 }
-
-/** Seconds and nanoseconds of a time in ms since 1970. */
-export function stamp(ms) {
-  const sec = Math.floor(ms / 1000);
-  return { sec, nanosec: Math.min(999999999, Math.floor((ms - sec * 1000) * 1e6)) };
-}

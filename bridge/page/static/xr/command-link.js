@@ -9,45 +9,28 @@
 import { CommandClock, ROBOTS } from "../macs-clock.js";
 import { Headset } from "../macs.js";
 import { Types } from "../ros.js";
-import { refused } from "../shared/words.js";
+import { Driver } from "../shared/driver.js";
+import { Halt } from "../shared/halt.js";
+import { stamp } from "../shared/twist.js";
 import { get, persisted, soon } from "./asking.js";
-import { stamp } from "./axes.js";
 import { lockout } from "./freshness.js";
-import { Halt } from "./halt.js";
-import { Hold, STILL_MS } from "./hold.js";
-import { Debts } from "./owed.js";
 import { Poke } from "./poke.js";
 import { Standing } from "./standing.js";
-import { POSE_TYPES, TWIST } from "./wire-types.js";
+import { POSE_TYPES } from "./wire-types.js";
 
 const FOLLOW_MS = 1000;
 const SILENCE_MS = 3000;
 const RETRY_MS = [20, 50, 100, 200, 300, 500];
 const STATUS_MS = 500;
-/** Nothing goes to a gateway that has not answered for so long. */
-const FRESH_MS = 200;
-const ZEROS_MS = [40, 80];
-const AGAIN_MS = 500;
-const LEAST_TICK_MS = 5;
 /** Of a picture of which nothing was heard. */
 const NEVER = { at: null, late: 0 };
 
 export class CommandLink {
-  #hold = new Hold();
   #target = null;
-  #drive = null;
   #poses = new Map();
   #seen = new Map();
   #settings = {};
   #away = "";
-  #madeAt = 0;
-  /** When a zero was said last: what hands did before it counts no more. */
-  #endedAt = -Infinity;
-  #sentAt = -Infinity;
-  /** When nothing waited here last. */
-  #clearAt = 0;
-  #askedAt = -Infinity;
-  #timer = null;
   #refusal = "";
 
   /**
@@ -63,9 +46,16 @@ export class CommandLink {
     this.standing = new Standing({
       ask,
       told: (robot, { stopped }) => this.halt.note(robot, stopped === true),
-      done: () => this.#judge(),
+      done: () => this.driver.judge(),
     });
     this.clock = new CommandClock(this.headset);
+    this.driver = new Driver({
+      headset: this.headset,
+      bars: (now) => this.#bars(now),
+      barsIn: (now) => this.#oldIn(now),
+      changed: () => this.#report(),
+      say: (text) => this.#say("drive", text),
+    });
     this.halt = new Halt(this.headset, me, kept, async (robot) => (await ask(`/view/robots/${robot}/status`))?.stopped);
     this.online = [];
     this.#listen();
@@ -85,10 +75,7 @@ export class CommandLink {
    * also where only groups may be named.
    */
   aim(target) {
-    this.#letGo("another robot was chosen");
-    const before = this.#drive;
-    this.#drive = null;
-    if (before && !before.debts) this.#leave(before);
+    this.driver.release("another robot was chosen");
     this.#closePoses();
     this.#refusal = "";
     this.#target = target && { members: target.robots, ...target, groups: target.groups ?? [] };
@@ -97,8 +84,7 @@ export class CommandLink {
     if (this.#commands) this.clock.mean(robots, groups, members);
     else this.clock.mean([]);
     this.#askStatus();
-    this.#judge();
-    if (topic && this.#commands) this.#aimDrive();
+    this.driver.aim(topic && this.#commands ? this.#target : null, (wanted) => this.#typed(this.#target.type, "drive", wanted));
     this.#openPoses();
   }
 
@@ -117,48 +103,39 @@ export class CommandLink {
   set(settings) {
     const before = this.#settings;
     this.#settings = settings;
+    this.driver.limits = { forward: settings.forward, turn: settings.turn, hz: settings.hz ?? 30 };
     if (Object.keys(POSE_TYPES).some((kind) => before[kind] !== settings[kind])) {
       this.#closePoses();
       this.#openPoses();
     }
-    this.#judge();
+    this.driver.judge();
   }
 
   /** The pictures that driving depends on. The scene says which, and not who receives them: that one may not run. */
   guard(keys) {
     this.#seen = new Map(keys.map((key) => [key, this.#seen.get(key) ?? NEVER]));
-    this.#judge();
+    this.driver.judge();
   }
 
   /** A picture came: how old it is is judged here; null: it is not received now. */
   see(key, seen) {
     if (!this.#seen.has(key)) return;
     this.#seen.set(key, seen ?? NEVER);
-    this.#judge();
+    this.driver.judge();
   }
 
   /** What hands do: {at, sample, poses}; `at` by this worker's clock. */
   input({ at, sample, poses }) {
     if (this.#away) return; // what is held meanwhile has to be let go of before it counts
-    const now = performance.now();
-    const made = Math.min(at, now);
-    if (now - made > STILL_MS || made < this.#endedAt) return this.#letGo("what hands do was told too late");
-    this.#madeAt = made;
-    this.#judge();
-    const was = this.#hold.held;
-    const began = this.#hold.input(sample, made);
-    if (was && !this.#hold.held) this.#ended();
-    const due = this.#hold.held && performance.now() - this.#sentAt >= 1000 / this.#settings.hz - 2;
-    if (began) this.#report();
-    if (began || due) this.#tick();
-    if (poses) this.#sendPoses(poses, made);
+    if (!this.driver.input(sample, at)) return;
+    if (poses) this.#sendPoses(poses, Math.min(at, performance.now()));
   }
 
   /** Nobody looks or holds any more, and why; empty: somebody does again. */
   setAway(why) {
     this.#away = why;
-    this.#letGo(why || "somebody is there again"); // what was taken hold of meanwhile does not count either
-    this.#judge();
+    this.driver.release(why || "somebody is there again"); // what was taken hold of meanwhile does not count either
+    this.driver.judge();
   }
 
   /** Ask for control, or give it: {action: "take" | "release" | "give", to}. */
@@ -177,7 +154,7 @@ export class CommandLink {
   }
 
   stop() {
-    this.#letGo("a stop is pressed");
+    this.driver.release("a stop is pressed");
     if (!this.halt.press()) this.#say("stop", "this token may not stop");
   }
 
@@ -186,21 +163,12 @@ export class CommandLink {
   }
 
   close() {
-    this.#letGo("the page was closed");
+    this.driver.release("the page was closed");
     this.clock.close();
     this.headset.close();
   }
 
   // -- driving -------------------------------------------------------------------------------------------------------
-
-  async #aimDrive() {
-    const { topic, type, robots, groups, members } = this.#target;
-    const node = this.headset.advertise(topic, type, { robots, groups });
-    const drive = { topic, robots, groups, members, node, shape: TWIST[type], type: null, debts: null };
-    this.#drive = drive;
-    drive.type = await this.#typed(type, "drive", () => this.#drive === drive);
-    this.#judge();
-  }
 
   /** A type, asked for as long as it is wanted: a robot that comes later knows it then. */
   #typed(type, kind, wanted) {
@@ -210,23 +178,12 @@ export class CommandLink {
   }
 
   /** Why nobody may drive now, in words; empty when he may. */
-  #judge() {
-    const now = performance.now();
-    const was = this.#hold.held;
-    const quiet = this.#quiet(now);
+  #bars(now) {
+    const why = this.#quiet(now) || this.#tooMany;
+    if (why) return why;
+    if (!this.me.may.includes("command")) return "this token may not drive";
     const holder = this.#status.map((each) => each.holder).find((each) => each && each !== this.#own);
-    let why = quiet || this.#tooMany;
-    if (!why && !this.me.may.includes("command")) why = "this token may not drive";
-    else if (!why && !this.#drive) why = "the robot takes no velocities";
-    else if (!why && !this.#drive.type) why = "the type of its commands is asked for";
-    else if (!why && holder) why = `${named(holder)} has control`;
-    else if (!why) why = this.#uncompared();
-    this.#hold.bar(why);
-    if (was && !this.#hold.held) this.#ended();
-    clearTimeout(this.#timer);
-    if (this.#hold.held) this.#timer = setTimeout(() => this.#tick(), this.#untilNext(now));
-    if (why !== this.told) this.#report();
-    this.told = why;
+    return this.driver.lacks || (holder ? `${named(holder)} has control` : this.#uncompared());
   }
 
   /** What those that are meant said of themselves. */
@@ -261,106 +218,10 @@ export class CommandLink {
     return [...this.#seen.values()].map(({ at, late }) => (at === null ? null : now - at + late));
   }
 
-  /** When there is something to do next: a command, or the picture gets too old. */
-  #untilNext(now) {
-    const next = 1000 / (this.#settings.hz ?? 30) - (now - this.#sentAt);
+  /** In how many ms the picture gets too old. */
+  #oldIn(now) {
     const ages = this.#ages(now).filter((age) => age !== null);
-    const old = ages.length && this.#settings.lockoutS > 0 ? this.#settings.lockoutS * 1000 - Math.max(...ages) + 1 : Infinity;
-    return Math.max(LEAST_TICK_MS, Math.min(next, old));
-  }
-
-  #tick() {
-    const now = performance.now();
-    const was = this.#hold.held;
-    const due = this.#hold.due(now);
-    if (was && due === null) this.#ended();
-    if (due === null || this.#blind(now)) return this.#judge();
-    if (now - this.#sentAt >= 1000 / this.#settings.hz - 2) this.#send(due, now);
-    this.#judge();
-  }
-
-  #send({ forward, turn }, now) {
-    const { type, shape, node } = this.#drive;
-    const linear = { x: forward * this.#settings.forward };
-    const angular = { z: turn * this.#settings.turn };
-    this.#sentAt = now;
-    const message = type.write(shape(linear, angular, performance.timeOrigin + this.#madeAt));
-    const { robots, groups } = this.#target;
-    if (this.#fresh(now) && node.publish(message, { robots, groups, madeAt: this.#madeAt })) {
-      this.speed = { linear: linear.x, angular: angular.z };
-    } else {
-      this.#letGo("the connection is not fresh");
-    }
-  }
-
-  /** Whether the gateway answers, and what was sent went. Poses and commands of one frame wait for each other a moment. */
-  #fresh(now) {
-    const asked = now - this.#askedAt <= FRESH_MS;
-    if (this.headset.waitingBytes === 0 || !asked) this.#clearAt = now; // what is said once may wait at that moment
-    this.#askedAt = now;
-    return this.headset.isFresh(FRESH_MS) && now - this.#clearAt <= FRESH_MS;
-  }
-
-  #letGo(why) {
-    const was = this.#hold.held;
-    this.#hold.release(why);
-    if (was) this.#ended();
-  }
-
-  /** A zero at once and twice more, and once again when the gateway is known to have taken it and the robot is there. */
-  #ended() {
-    const drive = this.#drive;
-    this.#endedAt = performance.now();
-    this.speed = { linear: 0, angular: 0 };
-    const zero = (members = drive.members) => {
-      const message = drive.type.write(drive.shape({}, {}, performance.timeOrigin + performance.now()));
-      const { robots, groups } = this.#others(drive, members);
-      if (robots.length || groups.length) drive.node.publish(message, { robots, groups });
-    };
-    zero();
-    for (const ms of ZEROS_MS) setTimeout(zero, ms);
-    this.#owe(drive, zero);
-    this.#report();
-  }
-
-  /** Who takes hold of the same robots anew says himself what is to be. */
-  #drives(drive) {
-    return this.#hold.held && this.#drive === drive;
-  }
-
-  /** Of these robots of a drive those that nobody drives now. */
-  #others(drive, members) {
-    const driven = this.#hold.held && this.#drive.node === drive.node ? this.#drive.members : [];
-    const robots = drive.robots.filter((robot) => members.includes(robot) && !driven.includes(robot));
-    return { robots, groups: drive.members.some((robot) => driven.includes(robot)) || this.#drives(drive) ? [] : drive.groups };
-  }
-
-  /** What is owed is owed also when another robot is chosen meanwhile, and by each robot on its own. */
-  async #owe(drive, zero) {
-    const debts = (drive.debts = new Debts(drive.members, performance.now()));
-    const owing = () => drive.debts === debts && !this.#drives(drive);
-    while (owing() && debts.isOpen(performance.now())) {
-      const there = await this.headset.online().catch(() => null);
-      const paid = there && owing() ? debts.pay(there.robots) : null;
-      if (paid) zero(paid);
-      if (debts.isOpen(performance.now())) await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
-    }
-    if (drive.debts !== debts) return;
-    drive.debts = null;
-    if (!this.#drives(drive) && debts.robots.length) {
-      this.#say("drive", `robot ${debts.robots.join(", ")} did not come back to be told to stand`);
-    }
-    if (this.#drive !== drive) this.#leave(drive);
-  }
-
-  /** A topic has one node for all robots: those that are driven now keep it. */
-  #leave({ node, robots, groups }) {
-    const now = this.#drive?.node === node ? this.#drive : { robots: [], groups: [] };
-    node.deregister({
-      robots: robots.filter((robot) => !now.robots.includes(robot)),
-      groups: groups.filter((group) => !now.groups.includes(group)),
-    });
-    if (!node.robots.size && !node.groups.size) node.close();
+    return ages.length && this.#settings.lockoutS > 0 ? this.#settings.lockoutS * 1000 - Math.max(...ages) + 1 : Infinity;
   }
 
   // -- poses ---------------------------------------------------------------------------------------------------------
@@ -384,7 +245,7 @@ export class CommandLink {
 
   #sendPoses(poses, at) {
     const now = performance.now();
-    if (!this.#poses.size || this.#quiet(now) || !this.#fresh(now)) return;
+    if (!this.#poses.size || this.#quiet(now) || !this.driver.isFresh(now)) return;
     const header = { stamp: stamp(performance.timeOrigin + at), frame_id: this.#settings.frame };
     for (const [kind, one] of this.#poses) {
       const value = poses[kind];
@@ -404,34 +265,28 @@ export class CommandLink {
   #listen() {
     const { headset } = this;
     headset.addEventListener("link", ({ detail: { up, id, why, resumed } }) => {
-      if (!up) this.#letGo("the connection is lost");
       if (!up) this.standing.forget();
       else if (this.#target) this.#askStatus();
       this.tell({ op: "link", which: "commands", up, id, why, resumed });
-      this.#judge();
+      this.driver.judge();
     });
     headset.addEventListener("presence", ({ detail: { robots } }) => this.#setOnline(robots));
     headset.addEventListener("gone", ({ detail }) => {
       const gone = detail.filter(({ type }) => type === 1).map(({ id }) => id);
       this.#setOnline(this.online.filter((robot) => !gone.includes(robot)));
     });
-    headset.addEventListener("refused", ({ detail: { robot, name, kind, reason } }) => {
-      const ours = name === this.#drive?.topic;
-      if (ours) {
+    headset.addEventListener("refused", ({ detail: { robot, name, reason } }) => {
+      if (name === this.driver.aimed?.topic) {
         this.#refusal = reason;
-        this.#letGo(refused(kind, reason));
         this.#askStatus();
       }
       this.#say("refused", `${robot ? `robot ${robot}` : "the gateway"} refused ${name}: ${reason}`);
     });
     headset.addEventListener("access", ({ detail: { kind, reason } }) => this.tell({ op: "access", kind, reason }));
-    this.clock.addEventListener("known", () => this.#judge());
-    this.clock.addEventListener("anew", () => {
-      this.#letGo("another clock begins");
-      this.#say("clock", "another clock begins: take hold anew");
-    });
+    this.clock.addEventListener("known", () => this.driver.judge());
+    this.clock.addEventListener("anew", () => this.#say("clock", "another clock begins: take hold anew"));
     this.halt.addEventListener("change", () => {
-      this.#judge();
+      this.driver.judge();
       this.tell({ op: "stop", ...this.halt.words(headset.connected), kept: this.halt.kept, stopped: this.halt.stopped() });
     });
   }
@@ -442,7 +297,7 @@ export class CommandLink {
     for (const robot of came) this.types.forget(robot);
     this.halt.setOnline(robots);
     this.tell({ op: "presence", robots });
-    this.#judge();
+    this.driver.judge();
   }
 
   /** Who has control, and whether it is stopped, as each robot says it itself. */
@@ -472,12 +327,12 @@ export class CommandLink {
       id: this.headset.id,
       connected: this.headset.connected,
       roundTripMs: this.headset.roundTripMs,
-      held: this.#hold.held,
-      source: this.#hold.source,
-      barred: this.#hold.barred,
-      why: this.#hold.why,
+      held: this.driver.held,
+      source: this.driver.source,
+      barred: this.driver.barred,
+      why: this.driver.why,
       blind: this.#blind(performance.now()),
-      speed: this.speed ?? { linear: 0, angular: 0 },
+      speed: this.driver.speed,
       exclusive: status.some((each) => each.exclusive),
       holder: holder && (holder === this.#own ? "you" : named(holder)),
       candidates: this.#candidates(status),
@@ -489,7 +344,7 @@ export class CommandLink {
       maxAgeS: clock?.maxAgeS ?? null,
       clockless,
       refusal: this.#refusal,
-      unsent: this.#drive?.node.unsent ?? 0,
+      unsent: this.driver.aimed?.node.unsent ?? 0,
     });
   }
 }

@@ -5,7 +5,8 @@
  * the stick's. Joints are positions in metres.
  */
 
-export const DEAD_ZONE = 0.1;
+import { deflection } from "../shared/gamepads.js";
+
 const PINCH_M = 0.02;
 /** Wider than it began with: a pinch at the edge does not flutter. */
 const UNPINCH_M = 0.035;
@@ -14,12 +15,6 @@ export const REACH_M = 0.15;
 const REST_M = 0.02;
 
 const apart = (one, other) => Math.hypot(one.x - other.x, one.y - other.y, one.z - other.z);
-
-/** A stick's deflection without what it has at rest, from -1 to 1. */
-export function deflection(value, dead = DEAD_ZONE) {
-  const size = Math.abs(value);
-  return size <= dead || !Number.isFinite(value) ? 0 : (Math.sign(value) * Math.min(1, size - dead)) / (1 - dead);
-}
 
 /** {forward, turn} of a controller's stick while its grip is held, else null. */
 export function stickDrive(gamepad) {
@@ -31,17 +26,6 @@ export function stickDrive(gamepad) {
 /** Both face buttons of one controller: the stop, by one thumb. */
 export function stopButtons(gamepad) {
   return Boolean(gamepad?.buttons[4]?.pressed && gamepad.buttons[5]?.pressed);
-}
-
-/** The stop of a gamepad: its two lower face buttons, A and B, by one thumb as well. */
-export function stopGamepad(gamepad) {
-  return Boolean(gamepad?.buttons[0]?.pressed && gamepad.buttons[1]?.pressed);
-}
-
-/** {forward, turn} of a gamepad's left stick while a shoulder button is held, else null. */
-export function gamepadDrive(gamepad) {
-  if (!gamepad || ![4, 5, 6, 7].some((button) => gamepad.buttons[button]?.pressed)) return null;
-  return { forward: deflection(-gamepad.axes[1]), turn: deflection(-gamepad.axes[0]) };
 }
 
 /** Whether thumb and index finger are together, where they were before. */

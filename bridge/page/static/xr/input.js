@@ -7,8 +7,9 @@
 
 import { Vector3 } from "../vendor/three.js";
 import { pose } from "./axes.js";
-import { Opened } from "./opened.js";
-import { gamepadDrive, handDrive, joy, pinchPoint, pinched, stickDrive, stopButtons, stopGamepad, stopHand } from "./gestures.js";
+import { gamepads, readGamepads, stopGamepad } from "../shared/gamepads.js";
+import { Opened } from "../shared/opened.js";
+import { handDrive, joy, pinchPoint, pinched, stickDrive, stopButtons, stopHand } from "./gestures.js";
 
 const WRIST = "wrist";
 
@@ -54,11 +55,7 @@ export class Input {
       const drive = hand ? this.#byHand(source, facing) : stickDrive(source.gamepad);
       read.push({ source: source.name, kind: source.kind, drive, open: !drive && !(hand && source.pressed) });
     }
-    for (const each of gamepads()) {
-      const drive = gamepadDrive(each);
-      read.push({ source: `gamepad ${each.index}`, kind: "gamepad", drive, open: !drive });
-    }
-    const held = this.#opened.held(read);
+    const held = this.#opened.held([...read, ...readGamepads()]);
     if (this.pad.sample) held.push(this.pad.sample);
     const chosen = held.find(({ source }) => source === this.#source) ?? held[0] ?? null;
     this.#source = chosen?.source ?? null;
@@ -130,8 +127,4 @@ function rayOf({ position, orientation: q }) {
   const origin = new Vector3(position.x, position.y, position.z);
   const direction = new Vector3(0, 0, -1).applyQuaternion({ x: q.x, y: q.y, z: q.z, w: q.w });
   return { origin, direction };
-}
-
-function gamepads() {
-  return [...(navigator.getGamepads?.() ?? [])].filter((each) => each?.connected && each.mapping !== "xr-standard");
 }

@@ -1,7 +1,7 @@
 /** What is on the screen about the scene: the robots, the way into XR, the stop, the pad, the settings. */
 
 import { digits, h, say, show } from "../page/dom.js";
-import { Pad } from "./pad.js";
+import { Pad } from "../shared/pad.js";
 
 const FIELDS = [
   ["Driving", [
@@ -45,7 +45,9 @@ export class Overlay {
   constructor({ canvas, settings, me, on }) {
     this.settings = settings;
     this.on = on;
-    this.pad = new Pad([canvas]);
+    this.pad = new Pad({ focusable: [canvas] });
+    const { pad, hint, speed } = this.pad;
+    const drive = h("section", { class: "xr-drive", "aria-label": "Drive" }, pad, h("div", {}, hint, h("p", {}, speed)));
     this.link = h("span", { class: "link-state", id: "link", role: "status" }, "connecting …");
     this.targets = h("select", { id: "target", "aria-label": "Robot or group", onchange: () => on.choose(this.targets.value) });
     this.enter = Object.fromEntries(MODES.map(([mode, label]) => [mode, button(mode, "enter", label, () => on.enter(mode))]));
@@ -68,7 +70,7 @@ export class Overlay {
     const head = h("header", { class: "xr-top" },
       h("a", { class: "brand", href: "/" }, "macs"), this.targets, this.link, this.control, this.take, this.give, this.back,
       h("span", { class: "xr-space" }), ...Object.values(this.enter), this.none, open, this.stopBar);
-    this.root = h("div", { class: "xr-overlay" }, head, this.dialog, this.pad.element, this.event);
+    this.root = h("div", { class: "xr-overlay" }, head, this.dialog, drive, this.event);
   }
 
   /** Which ways into XR there are: names of modes. */

@@ -4,7 +4,7 @@
  */
 
 import { Raycaster, Vector3 } from "../vendor/three.js";
-import { deflection } from "./gestures.js";
+import { deflection } from "../shared/gamepads.js";
 
 const PUSH_M_S = 1.2;
 const SCALE_S = 0.9;

@@ -1,16 +1,5 @@
 /** Types of topics that a headset sends and shows. */
 
-import { stamp } from "./axes.js";
-
-/** Types of velocities → a message of it; `ms` is its time since 1970. */
-export const TWIST = {
-  "geometry_msgs/msg/Twist": (linear, angular) => ({ linear, angular }),
-  "geometry_msgs/msg/TwistStamped": (linear, angular, ms) => ({
-    header: { stamp: stamp(ms), frame_id: "base_link" },
-    twist: { linear, angular },
-  }),
-};
-
 /** Kinds of what hands and head do → the type of their topic. */
 export const POSE_TYPES = {
   head: "geometry_msgs/msg/PoseStamped",

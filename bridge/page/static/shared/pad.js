@@ -1,6 +1,7 @@
-/** Driving at a screen: a pad for pointer and fingers, and keys while it or the scene has the focus. */
+/** Driving at a screen: a pad for pointer and fingers, and keys while it or what belongs to it has the focus. */
 
 import { h, say } from "../page/dom.js";
+import { STILL_MS } from "./hold.js";
 
 const KEYS = {
   ArrowUp: [1, 0],
@@ -18,15 +19,19 @@ export class Pad {
   #keys = new Set();
   #pointer = null;
   #at = { forward: 0, turn: 0 };
+  #unlisten = [];
 
-  /** `focusable` are elements that keys count in, besides the pad. */
-  constructor(focusable) {
+  /**
+   * `label` is what it is called; `focusable` are elements that keys count in, besides the pad; `changed(at)` is called when what
+   * is held is another one, as it was at `at`.
+   */
+  constructor({ label = "Drive pad", focusable = [], changed = () => {} } = {}) {
+    this.changed = changed;
     this.knob = h("span", { class: "knob" });
-    const label = "Drive pad: arrow keys or W, A, S, D while it has the focus";
-    this.pad = h("div", { class: "pad", id: "pad", tabindex: "0", role: "group", "aria-label": label }, this.knob);
+    const name = `${label}: arrow keys or W, A, S, D while it has the focus`;
+    this.pad = h("div", { class: "pad", id: "pad", tabindex: "0", role: "group", "aria-label": name }, this.knob);
     this.hint = h("p", { class: "hint", id: "drive-hint", role: "status" });
-    this.speed = h("p", { class: "figures", id: "drive-speed" });
-    this.element = h("section", { class: "xr-drive", "aria-label": "Drive" }, this.pad, h("div", {}, this.hint, this.speed));
+    this.speed = h("span", { class: "figures", id: "drive-speed" });
     this.focusable = [this.pad, ...focusable];
     this.#listen();
   }
@@ -46,7 +51,7 @@ export class Pad {
     this.#at = { forward: 0, turn: 0 };
   }
 
-  /** What the worker says of it. */
+  /** What is said of it: whether it drives, why it may not, why it was let go of last, and what was sent. */
   show({ held, barred, why, speed, forward = 0, turn = 0 }) {
     this.pad.classList.toggle("held", held);
     this.pad.classList.toggle("barred", Boolean(barred));
@@ -57,29 +62,47 @@ export class Pad {
     this.knob.style.transform = `translate(${-50 - 76 * turn}%, ${-50 - 76 * forward}%)`;
   }
 
+  close() {
+    this.release();
+    this.#unlisten.forEach((end) => end());
+  }
+
   #listen() {
     const { pad } = this;
-    pad.addEventListener("pointerdown", (event) => {
-      if (event.button !== 0) return;
+    const on = (target, type, callback) => {
+      target.addEventListener(type, callback);
+      this.#unlisten.push(() => target.removeEventListener(type, callback));
+    };
+    on(pad, "pointerdown", (event) => {
+      if (event.button !== 0 || isLate(event)) return;
       this.#pointer = event.pointerId;
       pad.setPointerCapture(event.pointerId);
       pad.focus({ preventScroll: true });
       this.#follow(event);
     });
-    pad.addEventListener("pointermove", (event) => {
+    on(pad, "pointermove", (event) => {
       if (event.pointerId !== this.#pointer) return;
+      // while another button is down, the end of the first is told as a move
       if (event.buttons & 1) this.#follow(event);
-      else this.release();
+      else this.#letGo(event);
     });
     for (const type of ["pointerup", "pointercancel", "lostpointercapture"]) {
-      pad.addEventListener(type, (event) => event.pointerId === this.#pointer && this.release());
+      on(pad, type, (event) => event.pointerId === this.#pointer && this.#letGo(event));
     }
-    pad.addEventListener("contextmenu", (event) => event.preventDefault());
+    on(pad, "contextmenu", (event) => event.preventDefault());
     for (const element of this.focusable) {
-      element.addEventListener("keydown", (event) => this.#key(event, true));
-      element.addEventListener("keyup", (event) => this.#key(event, false));
-      element.addEventListener("blur", () => this.#keys.clear());
+      on(element, "keydown", (event) => this.#key(event, true));
+      on(element, "keyup", (event) => this.#key(event, false));
+      on(element, "blur", (event) => {
+        this.#keys.clear();
+        this.changed(event.timeStamp);
+      });
     }
+  }
+
+  #letGo(event) {
+    this.release();
+    this.changed(event.timeStamp);
   }
 
   #follow(event) {
@@ -87,14 +110,21 @@ export class Pad {
     const turn = -((2 * (event.clientX - left)) / width - 1) / TRAVEL;
     const forward = -((2 * (event.clientY - top)) / height - 1) / TRAVEL;
     this.#at = { forward: Math.max(-1, Math.min(1, forward)), turn: Math.max(-1, Math.min(1, turn)) };
+    this.changed(event.timeStamp);
   }
 
   #key(event, down) {
     // with a modifier a key is another one, and its end may never be told
-    if (event.ctrlKey || event.metaKey || event.altKey) return this.#keys.clear();
-    if (!(event.code in KEYS)) return;
-    event.preventDefault();
-    if (down && !event.repeat) this.#keys.add(event.code);
-    if (!down) this.#keys.delete(event.code);
+    if (event.ctrlKey || event.metaKey || event.altKey) this.#keys.clear();
+    else if (!(event.code in KEYS)) return;
+    else {
+      event.preventDefault();
+      if (down && !event.repeat && !isLate(event)) this.#keys.add(event.code);
+      if (!down) this.#keys.delete(event.code);
+    }
+    this.changed(event.timeStamp);
   }
 }
+
+/** What was done so long ago, while the page stood still, takes hold of nothing. */
+const isLate = (event) => performance.now() - event.timeStamp > STILL_MS;

@@ -16,8 +16,10 @@ export class Hold {
   /** Whether something is held that does not count before it was let go of. */
   #stale = true;
 
-  constructor({ stillMs = STILL_MS } = {}) {
+  /** `still` is why it ends when who reads the controllers says nothing more. */
+  constructor({ stillMs = STILL_MS, still = "the headset stood still" } = {}) {
     this.stillMs = stillMs;
+    this.still = still;
     /** What holds on now: "left", "right", "keys" …; null: nobody. */
     this.source = null;
     /** Forward and to the left, each from -1 to 1. */
@@ -36,7 +38,7 @@ export class Hold {
 
   /** What hands do now: {source, forward, turn} while one holds on, else null. Whether it has just begun to drive. */
   input(sample, now) {
-    if (this.held && now - this.#heldAt > this.stillMs) this.release("the headset stood still");
+    if (this.held && now - this.#heldAt > this.stillMs) this.release(this.still);
     this.#heldAt = now;
     if (sample === null) {
       if (this.held) this.release("let go");
@@ -73,7 +75,7 @@ export class Hold {
 
   /** What is due now: {forward, turn} to send, or null. Ends a hold that nobody confirms. */
   due(now) {
-    if (this.held && now - this.#heldAt > this.stillMs) this.release("the headset stood still");
+    if (this.held && now - this.#heldAt > this.stillMs) this.release(this.still);
     return this.held ? { forward: this.forward, turn: this.turn } : null;
   }
 }

@@ -1,0 +1,16 @@
+/** Types of velocities, and the time in their headers. Pure. */
+
+/** Seconds and nanoseconds of a time in ms since 1970. */
+export function stamp(ms) {
+  const sec = Math.floor(ms / 1000);
+  return { sec, nanosec: Math.min(999999999, Math.floor((ms - sec * 1000) * 1e6)) };
+}
+
+/** Type → a message of it; `ms` is its time since 1970. */
+export const TWIST = {
+  "geometry_msgs/msg/Twist": (linear, angular) => ({ linear, angular }),
+  "geometry_msgs/msg/TwistStamped": (linear, angular, ms) => ({
+    header: { stamp: stamp(ms), frame_id: "base_link" },
+    twist: { linear, angular },
+  }),
+};
