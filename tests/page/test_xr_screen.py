@@ -85,6 +85,6 @@ async def test_a_press_that_nobody_hears_of_is_kept_and_said(gate: Gate) -> None
     await until(lambda: headset.value("Boolean(window.macsXr)"))
     await until(lambda: headset.state("connected"))
     await until(lambda: headset.state("barred !== 'nothing is known yet'"))
-    await until(lambda: headset.value("macsXr.telling.stop.text === 'each robot that comes is stopped'"))
+    await until(lambda: headset.value("macsXr.telling.stop.text === 'no robot is online: each that comes is stopped'"))
     await headset.value("(macsXr.release(), macsXr.release())")
     await until(lambda: headset.value("sessionStorage.getItem('macs.stop') === null"))

@@ -318,13 +318,17 @@ const parts = {
       const check = () => halt.check(performance.now() + 2000);
       return { halt, says, link, words, sent, status, check };
     };
+    const stopped = (one) => {
+      assert.equal(one.words().state, "stopped");
+      assert.match(one.words().text, /^robot 1, 2 stopped after \d+ ms$/);
+    };
     const confirmed = () => {
       const one = started();
       one.halt.setOnline([1, 2]);
       one.halt.press();
       one.says(1, true);
       one.says(2, true);
-      assert.deepEqual(one.words(), { state: "stopped", text: "robot 1, 2 stopped" });
+      stopped(one);
       one.sent.length = 0;
       return one;
     };
@@ -333,7 +337,7 @@ const parts = {
       one.halt.setOnline([2]);
       one.halt.setOnline([1, 2]); // its program has started anew, which ends its stop
       if (latched) one.says(1, false);
-      assert.deepEqual(one.words(), { state: "waiting", text: "not confirmed yet by robot 1" });
+      assert.deepEqual(one.words(), { state: "waiting", text: "no confirmation yet of robot 1" });
       assert.match(one.halt.bars([1]), /stop/);
       if (!latched) assert.deepEqual(one.sent, [[1, 1]]);
       one.says(1, true);
@@ -355,7 +359,7 @@ const parts = {
     assert.equal(away.words().state, "waiting");
     away.status.set(1, true).set(2, true);
     await away.check(); // what they said on the topic was lost
-    assert.deepEqual(away.words(), { state: "stopped", text: "robot 1, 2 stopped" });
+    stopped(away);
     away.halt.release();
 
     const lost = started();
@@ -366,7 +370,7 @@ const parts = {
     await lost.halt.check();
     assert.equal(lost.words().state, "waiting", "just pressed: nobody is asked yet");
     await lost.check();
-    assert.deepEqual(lost.words(), { state: "stopped", text: "robot 1, 2 stopped" });
+    stopped(lost);
     lost.halt.release();
     lost.status.set(1, false).set(2, false);
     await lost.check();

@@ -107,8 +107,8 @@ export class Drive {
     if (!this.headset.connected) return "no connection";
     if (!this.#online) return "the robot is not online";
     if (this.driver.lacks) return this.problem ?? this.driver.lacks;
-    if (this.stop.isStopped(this.robot) || this.status?.stopped) return "the robot is stopped";
-    if (this.stop.isWanted(this.robot)) return "a stop is pressed";
+    if (this.status?.stopped) return "the robot is stopped";
+    if (this.stop.bars(this.robot)) return this.stop.bars(this.robot);
     if (this.holder && this.holder !== this.#own) return `${this.holder} has control`;
     return this.#uncompared();
   }

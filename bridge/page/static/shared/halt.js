@@ -1,8 +1,11 @@
 /**
- * The emergency stop of who wears a headset: in the worker, so that it goes out whatever the scene does.
+ * The emergency stop, of a page or of the worker of a headset, so that it goes out whatever the scene does.
  *
  * A press is for all robots that the token may stop, is sent again until each says that it holds, and is never forgotten:
- * without a connection it goes as soon as there is one, and who comes later is stopped too, until it is released.
+ * without a connection it goes as soon as there is one, and who is away or comes later is stopped too, until it is released. That
+ * is the one thing here that may be old.
+ *
+ * Events: `change`, and `said`, as a robot says that it is stopped or may go on: {robot, stopped}.
  */
 
 const TOPIC = "/emergency_stop";
@@ -34,6 +37,9 @@ export class Halt extends EventTarget {
     this.all = kept?.all ?? false;
     /** robot → whether it says that it is stopped. */
     this.said = new Map();
+    /** robot → how long that took after the press, in ms. */
+    this.took = new Map();
+    this.beganAt = null;
     /** robot → when it was heard of last. */
     this.heardAt = new Map();
     this.turn = 0;
@@ -76,6 +82,8 @@ export class Halt extends EventTarget {
   /** Stop all. Whether this token may. */
   press() {
     if (!this.may) return false;
+    if (!this.open) this.beganAt = performance.now();
+    this.took.clear();
     this.all = true;
     this.pressedAt = performance.now();
     for (const robot of this.known) this.wanted.add(robot);
@@ -84,13 +92,28 @@ export class Halt extends EventTarget {
     return true;
   }
 
-  /** Let all that are stopped go on, as far as they let this headset; a press that is not confirmed is taken back. */
+  /**
+   * Let all that are stopped go on, as far as they let this headset; a press that is not confirmed is taken back. What came of
+   * it: who was asked to go on, and whether that was sent.
+   */
   release() {
     this.wanted.clear();
     this.all = false;
-    const stopped = this.stopped();
-    if (stopped.length) this.command?.publish(FALSE, this.#whom(stopped));
+    this.beganAt = null;
+    const robots = this.stopped();
+    const sent = robots.length > 0 && Boolean(this.command?.publish(FALSE, this.#whom(robots)));
     this.#changed();
+    return { robots, sent };
+  }
+
+  /** Say again what is not confirmed: timers of a hidden page are slow. */
+  again() {
+    this.#send();
+  }
+
+  /** Whether a press is not confirmed yet, by somebody who is known or because nobody is. */
+  get open() {
+    return this.wanted.size > 0 || (this.all && this.known.size === 0);
   }
 
   /** What a robot's status says of it, where nothing was said on the topic. */
@@ -120,7 +143,8 @@ export class Halt extends EventTarget {
   /** Why none of these may be driven; empty when they may. */
   bars(robots) {
     if (robots.some((robot) => this.said.get(robot))) return "the robot is stopped";
-    return this.all || robots.some((robot) => this.wanted.has(robot)) ? "a stop is pressed" : "";
+    const unknown = this.all && (!robots.length || robots.some((robot) => !this.said.has(robot)));
+    return unknown || robots.some((robot) => this.wanted.has(robot)) ? "a stop is pressed" : "";
   }
 
   get kept() {
@@ -136,13 +160,16 @@ export class Halt extends EventTarget {
     this.said.set(robot, stopped);
     this.heardAt.set(robot, performance.now());
     this.why.delete(robot);
-    if (stopped) this.wanted.delete(robot);
-    else if (this.all && before === undefined) this.wanted.add(robot);
+    if (stopped && this.wanted.delete(robot) && this.beganAt !== null) this.took.set(robot, performance.now() - this.beganAt);
+    if (!stopped && this.all && before === undefined) this.wanted.add(robot);
     if (before && !stopped) {
       // a release from just before the press may be told after it: then the press counts
       if (this.all && performance.now() - this.pressedAt < RACE_MS) this.wanted.add(robot);
       // somebody has let all of them go on: then newcomers may, too
       else if (!this.wanted.size && !this.stopped().length) this.all = false;
+    }
+    if (before !== stopped && (before !== undefined || stopped)) {
+      this.dispatchEvent(new CustomEvent("said", { detail: { robot, stopped } }));
     }
     this.#send(false);
   }
@@ -166,16 +193,29 @@ export class Halt extends EventTarget {
   /** What to tell a person: {text, state} with state `free`, `waiting` or `stopped`. */
   words(connected) {
     const stopped = this.stopped();
-    const open = this.wanted.size > 0 || (this.all && this.known.size === 0);
-    if (open && !connected) return { state: "waiting", text: "no connection: the stop is sent as soon as there is one" };
-    if (this.all && !connected) return { state: "waiting", text: "no connection: how robots are is not known" };
-    if (this.wanted.size) {
-      const why = [...this.wanted].map((robot) => this.why.get(robot)).find(Boolean);
-      return { state: "waiting", text: `not confirmed yet by robot ${[...this.wanted].join(", ")}${why ? ` (${why})` : ""}` };
+    const state = this.open || (this.all && !connected) ? "waiting" : stopped.length || this.all ? "stopped" : "free";
+    return { state, text: this.#said(stopped, connected).join(" · ") };
+  }
+
+  #said(stopped, connected) {
+    const list = (robots) => `robot ${robots.join(", ")}`;
+    if (this.open && !this.may) return [`a stop is not confirmed by ${list([...this.wanted])}, and this token may not stop`];
+    if (this.open && !connected) return ["no connection: the stop is sent as soon as there is one"];
+    if (this.all && !connected) return ["no connection: how robots are is not known"];
+    const words = [];
+    const waiting = [...this.wanted].filter((robot) => this.online.has(robot));
+    const away = [...this.wanted].filter((robot) => !this.online.has(robot));
+    if (waiting.length) {
+      const reason = waiting.map((robot) => this.why.get(robot)).find(Boolean);
+      words.push(`no confirmation yet of ${list(waiting)}${reason ? ` (${reason})` : ""}`);
+    } else if (stopped.length) {
+      const took = stopped.flatMap((robot) => this.took.get(robot) ?? []);
+      words.push(`${list(stopped)} stopped${took.length ? ` after ${Math.round(Math.max(...took))} ms` : ""}`);
     }
-    if (stopped.length) return { state: "stopped", text: `robot ${stopped.join(", ")} stopped` };
-    if (this.all) return { state: this.online.size ? "waiting" : "stopped", text: "each robot that comes is stopped" };
-    return { state: "free", text: "" };
+    if (away.length) words.push(`${list(away)} not online: stopped on return`);
+    const nobody = this.online.size ? "how robots are is not known" : "no robot is online";
+    if (this.all && !words.length) words.push(`${nobody}: each that comes is stopped`);
+    return words;
   }
 
   #whom(robots) {

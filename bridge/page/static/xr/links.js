@@ -1,7 +1,7 @@
 /** The two workers, and what goes to them and comes from them. Events: `presence`, `access`, `value`, `state`, `stop`, `event`, `link`. */
 
-/** Where the page at / writes down a stop for the page that comes after it in the same tab. */
-const KEPT = "macs.stop";
+import { readKept, writeKept } from "../shared/kept-stop.js";
+
 /** The worker of commands says so soon that it has heard of a press. */
 const ECHO_MS = 200;
 const NOTHING = { all: false, wanted: [], known: [] };
@@ -156,23 +156,5 @@ export class Links extends EventTarget {
     } else {
       this.#tell(message.op, message);
     }
-  }
-}
-
-function readKept() {
-  try {
-    const kept = JSON.parse(sessionStorage.getItem(KEPT));
-    return Array.isArray(kept?.wanted) && Array.isArray(kept.known) ? { ...kept, all: kept.all === true } : null;
-  } catch {
-    return null;
-  }
-}
-
-function writeKept({ state, kept }) {
-  try {
-    if (state === "free" && !kept.all) sessionStorage.removeItem(KEPT);
-    else sessionStorage.setItem(KEPT, JSON.stringify(kept));
-  } catch {
-    // a browser that keeps nothing
   }
 }
