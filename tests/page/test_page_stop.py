@@ -103,7 +103,9 @@ async def test_a_token_for_groups_stops_their_robots(start_site: StartSite, tmp_
     for secret in secrets:
         page = await signed_in(site, secret)
         await online(page, 1)
-        assert "by their group" in await page.page.inner_text(".robot-view")
+        said = await page.page.inner_text(".robot-view")
+        assert "by their group" in said
+        assert "gives control to who may name it by its number" in said
         await page.page.click("#stop")
         await until(lambda page=page: says(page, "#stop-status", "robot 1 stopped"))
         await released(page)

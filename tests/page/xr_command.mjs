@@ -352,6 +352,9 @@ const parts = {
     status[2] = { nodes: [{ name: "/cmd_vel", control: { holder: "unity/9", seconds_left: 1 } }], stopped: false };
     aim([], { groups: [5], members: [1, 2], seen: 1 });
     await until(() => told.state.barred === "headset 9 has control");
+    assert.ok(told.state.byGroup);
+    await link.control({ action: "take" });
+    assert.match(told.events.at(-1), /this token names groups only/);
     status[2] = { nodes: [], stopped: true };
     link.halt.said.clear();
     await until(() => told.state.barred === "the robot is stopped");

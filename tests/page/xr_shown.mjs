@@ -139,6 +139,14 @@ const parts = {
     say({ holder: "you", candidates: [8, 9] });
     assert.ok(buttons().includes("give 8: Give to 8"), "whom a button names is in it");
     assert.equal(status.title, "Waiting for robot 7");
+    assert.ok(!menu.buttons.flat().find(({ id }) => id === "back").off);
+    const take = () => menu.buttons.flat().find(({ id }) => id === "take");
+    say({ holder: null });
+    assert.deepEqual([take().off, rows()[""]], [false, undefined]);
+    say({ byGroup: true });
+    assert.ok(take().off);
+    assert.match(rows()[""], /this token names groups only/, "and why");
+    say({ byGroup: false });
     say({ unknown: [3] });
     assert.equal(rows().Control, "robot 3 does not say");
     say({ clockless: [3] });

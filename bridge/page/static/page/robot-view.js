@@ -1,5 +1,6 @@
 /** One robot: pictures, place, plots, topics, services, driving. Which panels there are follows what it offers. */
 
+import { ONLY_BY_GROUP } from "../shared/words.js";
 import { Calls } from "./calls.js";
 import { Camera, PICTURES } from "./camera.js";
 import { TWIST } from "../shared/twist.js";
@@ -22,7 +23,8 @@ const PLOTTED = {
 };
 
 const NOBODY = "No robot is online. As soon as one is, it appears here.";
-const ONLY_GROUPS = "This token names robots by their group: the mesh and the stop are for it, not what is one robot's.";
+const ONLY_GROUPS = `This token names robots by their group: the mesh and the stop are for it, and /xr, where a group is driven as one. \
+What is one robot's is not, nor is control to be taken: ${ONLY_BY_GROUP}.`;
 
 export class RobotView {
   #shown = null;

@@ -12,6 +12,7 @@ import { Types } from "../ros.js";
 import { Driver } from "../shared/driver.js";
 import { Halt } from "../shared/halt.js";
 import { stamp } from "../shared/twist.js";
+import { ONLY_BY_GROUP } from "../shared/words.js";
 import { get, persisted, soon } from "./asking.js";
 import { lockout } from "./freshness.js";
 import { Poke } from "./poke.js";
@@ -99,6 +100,12 @@ export class CommandLink {
     return length > ROBOTS ? `${length} robots are too many: at most ${ROBOTS} are driven at once` : "";
   }
 
+  /** Whether whom it is aimed at may be named by group only. */
+  get #byGroup() {
+    const { robots, groups } = this.#target ?? { robots: [], groups: [] };
+    return groups.length > 0 && !robots.length;
+  }
+
   /** What somebody chose: {forward, turn, hz, lockoutS, poseHz, frame, …, head, left, right …} */
   set(settings) {
     const before = this.#settings;
@@ -140,8 +147,8 @@ export class CommandLink {
 
   /** Ask for control, or give it: {action: "take" | "release" | "give", to}. */
   async control(request) {
-    const { robots = [], groups = [], topic } = this.#target ?? {};
-    if (groups.length && !robots.length) this.#say("control", "this token names groups only: robots give control one by one");
+    const { robots = [], topic } = this.#target ?? {};
+    if (this.#byGroup) this.#say("control", ONLY_BY_GROUP);
     for (const robot of robots) {
       try {
         const { done, reason } = await this.headset.ask(robot, "RobotControl", { ...request, topic });
@@ -334,6 +341,7 @@ export class CommandLink {
       blind: this.#blind(performance.now()),
       speed: this.driver.speed,
       exclusive: status.some((each) => each.exclusive),
+      byGroup: this.#byGroup,
       holder: holder && (holder === this.#own ? "you" : named(holder)),
       candidates: this.#candidates(status),
       secondsLeft: status[0]?.secondsLeft ?? 0,

@@ -1,6 +1,7 @@
 /** What is on the screen about the scene: the robots, the way into XR, the stop, the pad, the settings. */
 
 import { digits, h, say, show } from "../page/dom.js";
+import { ONLY_BY_GROUP } from "../shared/words.js";
 import { Pad } from "../shared/pad.js";
 
 const FIELDS = [
@@ -94,8 +95,8 @@ export class Overlay {
     say(this.link, state.connected ? reached : "connection lost");
     const whose = state.holder ? `${state.holder} ${state.holder === "you" ? "have" : "has"} control` : "nobody has control";
     const unknown = state.unknown.length ? `robot ${state.unknown.join(", ")} does not say who has control` : "";
-    say(this.control, unknown || (state.exclusive ? whose : ""));
-    show(this.take, state.exclusive && state.holder === null);
+    say(this.control, unknown || (state.exclusive ? `${whose}${state.byGroup ? ` · ${ONLY_BY_GROUP}` : ""}` : ""));
+    show(this.take, state.exclusive && !state.byGroup && state.holder === null);
     show(this.back, state.exclusive && state.holder === "you");
     show(this.give, state.exclusive && state.holder === "you" && state.candidates.length > 0);
     this.give.value = state.candidates[0] ?? "";

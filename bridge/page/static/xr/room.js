@@ -1,6 +1,7 @@
 /** What stands about who looks: panels of cameras, the board that tells, the board that is pressed, the model of the world. */
 
 import { digits } from "../page/dom.js";
+import { ONLY_BY_GROUP } from "../shared/words.js";
 import { Board } from "./board.js";
 import { Model } from "./model.js";
 import { face } from "./pointing.js";
@@ -105,6 +106,7 @@ export function statusRows({ state, stop, battery, picture, event, values }) {
   ];
   if (battery) rows.push({ label: "Battery", value: battery.text, tone: battery.tone });
   if (stop.text) rows.push({ label: "Stop", value: stop.text, tone: "bad" });
+  if (state.exclusive && state.byGroup) rows.push({ label: "", value: ONLY_BY_GROUP, tone: "muted" });
   for (const line of values.slice(0, 4)) rows.push({ label: "", value: line });
   if (event) rows.push({ label: "Last", value: event, tone: "muted" });
   return rows;

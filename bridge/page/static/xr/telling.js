@@ -15,6 +15,7 @@ const NOTHING = {
   blind: "",
   speed: { linear: 0, angular: 0 },
   exclusive: false,
+  byGroup: false,
   holder: null,
   candidates: [],
   secondsLeft: 0,
@@ -171,8 +172,8 @@ export class Telling {
   }
 
   #control() {
-    const { exclusive, holder, candidates } = this.state; // who is named on a button gets it, whoever comes meanwhile
-    if (holder !== "you") return [{ id: "take", label: "Take control", off: !exclusive || holder !== null }];
+    const { exclusive, byGroup, holder, candidates } = this.state; // who is named on a button gets it, whoever comes meanwhile
+    if (holder !== "you") return [{ id: "take", label: "Take control", off: !exclusive || byGroup || holder !== null }];
     const [other] = candidates;
     return [
       { id: "back", label: "Give back" },
