@@ -7,8 +7,9 @@ import logging
 import math
 import sys
 import time
-from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections import Counter, deque
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from itertools import chain
 from typing import cast
 
 from macs_zenoh.errors import NotAdmitted
@@ -114,6 +115,12 @@ class Connection(asyncio.BufferedProtocol):
         self._refused = False
         self._pauses = 0
         self._share = Share()
+        self._rest: deque[Iterator[Event]] = deque()
+        """What the agent did and is not handled yet, since that takes longer than a turn."""
+        self._waits = False
+        """Whether that waits for its turn: then the agent is not read from."""
+        self._lost = False
+        """Whether the socket has ended meanwhile."""
         self.received_bytes = 0
         self._unfinished = 0
         """What is counted for it of a frame that has begun."""
@@ -193,8 +200,8 @@ class Connection(asyncio.BufferedProtocol):
         began = time.monotonic()
         self._unread -= nbytes
         self.received_bytes += nbytes
-        if events := self.peer.advance(nbytes, began):
-            self._events(events)
+        if (events := self.peer.advance(nbytes, began)) is not None:
+            self.take(events, began)
             if self._successor is not None:
                 return
         unfinished = self.peer.partial_bytes
@@ -202,11 +209,13 @@ class Connection(asyncio.BufferedProtocol):
             self._note_unfinished(unfinished)
         took_s = time.monotonic() - began
         if took_s > TURN_S:
-            self._read_bytes = max(LEAST_READ_BYTES, int(self._read_bytes * TURN_S / took_s))
+            part = min(TURN_S / took_s, 0.5 if self._rest else 1.0)
+            self._read_bytes = max(LEAST_READ_BYTES, int(self._read_bytes * part))
         elif took_s < TURN_S / 2 and nbytes >= self._read_bytes // 2 and self._read_bytes < MOST_READ_BYTES:
             self._read_bytes *= 2
         rounds = self._memory.rounds
-        if (turn_s := rounds.spend(self.host, self._share, took_s)) and not self._transport.is_closing():
+        turn_s = rounds.spend(self.host, self._share, took_s)
+        if turn_s and not self._waits and not self._transport.is_closing():
             self.pause()
             rounds.enter(self.host, self.resume, turn_s)
 
@@ -230,6 +239,11 @@ class Connection(asyncio.BufferedProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = ENDED
+        if self._rest:  # what was said before comes first
+            self._lost = True
+            if self._timer is not None:
+                self._timer.cancel()
+            return
         if self.greeted and not self._refused and self.owner.sleeps(self):
             return
         for timer in (self._timer, self._tolled, self.regrouping):
@@ -251,41 +265,84 @@ class Connection(asyncio.BufferedProtocol):
 
     # -- in ------------------------------------------------------------------------------------------------------
 
-    def _events(self, events: list[Event]) -> None:
-        for number, event in enumerate(events):
+    def take(self, events: Iterable[Event], began: float) -> None:
+        """What the agent did: as much as a turn has time for that began then, the rest when others have had theirs."""
+        self._rest.append(iter(events))
+        if not self._waits:
+            self._handle_some(began)
+            if self._rest:
+                self._waits = True
+                self.pause()
+                self._memory.rounds.enter(self.host, self._handle_on)
+
+    def _handle_on(self) -> None:
+        began = time.monotonic()
+        self._handle_some(began)
+        self._memory.rounds.spend(self.host, self._share, time.monotonic() - began)
+        if self._rest:
+            self._memory.rounds.enter(self.host, self._handle_on)
+            return
+        self._waits = False
+        self.resume()
+        if self._lost:
+            self._lost = False
+            self.connection_lost(None)
+
+    def _handle_some(self, began: float) -> None:
+        """Handle what waits, in its order, until the turn is over that began then."""
+        for event in self._events():
             try:
                 if type(event) is Sent:
                     self.owner.forward(self, event)
-                elif isinstance(event, Rejected):
-                    if isinstance(event.error, NotAdmitted):
-                        self._not_let_in = True  # the door tells of all who try, by their addresses
-                        continue
-                    self._warn_once(type(event.error).__name__, str(event.error))  # the peer has counted it
-                elif isinstance(event, Left):
-                    if event.silent:
-                        self._give_up(event.reason)
-                    else:
-                        self.close(event.reason)
-                elif isinstance(event, Arrived):
-                    if self._writer.kept is not None:
-                        self._writer.kept.arrived(event.received)
                 else:
-                    self.owner.handle(self, event)
-                    if self._successor is not None:
-                        self._successor._events(events[number + 1 :])
-                        return
-                    if isinstance(event, Joined):
-                        if self._transport.is_closing():
-                            return  # it was not let in, and nothing that it sent before counts
-                        self._schedule()  # from now on silence counts, which may be less than what the handshake has
+                    self._handle(event)
             except Exception:  # ours to mend; this agent goes on, and so do all others
                 if self._fails():
                     log.exception("%s: %s failed (logged once, counted as failed)", self, type(event).__name__)
+            if self._successor is not None:
+                rest, self._rest = self._rest, deque()
+                self._successor.take(chain.from_iterable(rest), began)
+                return
+            if isinstance(event, Joined) and self._transport.is_closing() and not self._lost:
+                self._rest.clear()  # it was not let in, and nothing that it sent before counts
+                return
+            if time.monotonic() > began + TURN_S:
+                break
         try:
             self.owner.received(self)
         except Exception:
             if self._fails():
                 log.exception("%s: what it sent failed (logged once, counted as failed)", self)
+
+    def _events(self) -> Iterator[Event]:
+        """What waits, one after the other; whoever has not come to the end finds the rest there."""
+        while self._rest:
+            try:
+                for event in self._rest[0]:  # noqa: UP028 - by that it would end with who leaves off
+                    yield event
+            except Exception:
+                if self._fails():
+                    log.exception("%s: reading failed (logged once, counted as failed)", self)
+            self._rest.popleft()
+
+    def _handle(self, event: Event) -> None:
+        if isinstance(event, Rejected):
+            if isinstance(event.error, NotAdmitted):
+                self._not_let_in = True  # the door tells of all who try, by their addresses
+            else:
+                self._warn_once(type(event.error).__name__, str(event.error))  # the peer has counted it
+        elif isinstance(event, Left):
+            if event.silent:
+                self._give_up(event.reason)
+            else:
+                self.close(event.reason)
+        elif isinstance(event, Arrived):
+            if self._writer.kept is not None:
+                self._writer.kept.arrived(event.received)
+        else:
+            self.owner.handle(self, event)
+            if isinstance(event, Joined) and self._successor is None and not self._transport.is_closing():
+                self._schedule()  # from now on silence counts, which may be less than what the handshake has
 
     def _fails(self) -> bool:
         """What this agent said could not be carried out, for a reason that nobody thought of; whether that is the
@@ -457,6 +514,8 @@ class Connection(asyncio.BufferedProtocol):
         if not self.greeted or self.asleep:
             self.abort()
         elif not self._transport.is_closing():
+            while self._rest:
+                self._handle_some(time.monotonic())
             self._expect_back_no_more()
             self.peer.lost()
             log.info("%s leaves: %s", self, reason)
@@ -514,7 +573,7 @@ class Connection(asyncio.BufferedProtocol):
         assert kept is not None
         self._memory.waiting.set(self, self.host, 0)
         transport = newcomer._give_to(self)
-        self.asleep = False
+        self.asleep = self._lost = False
         self.peer, self.recipient = newcomer.peer, newcomer.peer.recipient
         self.entrance, self.host, self.address = newcomer.entrance, newcomer.host, newcomer.address
         newcomer.pace.has_left(self.pace)
@@ -541,6 +600,8 @@ class Connection(asyncio.BufferedProtocol):
         self._memory.unfinished.note(self, self.host, 0)
         self._memory.waiting.set(self, self.host, 0)
         transport.set_protocol(successor)
+        if self._pauses and not transport.is_closing():
+            transport.resume_reading()
         return transport
 
     def _give_up(self, reason: str) -> None:
@@ -573,7 +634,7 @@ class Connection(asyncio.BufferedProtocol):
         if in_time:
             self._looked = False  # what comes when its time has run out another time is looked at anew
         if in_time or not self._must_be_read():
-            self._events(self.peer.tick(now))
+            self.take(self.peer.tick(now), now)
         paused_at = None if self.asleep else self._writer.paused_at
         if paused_at is not None and now >= paused_at + self._write_timeout_s:
             self._give_up(f"it has not read for {self._write_timeout_s:g} s")

@@ -443,9 +443,8 @@ class Gateway:
             connection.charge()
 
     def _rights_changed(self, connection: Connection, grant: Grant) -> None:
-        """A token has other rights: they hold at once."""
-        for event in self._refusing.changed(connection, grant):
-            self.handle(connection, event)
+        """A token has other rights: they hold for all that is read from now on."""
+        connection.take(self._refusing.changed(connection, grant), time.monotonic())
 
     def _joined(self, connection: Connection, event: Joined) -> None:
         if self.agents.find(*connection.key) is connection:

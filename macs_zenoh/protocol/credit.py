@@ -21,7 +21,7 @@ class Credit:
     def left(self, now: float) -> float:
         """How many frames it is worth."""
         earned = max(0.0, now - self._at) * self.frames_per_s
-        self._left, self._at = min(self._most, self._left + earned), now
+        self._left, self._at = min(self._most, self._left + earned), max(self._at, now)
         return self._left
 
     def take(self, frames: float, now: float) -> bool:

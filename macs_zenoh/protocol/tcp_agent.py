@@ -13,7 +13,7 @@ Frames that come before the configuration are held until it is there, because he
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from enum import Enum
 from typing import NamedTuple
@@ -361,44 +361,52 @@ class TcpAgent:
         """Where the next received bytes belong; then call `advance`."""
         return self._decoder.space()
 
-    def advance(self, size: int, now: float) -> list[Event]:
-        """``size`` bytes were received into `space`."""
+    def advance(self, size: int, now: float) -> Iterator[Event] | None:
+        """``size`` bytes were received into `space`. Frames are read as their events are asked for: whoever asks may
+        do other things between them, and receive more, whose events come behind these. None: no frame is whole."""
         if self.state is GONE:
-            return []
+            return None
         self._heard_at = now
-        events: list[Event] = []
-        decoder, limited = self._decoder, self._limits.frames_per_s
-        shared = self.grant.credit
-        for frame in decoder.advance(size):
-            if isinstance(frame, WireError):
-                self.heard += self.state is ONLINE
-                self._reject(frame, 1, events)
-                continue
-            if self.state is ONLINE:
-                self.heard += frame.count
-            try:
-                if (limited or shared is not None) and not self._covered(frame, now):
-                    self._too_fast(frame, now, events)
-                elif self.state is ONLINE and not frame.has_management:
-                    self._send(frame, events)
-                    continue
-                else:
-                    self._frame(frame, events)
-            except NotPermitted as error:
-                self._forbid(error, frame, events)
-            except WireError as error:
-                self._reject(error, frame.count, events)
-            if self._gone():
-                return events
+        decoder = self._decoder
+        frames = decoder.advance(size)
         begun, self.partial_bytes = decoder.begun, decoder.partial_bytes
         if not begun:
             self._partial_since = None
         elif self._partial_since is None or begun < self._partial_begun:  # a new one
             self._partial_since, self._partial_begun = now, begun
-        if decoder.error is not None:
+        return self._read(frames, decoder.error, now) if frames or decoder.error is not None else None
+
+    def _read(self, frames: list[Frames | WireError], error: WireError | None, now: float) -> Iterator[Event]:
+        """The events of frames, behind which there is maybe one that ends it all."""
+        for frame in frames:
+            if self._gone():
+                return
+            events: list[Event] = []
+            self._read_frame(frame, now, events)
+            yield from events
+        if error is not None and not self._gone():
             self.drops["FrameTooLarge"] += 1
-            events += [Rejected(decoder.error), self._leave("its next frame cannot be found")]
-        return events
+            yield Rejected(error)
+            yield self._leave("its next frame cannot be found")
+
+    def _read_frame(self, frame: Frames | WireError, now: float, events: list[Event]) -> None:
+        if isinstance(frame, WireError):
+            self.heard += self.state is ONLINE
+            self._reject(frame, 1, events)
+            return
+        if self.state is ONLINE:
+            self.heard += frame.count
+        try:
+            if (self._limits.frames_per_s or self.grant.credit is not None) and not self._covered(frame, now):
+                self._too_fast(frame, now, events)
+            elif self.state is ONLINE and not frame.has_management:
+                self._send(frame, events)
+            else:
+                self._frame(frame, events)
+        except NotPermitted as error:
+            self._forbid(error, frame, events)
+        except WireError as error:
+            self._reject(error, frame.count, events)
 
     def receive(self, data: bytes, now: float) -> list[Event]:
         """The same for bytes that are already somewhere."""
@@ -409,7 +417,7 @@ class TcpAgent:
             size = min(len(space), len(view))
             space[:size] = view[:size]
             del space
-            events += self.advance(size, now)
+            events += self.advance(size, now) or ()
             view = view[size:]
         return events
 

@@ -1,0 +1,119 @@
+"""Frames that cost much are handled in turns: nobody waits for all that another one's socket brought at once."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+
+from bridge.gateway.connection import Connection
+from bridge.gateway.memory import Memory
+from bridge.gateway.shares import TURN_S
+from macs_zenoh.protocol.messages import ROS, UNITY, Configuration, Metadata, OnlineRequest, encode_management
+from macs_zenoh.protocol.tcp_agent import AskedOnline, Event, Joined, Sent, TcpAgent
+from macs_zenoh.protocol.wire import encode_frame, encode_message
+from tests.support.waiting import until
+
+MANY = 100
+COSTS_S = TURN_S / 3
+
+
+class Busy:
+    """A gateway to which each question is work; ``did`` has what it was asked, by whom."""
+
+    def __init__(self) -> None:
+        self.did: list[tuple[int, str | int]] = []
+        self.on_first: Callable[[], None] = lambda: None
+        self.came = 0
+
+    def opened(self, connection: Connection) -> bool:
+        self.came += 1
+        connection.greet(TcpAgent(self.came, self.came, time.monotonic()))
+        return True
+
+    def handle(self, connection: Connection, event: Event) -> None:
+        if isinstance(event, Joined):
+            return
+        assert isinstance(event, AskedOnline)
+        self.did.append((connection.agent_id, event.request_id))
+        if event.request_id == 1:
+            self.on_first()
+        until_s = time.monotonic() + COSTS_S
+        while time.monotonic() < until_s:
+            pass
+
+    def forward(self, connection: Connection, sent: Sent) -> None:
+        self.did.append((connection.agent_id, sent.metadata.node_name))
+
+    def closed(self, connection: Connection) -> None:
+        self.did.append((connection.agent_id, "closed"))
+
+    def sleeps(self, connection: Connection) -> bool:
+        return False
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *args: None
+
+
+def question(number: int) -> bytes:
+    """One that a gateway answers, and for which this one works."""
+    message = encode_message(Metadata(request_id=number).encode(), b"")
+    return encode_frame(management=encode_management(OnlineRequest()), message=message)
+
+
+def said(node: str) -> bytes:
+    """A message to a robot."""
+    return encode_frame(ROS, [7], message=encode_message(Metadata(node_name=node).encode(), b"x"))
+
+
+@asynccontextmanager
+async def two(busy: Busy) -> AsyncIterator[tuple[socket.socket, socket.socket]]:
+    """Two headsets' sockets, whose connections are configured."""
+
+    memory = Memory(64 << 20, 32 << 20)
+
+    def make() -> Connection:
+        return Connection(busy, memory=memory, outbox_bytes=64 << 20, write_timeout_s=30)  # type: ignore[arg-type]
+
+    server = await asyncio.get_running_loop().create_server(make, "127.0.0.1", 0)
+    address = server.sockets[0].getsockname()[:2]
+    hello = encode_frame(management=encode_management(Configuration(UNITY, 0)))
+    with socket.create_connection(address) as one, socket.create_connection(address) as other:
+        await until(lambda: busy.came == 2)
+        for each in (one, other):
+            each.sendall(hello)
+        await asyncio.sleep(0)
+        yield one, other
+    server.close()
+
+
+async def test_a_neighbour_has_its_turn_among_them() -> None:
+    """What somebody says while another's hundred questions are answered is heard before the last of them; these stay
+    in their order, with what came between and behind them."""
+    busy = Busy()
+    async with two(busy) as (one, other):
+        busy.on_first = lambda: other.sendall(said("stop"))
+        one.sendall(
+            b"".join(map(question, range(1, MANY // 2)))
+            + said("between")
+            + b"".join(map(question, range(MANY // 2, MANY)))
+        )
+        one.sendall(said("behind"))
+        await until(lambda: (1, "behind") in busy.did)
+        mine = [what for who, what in busy.did if who == 1]
+        assert mine == [*range(1, MANY // 2), "between", *range(MANY // 2, MANY), "behind"]
+        assert busy.did.index((2, "stop")) < MANY // 2
+
+
+async def test_all_of_it_counts_when_the_connection_ends_meanwhile() -> None:
+    """Who says much, then stops a robot, and is gone: all that it said comes before its end, as if it had been read
+    in one go."""
+    busy = Busy()
+    async with two(busy) as (one, _):
+        one.sendall(b"".join(map(question, range(1, MANY))) + said("stop"))
+        with suppress(OSError):
+            one.shutdown(socket.SHUT_RDWR)
+        await until(lambda: (1, "closed") in busy.did)
+        assert [what for who, what in busy.did if who == 1] == [*range(1, MANY), "stop", "closed"]
