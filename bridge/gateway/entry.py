@@ -5,9 +5,12 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from bridge.settings import GatewaySettings
 from macs_zenoh.losses import Losses
+from macs_zenoh.protocol.budget import Budget
+from macs_zenoh.protocol.keyexpr import BLOCK_SIZE
 
 from .admission import Admission, Churn
 from .connection import Connection
@@ -15,6 +18,9 @@ from .departures import PIECE_S
 from .leases import Leases
 from .record import Record
 from .waiting import WaitingRoom
+
+EVERY_ID = 1 << 16
+"""All ids of a mesh."""
 
 
 class Entry:
@@ -40,6 +46,9 @@ class Entry:
             settings.allow, settings.max_connections, settings.max_connections_per_address, settings.groups
         )
         self.churn = Churn()
+        ids = len(set(settings.blocks)) * BLOCK_SIZE
+        self._ids = Budget("ids", each=1, per_address=ids - ids // 4, total=EVERY_ID) if ids else None
+        """Where there are only some: one address never takes all. Who waits for one, or sleeps, counts."""
         self._coming: dict[Connection, asyncio.TimerHandle] = {}
         """Who does not even wait for an id yet, since many from there have come and gone."""
         self._waiting = WaitingRoom(settings.handshake_timeout_s, self._no_id)
@@ -70,12 +79,15 @@ class Entry:
         """Let a connection in, or not. It is greeted at once, or as soon as there is an id for it."""
         connection.stranger = connection.entrance.wants_token(connection.host)
         refusal = self.admission.judge(connection.host, stranger=connection.stranger)
+        if refusal is None and self._ids is not None and (why := self._ids.judge(connection, connection.host)):
+            refusal = "too_many_ids", f"{why} (gateway.blocks)"
         if refusal is not None:
             name, why = refusal
             self._losses.once(name, "%s is refused: %s", connection.address, why)
             self._record.address("refused", connection.address, name, why)
             return False
         self.admission.enter(connection.host, stranger=connection.stranger)
+        self._count(connection, 1)
         wait_s = self.churn.wait_s(connection.host, time.monotonic())
         if wait_s:
             self._losses.once("coming_and_going", "%s waits: many from there have just left", connection.address)
@@ -97,6 +109,21 @@ class Entry:
         if connection.greeted:
             now = time.monotonic()
             self.churn.ended(connection.host, now - connection.greeted_at, now)
+
+    def forget(self, connection: Connection) -> None:
+        """Nobody has, or waits for, an id any more for this connection."""
+        self._count(connection, 0)
+
+    @contextmanager
+    def moved(self, connection: Connection) -> Iterator[None]:
+        """Within it an agent comes to have another address: its id counts for that."""
+        self._count(connection, 0)
+        yield
+        self._count(connection, 1)
+
+    def _count(self, connection: Connection, ids: int) -> None:
+        if self._ids is not None:
+            self._ids.set(connection, connection.host, ids)
 
     def leave(self, connection: Connection) -> None:
         """A connection has ended without an id."""

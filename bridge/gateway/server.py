@@ -341,6 +341,7 @@ class Gateway:
 
     def _has_closed(self, connection: Connection) -> None:
         self._door.leave(connection)
+        self._entry.forget(connection)
         self._sleepers.left(connection)
         if not connection.asleep:
             self._entry.leave_address(connection)
@@ -383,12 +384,13 @@ class Gateway:
         former = self.agents.find(event.former.agent_type, event.former.agent_id)
         assert former is not None
         self._entry.known(newcomer)
+        self._entry.forget(newcomer)
         self._forwarding.never_mind(newcomer)
         self.agents.never_mind(event.spare_id)
         self._leases.give_back(event.spare_id)
         self._credits.leave(newcomer.host, event.spare_credit, time.monotonic())
         self._door.is_now(newcomer, former)
-        with self._registry.moved(former):
+        with self._registry.moved(former), self._entry.moved(former):
             self._sleepers.resumed(newcomer, event)
         self._entry.greet_waiting()
 

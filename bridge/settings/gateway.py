@@ -82,7 +82,8 @@ class GatewaySettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=
     block: GroupId | None = None
     """The block of 256 agent ids this gateway gives out first, 0 being 1..255; unset: lease the first free one."""
     blocks: list[GroupId] = []
-    """The only blocks it may lease: where routers hold its certificate to them (docs/security.md). Empty: any."""
+    """The only blocks it may lease: where routers hold its certificate to them (docs/security.md). Empty: any. One
+    address never has more than three quarters of their ids."""
     managers: list[str] = []
     """Own management messages, as my_package.world_class_manager:WorldClassManager (docs/managers.md)."""
     tell_refusals: bool = True

@@ -33,6 +33,7 @@ TURNED_AWAY = {
     "address_not_allowed": "they come from a network that may not",
     "too_many_connections": "there are too many connections",
     "too_many_from_address": "there are too many connections of one address",
+    "too_many_ids": "one address has most of the ids of the gateway's blocks",
     "too_many_unknown": "there are too many that have shown no token",
     "robot_not_allowed": "robot programs may not come with that id",
     "zenoh_program": "they are Zenoh programs, which want a router",

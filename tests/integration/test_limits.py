@@ -142,6 +142,38 @@ async def test_connections_are_limited(start_gateway: StartGateway, connect: Con
     assert (await start_gateway(allow=["127.0.0.0/8"])).drops == {}
 
 
+async def test_one_address_does_not_take_all_ids(start_gateway: StartGateway) -> None:
+    """Where a gateway has only so many, somebody from elsewhere gets one; who has taken most is refused and counted,
+    until he gives one back."""
+    gateway = await start_gateway(blocks=[3])
+    most, taken = 192, []
+
+    async def connected(host: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter] | None:
+        reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port, local_addr=(host, 0))
+        with suppress(ConnectionError):
+            if await asyncio.wait_for(reader.read(1), PATIENCE_S):
+                return reader, writer
+        writer.close()
+        return None
+
+    for _ in range(most):
+        taken.append(await connected("127.0.0.1"))
+    assert all(taken)
+    assert await connected("127.0.0.1") is None
+    assert gateway.drops["too_many_ids"] == 1
+    elsewhere = await connected("127.0.0.2")
+    assert elsewhere is not None
+    one = taken.pop()
+    assert one is not None
+    one[1].close()
+    await until(lambda: len(gateway.agents) == most)
+    taken.append(await connected("127.0.0.1"))
+    assert taken[-1] is not None
+    for each in (*taken, elsewhere):
+        assert each is not None
+        each[1].close()
+
+
 async def test_a_rate_is_kept(start_gateway: StartGateway, connect: Connect) -> None:
     """Beyond its rate a connection's messages and questions are dropped and counted; the connection stays."""
     gateway = await start_gateway(max_frames_per_s=20)
