@@ -8,7 +8,7 @@ import msgspec
 from msgspec import UNSET
 
 from bridge.recording.streams import CONTROL, DEADMAN, DROPS, STATUS, STOPS
-from macs_zenoh.protocol.robot_state import NodeStatus, RobotStatus, tripped
+from macs_zenoh.protocol.robot_state import NodeStatus, RobotStatus, added, counting_anew, tripped
 
 STOP, DEAD_MAN = "stop", "deadman"
 """What a ring is written for."""
@@ -32,6 +32,11 @@ class Condition:
         self._robot = robot
         self._last: RobotStatus | None = None
         self._stable: object = None
+
+    def began_again(self) -> None:
+        """The robot has been started again: it counts from none, and whatever it says has happened since."""
+        if self._last is not None:
+            self._last, self._stable = counting_anew(self._last), None
 
     def tell(self, status: RobotStatus) -> list[Event]:
         """The robot says how it is now: what is new in it. Times that only run on are not."""
@@ -57,7 +62,7 @@ class Condition:
             "times": now.stop.times,
             "history": now.stop.history,
         }
-        is_new = now.stop.times > was[1] or (now.stopped and not was[0])
+        is_new = added(was[1], now.stop.times) > 0 or (now.stopped and not was[0])
         return [self._event(STOPS, value, keep="stop", trigger=STOP if is_new and before is not None else "")]
 
     def _controls(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
@@ -78,12 +83,12 @@ class Condition:
         return [
             self._event(DEADMAN, {"topic": topic, "trips": told.times, "why": told.why}, trigger=DEAD_MAN)
             for topic, told in tripped(now).items()
-            if _more(known[topic].times if topic in known else 0, told.times)
+            if added(known[topic].times if topic in known else 0, told.times)
         ]
 
     def _drops(self, before: RobotStatus | None, now: RobotStatus) -> list[Event]:
         was = before.drops if before is not None else {}
-        more = {name: count for name, all_ in now.drops.items() if (count := _more(was.get(name, 0), all_))}
+        more = {name: count for name, all_ in now.drops.items() if (count := added(was.get(name, 0), all_))}
         return [self._event(DROPS, {"more": more, "in_all": now.drops})] if more else []
 
     def _event(self, channel: str, value: dict[str, Any], *, keep: str = "", trigger: str = "") -> Event:
@@ -94,11 +99,6 @@ class Condition:
 def stop_topic(status: RobotStatus) -> str:
     """The topic of a robot's emergency stop; empty for none."""
     return next((node.name for node in status.nodes if node.role == "emergency stop"), "")
-
-
-def _more(before: int, now: int) -> int:
-    """What has been added; a robot that has been started again counts from none."""
-    return now - before if now >= before else now
 
 
 def _holders(status: RobotStatus) -> dict[str, str]:

@@ -89,6 +89,9 @@ class Recorder:
         self._traces: Traces | None = None
         self._watching: dict[int, asyncio.Task[None]] = {}
         self._asked: dict[int, asyncio.Event] = {}
+        self._conditions: dict[int, Condition] = {}
+        self._sessions: dict[int, tuple[str, int]] = {}
+        """Of robots, when they were seen last."""
         self._subscribed: list[Any] = []
         layout = Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots)
         self._traffic = Traffic(layout, self._bad)
@@ -169,15 +172,21 @@ class Recorder:
             follower.presence(agent, online)
         if agent.type != ROS or not self._wanted.robot(agent.id):
             return
+        known = self._sessions.get(agent.id)
+        if online:
+            self._sessions[agent.id] = agent.session
         if online and agent.id not in self.robots:
             self._follow(agent.id)
         elif online:
+            if known != agent.session:
+                self._conditions[agent.id].began_again()
             self._asked[agent.id].set()
         elif not online:
             self.schemas.forget(agent.id)
 
     def _follow(self, robot: int) -> None:
         asked = self._asked[robot] = asyncio.Event()
+        self._conditions[robot] = Condition(robot)
         self.robots[robot] = RobotFollower(
             self.agent,
             robot,
@@ -197,7 +206,7 @@ class Recorder:
 
     async def _watch(self, robot: int) -> None:
         """Ask a robot how it is, for as long as this recording goes on."""
-        condition, asked, offered = Condition(robot), self._asked[robot], None
+        condition, asked, offered = self._conditions[robot], self._asked[robot], None
         pause_s = STATUS_S
         while True:
             asked.clear()

@@ -10,7 +10,7 @@ from msgspec import UNSET
 
 from macs_zenoh.protocol.agent_id import AgentId
 from macs_zenoh.protocol.directory import AgentInfo
-from macs_zenoh.protocol.robot_state import RobotStatus, tripped
+from macs_zenoh.protocol.robot_state import RobotStatus, added, tripped
 
 SHORT = 8
 """Of a session's id so much tells it from others."""
@@ -128,8 +128,9 @@ def _stops(who: str, before: RobotStatus, after: RobotStatus, at_s: float) -> It
     if after.stopped and (not before.stopped or after.stop.times != before.stop.times):
         yield Event(at_s, "stopped", who, f"{who} was stopped by {after.stop.by}", after.stop.by)
     elif before.stopped and not after.stopped:
-        yield Event(at_s, "released", who, f"{who} was released by {after.stop.by}", after.stop.by)
-    elif after.stop.times > before.stop.times:  # both between two looks
+        by = after.stop.by or "being started again"
+        yield Event(at_s, "released", who, f"{who} was released by {by}", after.stop.by)
+    elif added(before.stop.times, after.stop.times):  # both between two looks
         yield Event(at_s, "stopped", who, f"{who} was stopped, and released by {after.stop.by}", after.stop.by)
 
 
@@ -141,7 +142,7 @@ def _controls(who: str, before: RobotStatus, after: RobotStatus, at_s: float) ->
             yield Event(at_s, "control", who, text, holder or "")
     had_tripped = tripped(before)
     for topic, told in tripped(after).items():
-        if told.times > (had_tripped[topic].times if topic in had_tripped else 0):
+        if added(had_tripped[topic].times if topic in had_tripped else 0, told.times):
             yield Event(at_s, "dead-man", who, f"the dead-man of {topic} on {who} has acted: {told.why}")
 
 
@@ -156,7 +157,7 @@ def _registered(status: RobotStatus) -> set[tuple[str, str, str]]:
 
 
 def _more(before: Mapping[str, int], after: Mapping[str, int]) -> Counter[str]:
-    return Counter({name: count - before.get(name, 0) for name, count in after.items() if count > before.get(name, 0)})
+    return Counter({name: more for name, count in after.items() if (more := added(before.get(name, 0), count))})
 
 
 def _messages(count: int) -> str:

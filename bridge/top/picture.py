@@ -10,13 +10,15 @@ from msgspec import UNSET
 from macs_zenoh.protocol.directory import AgentInfo, Change
 from macs_zenoh.protocol.messages import ROS
 from macs_zenoh.protocol.ping import GatewayAgent, GatewayTold, Pong
-from macs_zenoh.protocol.robot_state import CarriedStatus, NodeStatus, RobotStatus
+from macs_zenoh.protocol.robot_state import CarriedStatus, NodeStatus, RobotStatus, added, counting_anew
 from macs_zenoh.protocol.routers import Router, Trips, between
 
 from .events import Event, of_gateway, of_presence, of_program, of_robot
 
 MOST_TOPICS = 2000
 """Rows of topics that are kept: what others choose must not decide how much is."""
+MOST_LEFT = 64
+"""Robots that are gone and of which the last state is kept."""
 SILENT_AFTER = 3
 """So many questions without an answer until a robot counts as silent."""
 
@@ -105,6 +107,8 @@ class Picture:
         self.topics: dict[tuple[int, str, str], TopicRow] = {}
         """By robot, role and name."""
         self.away: set[tuple[int, int]] = set()
+        self._left: dict[int, RobotRow] = {}
+        """Robots that are gone, who went last at the end: when one is back it can be said what happened meanwhile."""
         self._fresh: set[str] = set()
         """Sessions of gateways that have not answered yet, and were not asked before."""
         self.known: dict[tuple[int, int], GatewayAgent] = {}
@@ -126,12 +130,13 @@ class Picture:
                 self.others.pop(agent.key, None)
                 self.known.pop(agent.key, None)
         elif online:
-            row = self.robots.setdefault(agent.id, RobotRow(agent))
-            if row.info.session != agent.session:  # it started again, and counts from nothing
-                row.status = None
+            row = self.robots.get(agent.id) or self._left.pop(agent.id, None) or RobotRow(agent)
+            if row.info.session != agent.session and row.status is not None:
+                row.status = counting_anew(row.status)  # whatever it tells has happened since
             row.info = agent
+            self.robots[agent.id] = row
         else:
-            self.robots.pop(agent.id, None)
+            self._leave(agent.id)
             for key in [key for key in self.topics if key[0] == agent.id]:
                 del self.topics[key]
         return events
@@ -146,8 +151,8 @@ class Picture:
         if row.unanswered >= SILENT_AFTER:
             events.append(Event(at_s, "came", str(row.info.key), f"{row.info.key} answers again"))
         if before is not None and since_s > 0:
-            more = {name: count - before.drops.get(name, 0) for name, count in status.drops.items()}
-            row.lost = {name: max(0, count) / since_s for name, count in more.items()}
+            more = {name: added(before.drops.get(name, 0), count) for name, count in status.drops.items()}
+            row.lost = {name: count / since_s for name, count in more.items()}
             row.lost_per_s = sum(row.lost.values())
         row.status, row.told_s, row.round_trip_s, row.unanswered, row.problem = status, now, round_trip_s, 0, ""
         self._topics_of(robot, status, before is not None, since_s)
@@ -222,6 +227,14 @@ class Picture:
             events.append(of_program(kind, row.address or zid[:8], False, at_s))
         self.programs.update(rows)
         return events
+
+    def _leave(self, robot: int) -> None:
+        row = self.robots.pop(robot, None)
+        if row is not None and row.status is not None:
+            row.unanswered, row.problem = 0, ""
+            self._left[robot] = row
+            if len(self._left) > MOST_LEFT:
+                del self._left[next(iter(self._left))]
 
     def _topics_of(self, robot: int, status: RobotStatus, told_before: bool, since_s: float) -> None:
         seen = set()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from msgspec import UNSET, Struct, UnsetType, field
+from msgspec import UNSET, Struct, UnsetType, field, structs
 
 from .messages import AgentId, AgentType, Count, Functionality
 
@@ -97,6 +97,16 @@ class RobotStatus(Struct, frozen=True):
     """What its agent cannot do for its safety, where that is a program beside the robot."""
     max_timed_command_age_s: float | UnsetType = UNSET
     """It asks what time commands were made, and how old they may be; 0: of any age."""
+
+
+def added(before: int, now: int) -> int:
+    """How much a robot's count has grown; one that has been started again counts from none."""
+    return now - before if now >= before else now
+
+
+def counting_anew(status: RobotStatus) -> RobotStatus:
+    """What is known of a robot that has been started again since: it counts from none."""
+    return structs.replace(status, stop=structs.replace(status.stop, times=0), trips={}, drops={})
 
 
 def tripped(status: RobotStatus) -> dict[str, TripsStatus]:

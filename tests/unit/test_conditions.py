@@ -85,6 +85,21 @@ def test_what_was_lost_is_told_by_how_much() -> None:
         assert (event.channel, event.value["more"], event.value["in_all"]) == (DROPS, more, now)
 
 
+def test_a_robot_that_was_started_again_counts_from_none() -> None:
+    """Though it may have come to the same numbers: what they say has happened since."""
+    before = status(
+        driven("unity/1"), stop=StopStatus(by="unity/1", times=1), drops={"a": 1}, trips={CMD: TripsStatus(1)}
+    )
+    condition = Condition(7)
+    condition.tell(before)
+    assert condition.tell(before) == []
+    condition.began_again()
+    now = condition.tell(before)
+    assert [event.channel for event in now] == [STATUS, STOPS, DEADMAN, DROPS]
+    assert [event.trigger for event in now] == ["", STOP, DEAD_MAN, ""]
+    assert condition.tell(before) == []
+
+
 def test_a_stop_has_a_ring_written_once() -> None:
     """When it is pressed, not when another presses as well, nor when it was there at the first look."""
     free = status()

@@ -116,6 +116,41 @@ def test_who_comes_leaves_and_fails_over() -> None:
     assert picture.told(8, status(), 0.001, 2.0, 2.0) == []
 
 
+@pytest.mark.parametrize("seen", [True, False], ids=["seen to leave", "not seen to leave"])
+@pytest.mark.parametrize("times", [1, 3], ids=["once", "as often as before"])
+def test_what_happens_on_a_robot_that_was_started_again_is_told(times: int, seen: bool) -> None:
+    """It counts from none: what its dead-men, its stop and its counters say has happened since."""
+    picture = Picture()
+    picture.presence(Change(robot(), True), 1.0)
+    before = structs.replace(
+        status(drive("unity/256", trips=3), by="unity/5", times=3, drops={"stopped": 3}),
+        trips={"/cmd_vel": TripsStatus(3, "before")},
+    )
+    assert picture.told(7, before, 0.001, 1.0, 1.0) == []
+    if seen:
+        picture.presence(Change(robot(), False), 2.0)
+    picture.presence(Change(robot(zid="b" * 32), True), 3.0)
+    after = structs.replace(
+        status(drive("unity/256"), by="unity/9", times=times, drops={"stopped": times}),
+        trips={"/cmd_vel": TripsStatus(times, "silence")},
+    )
+    events = picture.told(7, after, 0.001, 3.0, 3.0)
+    assert sorted(kinds(events)) == ["dead-man", "refused", "stopped"]
+    assert any(f"refused {times} message" in event.text for event in events)
+    assert picture.told(7, after, 0.001, 4.0, 4.0) == []
+
+
+def test_what_happens_while_a_robot_is_out_of_sight_is_told() -> None:
+    """It has not been started again: its link was lost, and what it counts goes on."""
+    picture = Picture()
+    picture.presence(Change(robot(), True), 1.0)
+    picture.told(7, structs.replace(status(), trips={"/cmd_vel": TripsStatus(1, "before")}), 0.001, 1.0, 1.0)
+    picture.presence(Change(robot(), False), 2.0)
+    picture.presence(Change(robot(), True), 3.0)
+    acted = structs.replace(status(), trips={"/cmd_vel": TripsStatus(2, "its link")})
+    assert kinds(picture.told(7, acted, 0.001, 3.0, 3.0)) == ["dead-man"]
+
+
 def test_a_robot_that_does_not_answer_is_told_once() -> None:
     """And that it answers again."""
     picture = Picture()
