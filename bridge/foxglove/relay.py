@@ -50,6 +50,8 @@ TOLD_BYTES = 256 << 20
 """Of the SDK: pictures and clouds."""
 CHANNELS = 256
 """Of one client, that it publishes to."""
+AT_ONCE = 1024
+"""Channels that one message may advertise: what is refused is said of each."""
 PASSED = frozenset({"subscribe", "unsubscribe", "subscribeConnectionGraph", "unsubscribeConnectionGraph"})
 """What a client may say whatever its rights are; the rest is judged or dropped."""
 PUBLISHED, CALLED = 1, 2
@@ -250,19 +252,22 @@ class Relay:
 
     async def _advertised(self, client: _Client, said: dict[str, Any]) -> list[Any]:
         """Of the channels that a client will publish to, those that it may."""
-        passed = []
-        for channel in _list(said, "channels"):
-            if not isinstance(channel, dict) or not isinstance(number := channel.get("id"), int):
-                continue
-            topic = str(channel.get("topic", ""))
+        passed, named = [], _list(said, "channels")
+        for channel in named[:AT_ONCE]:
+            number, topic = (channel.get("id"), channel.get("topic")) if isinstance(channel, dict) else (None, None)
+            topic = topic if isinstance(topic, str) else ""
             why = self._why_not(client.grant, NodeType.PUBLISHER, topic)
-            if why is None and len(client.channels) >= CHANNELS:
+            if type(number) is not int or not 0 <= number < 0xFFFFFFFF:
+                why = "it has no number"
+            elif why is None and len(client.channels) >= CHANNELS:
                 why = f"a client publishes to {CHANNELS} topics and no more"
-            if why is None and 0 <= number < 0xFFFFFFFF:
+            elif why is None:
                 client.channels[number] = topic
                 passed.append(channel)
-            else:
-                await self._refuse(client, topic, why or "it has no number")
+                continue
+            await self._refuse(client, topic, why or "")
+        if (more := len(named) - AT_ONCE) > 0:
+            await self._refuse(client, f"{more} channels more", f"one message names at most {AT_ONCE}", more)
         return passed
 
     async def _binary(self, client: _Client, there: Any, data: bytes) -> None:
@@ -279,6 +284,8 @@ class Relay:
             call = int.from_bytes(data[5:9], "little")
             failure = {"op": "serviceCallFailure", "serviceId": number, "callId": call, "message": why}
             await client.here.send_str(json.dumps(failure))
+        else:
+            self.drops.once("not_advertised", "%s publishes to what it has not advertised, or may not", client.host)
 
     def _why_not(self, grant: Grant, kind: NodeType, name: str) -> str | None:
         """Why a client may not publish to a topic or call a service of the mesh, as ``/7/cmd_vel``; None: it may."""
@@ -293,8 +300,8 @@ class Relay:
         node = AddNode(UNITY, 0, int(kind), node_name(topic), topic, "")
         return grant.rights.of_registration(node, [robot], [])
 
-    async def _refuse(self, client: _Client, topic: str, why: str) -> None:
-        self.drops.once("client_not_allowed", "%s is not published to: %s", topic, why)
+    async def _refuse(self, client: _Client, topic: str, why: str, count: int = 1) -> None:
+        self.drops.once("client_not_allowed", "%s is not published to: %s", topic[:200], why, count=count)
         await self._tell(client, f"{topic[:200]}: {why}", id=topic[:200])
 
     async def _tell(self, client: _Client, problem: str, **about: str) -> None:
@@ -315,7 +322,7 @@ def _token(request: web.Request) -> str | None:
 
 def _list(said: dict[str, Any], name: str) -> list[Any]:
     found = said.get(name)
-    return found[:1024] if isinstance(found, list) else []
+    return found if isinstance(found, list) else []
 
 
 def own_certificate() -> tuple[bytes, bytes, ssl.SSLContext]:

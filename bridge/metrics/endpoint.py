@@ -82,7 +82,13 @@ class Endpoint:
         self._open[task] = host
         try:
             await within(self._serve(reader, writer), REQUEST_S)
-        except (OSError, asyncio.TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+        except asyncio.TimeoutError:
+            self._drops.once("slow_request", "%s is closed: nothing whole for %g s", host, REQUEST_S)
+            writer.transport.abort()
+        except asyncio.LimitOverrunError:
+            self._drops.once("large_request", "%s is closed: it asks with more than %d bytes", host, REQUEST_BYTES)
+            writer.transport.abort()
+        except (OSError, asyncio.IncompleteReadError):  # it has gone
             writer.transport.abort()
         finally:
             self._open.pop(task, None)

@@ -281,6 +281,21 @@ async def test_somebody_looks_at_thousands_of_channels_at_once(tmp_path: Path) -
         assert site.relay.drops == {"bad_json": 1}
 
 
+async def test_what_is_too_much_to_publish_to_is_told_and_counted(tmp_path: Path) -> None:
+    """Each of a message's channels beyond those that a client may have, also beyond those that are read of it; and
+    what is published to them."""
+    async with started(tmp_path, publish=True, with_tokens=False) as site, site.client() as socket:
+        many = [channel(number, f"/7/topic{number}") for number in range(2000)]
+        many[0]["id"] = "no number"
+        await socket.send_str(json.dumps({"op": "advertise", "channels": many}))
+        while "channels more" not in (status := await said(socket, "status"))["message"]:
+            pass
+        assert status["message"].startswith(f"{2000 - door.AT_ONCE} channels more")
+        assert site.relay.drops == {"client_not_allowed": 2000 - door.CHANNELS}
+        await socket.send_bytes(published(1999, b"x"))
+        await until(lambda: site.relay.drops["not_advertised"] == 1)
+
+
 async def test_who_floods_is_closed(tmp_path: Path) -> None:
     """What waits of a flood would be carried out late; whoever else publishes goes on."""
     async with (

@@ -121,6 +121,7 @@ async def test_what_is_no_request_costs_nothing() -> None:
         assert b" 403 " in await said(b"GET /metrics HTTP/1.1\r\nHost: evil.example\r\n\r\n")
         assert b" 404 " in await said(b"GET /../etc/passwd HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         assert await said(b"GET /" + b"a" * 100_000) == b""
+        slow, slow_writer = await asyncio.open_connection(host, int(port))
         idle = [await asyncio.open_connection(host, int(port)) for _ in range(40)]
         assert await said(b"x") == b""  # there is no place for it
         for _, writer in idle:
@@ -132,6 +133,18 @@ async def test_what_is_no_request_costs_nothing() -> None:
         await until(answered, every_s=0.05)
         counted = figure((await get(f"{where}/metrics"))[1], "macs_drops_total", where="metrics", counter=TOO_MANY)
         assert counted >= 40 + 1 - AT_ONCE_EACH
+        assert await slow.read() == b""  # in its time
+        slow_writer.close()
+
+        async def is_counted(counter: str) -> bool:
+            text = (await get(f"{where}/metrics"))[1]
+            return (
+                f'counter="{counter}"' in text
+                and figure(text, "macs_drops_total", where="metrics", counter=counter) >= 1
+            )
+
+        await until(lambda: is_counted("slow_request"), every_s=0.6)  # figures are given again for half a second
+        await until(lambda: is_counted("large_request"), every_s=0.6)
 
 
 async def test_one_address_does_not_take_all_places() -> None:
