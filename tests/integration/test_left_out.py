@@ -61,6 +61,31 @@ async def test_a_robot_is_back_when_those_who_claimed_to_be_it_are_gone(router: 
         presence.close()
 
 
+async def test_room_is_used_whenever_it_is_made(router: str, stranger: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who was left out is asked for at once, and again when he is left out and room is made once more before the last
+    question, which waits for long."""
+    monkeypatch.setattr(anew, "PAUSES_S", (0.02, 0.02, 0.02, 600.0))
+    robot = AgentInfo(ROS, 7, 3, "ff")
+    async with await Mesh.open(patient(router)) as mesh:
+        presence = watched(mesh, [])
+        await presence.start()
+        true = stranger.declare_token(robot.presence)
+        await until(lambda: presence.directory.get(ROS, 7) == robot)
+        for time in (1, 2):
+            tokens = [
+                stranger.declare_token(AgentInfo(ROS, 7, 0, f"0{time}{number:02x}").presence)
+                for number in range(Directory.PER_AGENT)
+            ]
+            await until(lambda: len(presence.directory.claimants(ROS, 7)) == Directory.PER_AGENT)
+            await until(lambda time=time: mesh.drops["too_many_claims"] == time)
+            for token in tokens:
+                token.close()
+            await until(lambda: presence.directory.get(ROS, 7) == robot)
+            await until(lambda: presence._anew._next == len(anew.PAUSES_S) - 1)
+        true.close()
+        presence.close()
+
+
 async def test_what_ends_while_it_is_asked_for_does_not_come_back(
     router: str, stranger: Mesh, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -96,7 +121,7 @@ async def test_what_ends_while_it_is_asked_for_does_not_come_back(
 
         monkeypatch.setattr(presence._anew, "ended", watched_end)
         monkeypatch.setattr(mesh, "tokens", late)
-        monkeypatch.setattr(anew, "AGAIN_S", 0.0)
+        monkeypatch.setattr(anew, "PAUSES_S", (0.02, 0.02))
         for token in tokens:
             token.close()
         await until(lambda: len(answers) == 1)
