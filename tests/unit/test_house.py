@@ -62,3 +62,20 @@ def test_what_may_be_larger_exists() -> None:
     """No exception is kept for what has gone."""
     for name in {*LARGER, *(known.split()[0] for known in LONGER)}:
         assert (ROOT / name).exists(), name
+
+
+def test_what_is_in_a_tier_exists() -> None:
+    """Each name of a file or of the beginning of a test is one: who renames a test takes it out of no tier unseen."""
+    tree = ast.parse((ROOT / "tests" / "conftest.py").read_text(encoding="utf-8"))
+    tiers = {
+        node.targets[0].id: ast.literal_eval(node.value)
+        for node in tree.body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id.isupper()
+    }
+    named = [*tiers["ALONE"], *tiers["SOAK"]]
+    assert len(named) > 30
+    for name in named:
+        path, _, test = name.partition("::")
+        assert (ROOT / path).exists(), name
+        begins = f"def {test.partition('[')[0]}"
+        assert not test or begins in (ROOT / path).read_text(encoding="utf-8"), name
