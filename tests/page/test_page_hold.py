@@ -75,6 +75,15 @@ async def test_a_modifier_key_ends_a_hold(site: Site, heard: Heard) -> None:
     await stands(page, heard)
 
 
+async def test_a_pad_that_loses_the_focus_ends_a_hold(site: Site, heard: Heard) -> None:
+    """By keys: who types elsewhere drives nothing, whatever key is down."""
+    page = await site.with_robot()
+    await drives(page, heard, partial(by_key, page))
+    await page.value("document.querySelector('#pad').blur()")
+    await stands(page, heard)
+    await page.page.keyboard.up("ArrowUp")
+
+
 async def test_the_first_button_ends_a_hold_while_another_is_down(site: Site, heard: Heard) -> None:
     """Browsers tell the end of one button as a move while another is down."""
     page = await site.with_robot()

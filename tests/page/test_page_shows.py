@@ -19,9 +19,9 @@ from tests.support.waiting import until
 pytestmark = needs_browser
 
 SIZE = "document.querySelector('#trail canvas').dataset.map"
-OCCUPIED = """(() => {
-  const canvas = document.querySelector('#trail canvas');
-  const wanted = getComputedStyle(canvas).getPropertyValue('--map-occupied').trim().slice(1);
+COLOURED = """(([selector, colour]) => {
+  const canvas = document.querySelector(selector);
+  const wanted = getComputedStyle(canvas).getPropertyValue(colour).trim().slice(1);
   const [red, green, blue] = [0, 2, 4].map((at) => parseInt(wanted.slice(at, at + 2), 16));
   const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
   let found = 0;
@@ -29,14 +29,19 @@ OCCUPIED = """(() => {
     if (data[at] === red && data[at + 1] === green && data[at + 2] === blue) found += 1;
   }
   return found;
-})()"""
-"""How many pixels of the place have the colour of what is occupied."""
+})"""
+"""How many pixels of a canvas have a colour of the page."""
+
+
+async def coloured(page: Watched, selector: str, colour: str) -> int:
+    """As the next frame shows it."""
+    await page.value("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    return int(await page.page.evaluate(COLOURED, [selector, colour]))
 
 
 async def occupied(page: Watched) -> int:
-    """As the next frame shows it."""
-    await page.value("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    return int(await page.value(OCCUPIED))
+    """Pixels of the place where something is."""
+    return await coloured(page, "#trail canvas", "--map-occupied")
 
 
 async def test_a_map_lies_under_the_place(site: Site) -> None:
@@ -56,6 +61,20 @@ async def test_a_map_lies_under_the_place(site: Site) -> None:
     assert await occupied(page) == 0
     await page.page.select_option("#trail-map", "/map")
     await until(pillars)
+
+
+async def test_a_plot_has_the_line_of_its_numbers(site: Site) -> None:
+    """It is drawn, and grows: what is counted as a point is also seen."""
+    page = await site.with_robot()
+    # where the robot stands at 0, 0 the second line covers the first
+    plot = "#plot--pose-pose-position-x-pose-position-y canvas"
+    await page.page.wait_for_selector(plot)
+
+    async def drawn(more_than: int) -> bool:
+        return await coloured(page, plot, "--plot-2") > more_than
+
+    await until(partial(drawn, 10))
+    await until(partial(drawn, await coloured(page, plot, "--plot-2") + 10))
 
 
 async def test_a_large_map_takes_little(site: Site) -> None:
