@@ -61,6 +61,28 @@ class Budget:
         self.used += change
 
 
+class Ever:
+    """Things that are never given back once somebody had them: each holder has at most ``each`` different ones, all
+    together ``total``, as in `Budget`."""
+
+    def __init__(self, *, each: int, total: int) -> None:
+        self._each = each
+        self._total = total
+        self._of: dict[Hashable, set[Hashable]] = {}
+        self.used = 0
+
+    def may(self, holder: Hashable, what: Hashable) -> bool:
+        """Whether somebody may have this, as one who has it already may. What he may have he has from now on."""
+        his = self._of.setdefault(holder, set())
+        if what in his:
+            return True
+        if not may_have_one_more(self.used, len(his), each=self._each, total=self._total):
+            return False
+        his.add(what)
+        self.used += 1
+        return True
+
+
 class Toll:
     """Slows whoever asks for more work than ``per_s``: a quarter of a second's worth is free at once, beyond that each
     piece is paid for with time."""

@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from typing import Any
 
 import pytest
 import zenoh
@@ -20,7 +21,7 @@ from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.mesh import Mesh, Sample
 from macs_zenoh.mesh.outgoing import Outgoing
-from macs_zenoh.protocol.keyexpr import PING
+from macs_zenoh.protocol.keyexpr import PING, UNICAST
 from macs_zenoh.protocol.limits import CALL_BYTES
 from tests.support.local import patient
 from tests.support.routers import Router
@@ -86,6 +87,48 @@ async def test_who_subscribes_later_gets_large_payloads(
             await until(put)
             await until(lambda: len(here) == number)
         assert [end for _, end in here] == [i.to_bytes(4, "big") for i in range(number)]
+
+
+@pytest.mark.parametrize("size", [64, Outgoing.HERE_BYTES, 2 * Outgoing.LARGE_BYTES])
+async def test_who_sends_to_many_gets_publishers_for_some_and_all_of_it_arrives(
+    router: str, size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zenoh never forgets a key that had a publisher, so a sender's others have none; another sender's still have."""
+    monkeypatch.setattr(Outgoing, "OF_SENDER", 16)
+    keys: set[str] = set()
+    here: list[tuple[int, bytes]] = []
+    away: list[tuple[int, bytes]] = []
+    async with (
+        await Mesh.open(MeshSettings(connect=[router])) as mesh,
+        await Mesh.open(MeshSettings(connect=[router])) as other,
+    ):
+        mesh.subscribe(UNICAST.every(type="unity"), keeper(here))
+        other.subscribe(UNICAST.every(type="unity"), keeper(away))
+        await until(lambda: (mesh.put(UNICAST.of(type=2, id=9, from_type=1, from_id=9), b"begin"), away)[1])
+
+        class Counting:
+            """The session, whose publishers are counted."""
+
+            def __getattr__(self, name: str) -> Any:
+                return getattr(session, name)
+
+            def declare_publisher(self, key: str, **way: Any) -> zenoh.Publisher:
+                keys.add(key)
+                declared: zenoh.Publisher = session.declare_publisher(key, **way)
+                return declared
+
+        session = mesh._outgoing._session
+        monkeypatch.setattr(mesh._outgoing, "_session", Counting())
+        sent = []
+        for sender in (7, 8):
+            for again in range(4):
+                for number in range(1, 41):
+                    payload = bytes(size) + f"{sender:2}{again}{number:3}".encode()
+                    mesh.put(UNICAST.of(type=2, id=number, from_type=1, from_id=sender), payload)
+                    sent.append((len(payload), payload[-4:]))
+        await until(lambda: here[-len(sent) :] == sent and away[-len(sent) :] == sent)
+        of = {sender: len([key for key in keys if key.endswith(f"/ros/{sender}")]) for sender in (7, 8)}
+        assert of == {7: 16, 8: 16}
 
 
 async def test_a_lost_router_costs_nothing_between_agents_of_one_program() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from macs_zenoh.protocol.budget import Budget, Toll, Unfinished
+from macs_zenoh.protocol.budget import Budget, Ever, Toll, Unfinished
 
 
 def test_each_address_and_all_have_bounds() -> None:
@@ -30,6 +30,22 @@ def test_the_last_quarter_is_for_those_who_have_little() -> None:
     budget.set("a", "x", 0)
     assert (budget.used, budget.of("a"), budget.of("b")) == (16, 0, 16)
     assert budget.judge("b", "y", 16) is None
+
+
+@given(st.lists(st.tuples(st.integers(1, 4), st.integers(1, 40)), max_size=200))
+def test_what_somebody_had_once_he_may_have_again(story: list[tuple[int, int]]) -> None:
+    """Of different things each has at most so many, and all so many; the same one again costs nothing."""
+    ever = Ever(each=16, total=30)
+    had: dict[int, set[int]] = {holder: set() for holder in range(1, 5)}
+    for holder, what in story:
+        before = what in had[holder]
+        if ever.may(holder, what):
+            had[holder].add(what)
+        else:
+            assert not before
+    assert max(len(his) for his in had.values()) <= 16
+    assert ever.used == sum(len(his) for his in had.values()) <= 30
+    assert ever.may("somebody else", 1) == (ever.used < 30)
 
 
 @given(st.lists(st.tuples(st.integers(1, 5), st.integers(0, 20)), max_size=60))
