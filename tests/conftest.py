@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import sys
+import zlib
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from hypothesis import HealthCheck, settings
 
 from tests.support.isolation import isolate
 from tests.support.patience import be_patient
-from tests.support.thorough import examples
+from tests.support.thorough import PART, examples
 
 NEED_ROS_TESTS = "MACS_NEED_ROS_TESTS"
 """Set by ``make test`` and CI: a run in which no ROS test passed is a failed run."""
@@ -56,9 +57,16 @@ SOAK = (
     "tests/integration/test_nothing_lost.py::test_large_frames",
     "tests/integration/test_nothing_lost.py::test_many_destinations",
     "tests/integration/test_nothing_lost.py::test_slower_receivers_in_a_group",
+    "tests/integration/test_operator.py::test_an_answer_that_makes_no_sense",
+    "tests/integration/test_operator.py::test_numbers_that_are_none",
+    "tests/integration/test_output.py::test_json_is_json",
     "tests/integration/test_page_load.py",
     "tests/integration/test_page_many.py",
     "tests/integration/test_security_web.py::test_chromium",
+    "tests/integration/test_wrong_port.py::test_why_no_router_answers",
+    "tests/integration/test_rmw_mirrors.py::test_each_robot",
+    "tests/integration/test_rmw_secured.py::test_the_check",
+    "tests/integration/test_trace_hops.py::test_a_slow_link",
     "tests/integration/test_router_links.py::test_a_link_that_flaps",
     "tests/page/test_macs_js.py::test_it_conforms_in_chromium[page]",
     "tests/page/test_macs_js.py::test_it_conforms_in_node",
@@ -88,12 +96,18 @@ SOAK = (
     "tests/ros/test_secured_verbs.py",
     "tests/ros/test_tutorial_page.py",
     "tests/ros/test_typed_values.py",
+    "tests/ros/test_unity_page.py::test_every_command_runs",
     "tests/ros/test_unity_cdr.py",
     "tests/ros/test_up_demo.py::test_the_demo_drives",
     "tests/ros/test_up_demo.py::test_the_demo_leaves",
     "tests/ros/test_up_demo.py::test_two_demos",
 )
 """What takes minutes, and seldom finds what others do not: marked ``soak``, run by ``make test-all`` and CI."""
+
+FAMILY = range(3, 16)
+"""So many cases of one test are programs started so many times, and one in `PART` of them is in ``make test``, another
+one in each test: of four ports, say, each test has one. More are rows of a table, and cheap; so are those of
+tests/unit."""
 
 LOGGERS = ("macs", "macs.mesh", "macs.demo")
 """Those whose level our programs set."""
@@ -159,6 +173,21 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.alone)
         if item.nodeid.startswith(SOAK):
             item.add_marker(pytest.mark.soak)
+    for name, cases in _families(items).items():
+        chosen = zlib.crc32(name.encode()) % min(PART, len(cases))
+        for number, item in enumerate(cases):
+            if number % PART != chosen:
+                item.add_marker(pytest.mark.soak)
+
+
+def _families(items: list[pytest.Item]) -> dict[str, list[pytest.Item]]:
+    """Tests with several cases, by their names."""
+    found: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        name, _, case = item.nodeid.partition("[")
+        if case and not name.startswith("tests/unit/") and not item.get_closest_marker("soak"):
+            found.setdefault(name, []).append(item)
+    return {name: cases for name, cases in found.items() if len(cases) in FAMILY}
 
 
 @pytest.fixture(scope="session", autouse=True)
