@@ -26,6 +26,7 @@ import socket
 import ssl
 from pathlib import Path
 
+from bridge import memory
 from bridge.cli import options, running
 from bridge.cli.amounts import pattern
 from bridge.settings import Settings
@@ -82,6 +83,7 @@ def run(args: argparse.Namespace) -> int:
     if args.principal is not None and not args.principal.joins:
         raise UsageError("it is online: --as unity/5, or another agent with an id")
     settings = options.settings(args)
+    memory.give_back()
     return running.until_stopped(lambda: _show(args, settings))
 
 

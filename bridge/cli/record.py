@@ -37,6 +37,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bridge import memory
 from bridge.cli import amounts, options, output, running
 from bridge.cli.amounts import pattern, seconds, size
 from bridge.cli.named import number
@@ -99,6 +100,8 @@ def run(args: argparse.Namespace) -> int:
     settings = options.settings(args)
     if args.serve is not None:
         return _serve(args, settings)
+    memory.give_back()
+    memory.collect_seldom()
     os.nice(settings.record.nice)  # before there are threads: each has its own
     return running.until_stopped(lambda: _record(args, settings))
 

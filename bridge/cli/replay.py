@@ -34,6 +34,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bridge import memory
 from bridge.cli import options, output, running
 from bridge.cli.amounts import pattern, seconds
 from bridge.settings import Settings
@@ -80,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
     if order.commands_to or order.own_names:
         _confirm(order.commands_to or order.own_names, args.confirm, order.to)
     settings = options.settings(args)
+    memory.give_back()
     return running.until_stopped(lambda: _replay(order, settings))
 
 

@@ -12,7 +12,7 @@ import os
 import struct
 import zlib
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from mcap.data_stream import RecordBuilder
@@ -39,6 +39,8 @@ CHUNK_BYTES = 2 << 20
 REMEMBERED = 256
 """So many chunks can be given up, where the disk has no room for the index."""
 COMPRESSIONS = ("zstd", "lz4", "none")
+LARGE_BYTES = 64 << 10
+"""A message of so much is written from where it is, without a copy in between."""
 SAMPLES, SAMPLE_BYTES = 3, 16 << 10
 """So much of a chunk is tried first: what gets no smaller, as pictures that are compressed or full of noise, is
 written as it is, for a tenth of the time."""
@@ -233,32 +235,44 @@ class McapFile:
         is as before."""
         if not self._pieces:
             return
-        raw = b"".join(self._pieces)
+        raw = _blocks(self._pieces)
         entries, start_ns, end_ns = self._entries, self._start_ns, self._end_ns
         self._pieces, self._entries, self._pending = [], {}, 0
         compression = self._compression if self._gets_smaller(raw) else ""
+        if compression:
+            raw = [b"".join(raw)]
+        data = [self._compress(raw[0])] if compression else raw
         try:
-            self.add_chunk(raw, self._compress(raw) if compression else raw, compression, entries, start_ns, end_ns)
+            self.add_chunk(raw, data, compression, entries, start_ns, end_ns)
         except OSError:
             self.lost += sum(len(times) // 2 for times in entries.values())
             raise
 
     def add_chunk(
-        self, raw: bytes, data: bytes, compression: str, entries: Mapping[int, list[int]], start_ns: int, end_ns: int
+        self,
+        raw: Sequence[bytes],
+        data: Sequence[bytes],
+        compression: str,
+        entries: Mapping[int, list[int]],
+        start_ns: int,
+        end_ns: int,
     ) -> None:
-        """A whole chunk: its messages as they are, and as they are written; ``entries`` are by channel time, offset,
-        time, offset, …"""
-        name = compression.encode()
-        length = 8 + 8 + 8 + 4 + 4 + len(name) + 8 + len(data)
+        """A whole chunk, in pieces: its messages as they are, and as they are written; ``entries`` are by channel
+        time, offset, time, offset, …"""
+        name, raw_bytes, data_bytes = compression.encode(), sum(map(len, raw)), sum(map(len, data))
+        length = 8 + 8 + 8 + 4 + 4 + len(name) + 8 + data_bytes
+        crc = 0
+        for piece in raw:
+            crc = zlib.crc32(piece, crc)
         head = b"".join(
             (
-                _CHUNK.pack(Opcode.CHUNK, length, start_ns, end_ns, len(raw), zlib.crc32(raw)),
+                _CHUNK.pack(Opcode.CHUNK, length, start_ns, end_ns, raw_bytes, crc),
                 _U32.pack(len(name)),
                 name,
-                _U64.pack(len(data)),
+                _U64.pack(data_bytes),
             )
         )
-        chunk_bytes = len(head) + len(data)
+        chunk_bytes = len(head) + data_bytes
         at, offsets, indexes = self._at + chunk_bytes, {}, []
         for channel, times in entries.items():
             record = _INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(times), channel, 8 * len(times))
@@ -270,14 +284,14 @@ class McapFile:
             chunk_length=chunk_bytes,
             chunk_start_offset=self._at,
             compression=compression,
-            compressed_size=len(data),
+            compressed_size=data_bytes,
             message_end_time=end_ns,
             message_index_length=at - self._at - chunk_bytes,
             message_index_offsets=offsets,
             message_start_time=start_ns,
-            uncompressed_size=len(raw),
+            uncompressed_size=raw_bytes,
         )
-        self._write(head, data, b"".join(indexes))
+        self._write(head, *data, b"".join(indexes))
         self.index.add_chunk(index, {channel: len(times) // 2 for channel, times in entries.items()})
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
@@ -335,12 +349,13 @@ class McapFile:
         os.ftruncate(self._file, self._at)
         os.lseek(self._file, self._at, os.SEEK_SET)
 
-    def _gets_smaller(self, raw: bytes) -> bool:
+    def _gets_smaller(self, raw: Sequence[bytes]) -> bool:
         """Whether it is worth the time to make a chunk smaller, as pieces of it tell."""
-        if not self._compression or len(raw) <= SAMPLES * SAMPLE_BYTES:
+        size = sum(map(len, raw))
+        if not self._compression or size <= SAMPLES * SAMPLE_BYTES:
             return bool(self._compression)
-        step = (len(raw) - SAMPLE_BYTES) // (SAMPLES - 1)
-        sample = b"".join(raw[at : at + SAMPLE_BYTES] for at in range(0, len(raw), step))
+        step = (size - SAMPLE_BYTES) // (SAMPLES - 1)
+        sample = b"".join(_cut(raw, at, at + SAMPLE_BYTES) for at in range(0, size, step))
         return len(self._compress(sample)) <= WORTH * len(sample)
 
     def _write(self, *pieces: bytes) -> None:
@@ -360,6 +375,33 @@ class McapFile:
             os.lseek(self._file, self._at, os.SEEK_SET)
             raise
         self._at += written
+
+
+def _blocks(pieces: Sequence[bytes]) -> list[bytes]:
+    """The same in fewer pieces, none of which is both copied and large."""
+    blocks: list[bytes] = []
+    small: list[bytes] = []
+    for piece in pieces:
+        if len(piece) < LARGE_BYTES:
+            small.append(piece)
+            continue
+        if small:
+            blocks.append(b"".join(small))
+            small = []
+        blocks.append(piece)
+    if small:
+        blocks.append(b"".join(small))
+    return blocks
+
+
+def _cut(pieces: Sequence[bytes], start: int, end: int) -> bytes:
+    """Of what pieces are together, from here to there."""
+    cut, at = [], 0
+    for piece in pieces:
+        if at < end and start < at + len(piece):
+            cut.append(piece[max(0, start - at) : end - at])
+        at += len(piece)
+    return b"".join(cut)
 
 
 def _bytes(*records: McapRecord) -> bytes:

@@ -186,7 +186,7 @@ def _put_chunk(file: McapFile, raw: bytes, packed: bytes, compression: str) -> N
             times.append(message.log_ns)
         elif opcode in (SCHEMA, CHANNEL):
             _take_name(file, opcode, raw[at : at + length], is_in_chunk=True)
-    file.add_chunk(raw, packed, compression, entries, min(times, default=0), max(times, default=0))
+    file.add_chunk([raw], [packed], compression, entries, min(times, default=0), max(times, default=0))
 
 
 def problems(path: Path, progress: Progress = quiet) -> list[str]:

@@ -21,7 +21,7 @@ from rosbags.highlevel import AnyReader
 from bridge.recording import repair as repairing
 from bridge.recording.bag import BadBag, Bag, Unfinished
 from bridge.recording.disk import Disk, Plan
-from bridge.recording.mcap_file import COMPRESSIONS, MAGIC, McapFile
+from bridge.recording.mcap_file import CHUNK_BYTES, COMPRESSIONS, LARGE_BYTES, MAGIC, McapFile
 from bridge.recording.rosbag2 import ros_name
 from bridge.recording.serving.folder import Folder
 from bridge.recording.streams import (
@@ -94,6 +94,36 @@ def test_others_read_what_is_written(tmp_path: Path, compression: str) -> None:
         assert texts(bag) == expected
         assert (bag.start_ns, bag.end_ns) == (BEGIN, BEGIN + 2999 * S // 100)
         assert texts(bag, start_ns=BEGIN + 10 * S, end_ns=BEGIN + 11 * S) == expected[1000:1100]
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+@pytest.mark.parametrize("noisy", [True, False])
+def test_large_messages_are_read_among_small_ones(tmp_path: Path, compression: str, noisy: bool) -> None:
+    """Also where several share a chunk, and one is more than a chunk: in their order, with the chunks' checksums."""
+    path = tmp_path / "a.mcap"
+    file = McapFile(path, compression=compression)
+    channel = file.channel("/7/image", "json", 0, {})
+    sizes = [
+        10,
+        LARGE_BYTES,
+        100,
+        200,
+        LARGE_BYTES + 1,
+        LARGE_BYTES,
+        2 * CHUNK_BYTES,
+        *[50] * 3000,
+        LARGE_BYTES * 3,
+        1,
+        0,
+    ]
+    messages = [os.urandom(size) if noisy else b"\x07" * size for size in sizes]
+    for number, data in enumerate(messages):
+        file.add(channel, number, BEGIN + number, 0, data)
+    file.close()
+    with path.open("rb") as stream:
+        read = [message.data for _, _, message in make_reader(stream, validate_crcs=True).iter_messages()]
+    assert read == messages
+    assert (path.stat().st_size < sum(sizes) // 2) == (not noisy and compression != "none")
 
 
 def test_others_files_are_read(tmp_path: Path) -> None:
