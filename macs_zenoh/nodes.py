@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
-import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
@@ -84,8 +83,10 @@ Asked = tuple[str, frozenset[int], frozenset[int], str | None]
 class Nodes:
     """The interface nodes that one agent uses. Made when it uses the first."""
 
-    def __init__(self, agent: Agent, layout: Layout) -> None:
+    def __init__(self, agent: Agent, layout: Layout, *, patient: bool = False) -> None:
+        """``patient``: topics may come a hundredth of a second later, which costs less."""
         self.agent = agent
+        self._patient = patient
         self._nodes: dict[NodeKey, Node] = {}
         self._streams: dict[tuple[int, str], Declared] = {}
         self._reader = StreamReader(layout, self._bad_frame)
@@ -363,7 +364,7 @@ class Nodes:
             elif (robot, name) not in self._streams:
                 key = STREAM.of(type=ROS, id=robot, node=name)
                 take = partial(self._take_data, robot, name)
-                self._streams[robot, name] = self.agent.mesh.subscribe(key, take, reliable=True)
+                self._streams[robot, name] = self.agent.mesh.subscribe(key, take, reliable=True, patient=self._patient)
 
     def _take_data(self, robot: int, name: str, batch: Iterator[Sample]) -> None:
         for key, payload in batch:
@@ -371,7 +372,7 @@ class Nodes:
             data = self._reader.read(key, name, payload, self.agent.key)
             if node is None or not data:
                 continue
-            of_type, now = node.wanted.data_exchange_type, time.monotonic()
+            of_type, now = node.wanted.data_exchange_type, self.agent.mesh.came_s
             messages = [TopicMessage(robot, node.topic, of_type, cdr, self.types, now) for cdr in data]
             self._late.hold(node, robot, messages)
             for user in list(node.users):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable, Iterator
 
 from bridge.recording.disk import Entry, Sink, now_ns
@@ -72,7 +73,7 @@ class RobotFollower:
         self._on_stop_state = on_stop_state
         self._on_offered = on_offered
         self._layout = Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots)
-        self._nodes = Nodes(agent, self._layout)
+        self._nodes = Nodes(agent, self._layout, patient=True)
         self._following: dict[str, asyncio.Task[None]] = {}
         self._stop_topic = ""
         key = STREAM.of(type=ROS, id=robot, node=OFFERS_STREAM)
@@ -190,7 +191,8 @@ class RobotFollower:
 
         def take(message: TopicMessage) -> None:
             data = message.data
-            put(Entry(channel, channel.next(len(data)), now_ns(), data, keep))
+            ago_s = time.monotonic() - message.received_s
+            put(Entry(channel, channel.next(len(data)), now_ns() - int(ago_s * 1e9), data, keep))
             if on_message is not None:
                 on_message()
 

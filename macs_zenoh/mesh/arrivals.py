@@ -97,6 +97,8 @@ class Arrivals:
     PATIENCE_S = 0.1
     AT_ONCE_BYTES = 128 << 10
     """Larger ones take too long for a thread that reads from the link."""
+    PATIENT_S = 0.01
+    """So long samples may wait whose subscription is patient: to wake the loop for each costs more than the rest."""
     CALM_S = 0.0003
     """So long after the one before, a sample counts as a single one."""
 
@@ -119,6 +121,10 @@ class Arrivals:
         self.looped = 0
         """How many of these the loop's own thread has put."""
         self._waiting = False
+        self._resting = False
+        """Whether the loop is woken a little later, for patient subscriptions."""
+        self.came_s: float | None = None
+        """When the sample came that is being handled, by the monotonic clock: of patient subscriptions."""
         self._handled: tuple[Any, ...] | None = None
         """The sample that is being handled."""
         self._large_bytes = 0
@@ -147,13 +153,16 @@ class Arrivals:
         on_numbered: OnNumbered | None = None,
         *,
         at_once: AtOnce | None = None,
+        patient: bool = False,
         traced: bool = True,
     ) -> Callable[[zenoh.Sample], bool]:
         """What Zenoh calls, in whatever thread, for each sample of one subscription; whether there was room for it.
         Samples that their source has numbered go to ``on_numbered``, if it is given; others are offered to
-        ``at_once`` first. ``traced``: those that are marked, while anybody wants to know, are noted."""
+        ``at_once`` first. ``patient``: those without a number are handled within ``PATIENT_S``, several at a time, and
+        `came_s` has when each came. ``traced``: those that are marked, while anybody wants to know, are noted."""
         looks = self._tracing.looks if traced else ()
         others, mine, limit, large, own = self._queue, self._mine, self.TOPICS_LIMIT, self.LARGE_BYTES, self._own
+        with_time = self._with_time(on_batch) if patient else None
 
         def receive(sample: zenoh.Sample) -> bool:
             if looks and sample.attachment is not None and (trace := self._tracing.begin(sample)) is not None:
@@ -179,6 +188,12 @@ class Arrivals:
                 return False
             self.looped += looped
             if info is None or on_numbered is None:
+                if with_time is not None:
+                    queue.append((with_time, (key, payload, time.monotonic()), looped))
+                    if not (self._waiting or self._resting):
+                        self._resting = True
+                        self._wake(self._rest)
+                    return True
                 queue.append((on_batch, (key, payload), looped))
             else:
                 source = f"{info.source_id.zid}/{info.source_id.eid}"
@@ -251,6 +266,30 @@ class Arrivals:
         except Exception:
             log.exception("handling a sample failed")  # it may have been half done: not once more
             return True
+
+    def _with_time(self, on_batch: OnBatch) -> Callable[[Iterator[tuple[str, Payload, float]]], None]:
+        """A handler of samples with the time at which each came: `came_s` while it is handled."""
+
+        def each(samples: Iterator[tuple[str, Payload, float]]) -> Iterator[Sample]:
+            for key, payload, came_s in samples:
+                self.came_s = came_s
+                yield key, payload
+
+        def handle(samples: Iterator[tuple[str, Payload, float]]) -> None:
+            try:
+                on_batch(each(samples))
+            finally:
+                self.came_s = None
+
+        return handle
+
+    def _rest(self) -> None:
+        self._loop.call_later(self.PATIENT_S, self._rested)
+
+    def _rested(self) -> None:
+        self._resting = False
+        if not self._waiting:
+            self._deliver()
 
     def mark(self, on_mark: OnBatch) -> None:
         """Call ``on_mark`` on the loop after all that has arrived so far. From any thread."""

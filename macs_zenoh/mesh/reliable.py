@@ -38,6 +38,7 @@ class Recovered:
         on_miss: OnMiss,
         *,
         at_once: AtOnce | None,
+        patient: bool,
         linked: bool,
         on_close: Callable[[Recovered], None],
     ) -> None:
@@ -49,6 +50,7 @@ class Recovered:
         self._key = key
         self._on_batch = on_batch
         self._at_once = at_once
+        self._patient = patient
         self._on_miss = on_miss
         self._recovery = Recovery()
         self._deadline = Deadline(lambda: self._go_on([]))
@@ -59,7 +61,7 @@ class Recovered:
     def declare(self) -> Subscription:
         """Subscribe, and learn how far those sources are that exist."""
         session, arrivals = self._session, self._arrivals
-        receive = arrivals.receiver(self._on_batch, self._on_numbered, at_once=self._at_once)
+        receive = arrivals.receiver(self._on_batch, self._on_numbered, at_once=self._at_once, patient=self._patient)
         samples = zenoh.handlers.Callback(receive, indirect=False)
         beat = arrivals.receiver(self._on_heartbeat)
         heartbeats = zenoh.handlers.Callback(beat, indirect=False)

@@ -6,7 +6,6 @@ import asyncio
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import TracebackType
@@ -34,14 +33,11 @@ from .opening import open_now, open_session
 from .outgoing import Outgoing
 from .panics import call, end_on_panics, last_words, watched
 from .reliable import Recovered
-from .threads import keep_attached
+from .token_news import TokenNews
 from .tracing import Tracing
 from .zenoh_config import check_files, first_line, id_is_chosen, insert, zenoh_config
 
 log = logging.getLogger("macs.mesh")
-
-TOKENS_AT_ONCE = 200
-"""So many tokens are told of without a break."""
 
 BEAT_S = 5.0
 """How often it is tried whether Zenoh still works in this process."""
@@ -334,6 +330,7 @@ class Mesh:
         at_once: AtOnce | None = None,
         reliable: bool = False,
         on_miss: OnMiss | None = None,
+        patient: bool = False,
     ) -> Subscription:
         """Receive samples in batches. What one sender put is received in its order, over all subscriptions of this
         mesh, as long as it was put with one kind of traffic.
@@ -344,6 +341,9 @@ class Mesh:
         ``reliable``: what a source keeps (`keep`) is received in order and once, also through outages. Samples that
         it has no more are counted as ``missed``, and ``on_miss(key, count)`` hears of them. What sources do not keep
         is received as without it.
+
+        ``patient``: to handle them a hundredth of a second later is soon enough, which costs less; `came_s` says when
+        one came.
         """
         if reliable:
             recovered = Recovered(
@@ -353,13 +353,20 @@ class Mesh:
                 on_batch,
                 partial(self._lost, on_miss),
                 at_once=at_once,
+                patient=patient,
                 linked=self.linked,
                 on_close=self._recovered.discard,
             )
             self._recovered.add(recovered)
             return recovered.declare()
-        receive = self._arrivals.receiver(on_batch, at_once=at_once)
+        receive = self._arrivals.receiver(on_batch, at_once=at_once, patient=patient)
         return Subscription(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+
+    @property
+    def came_s(self) -> float:
+        """When the sample that is being handled came, by the monotonic clock; as far as that is known, else now."""
+        came_s = self._arrivals.came_s
+        return time.monotonic() if came_s is None else came_s
 
     def subscribe_guarded(self, key: str, on_aged: OnAged, gate: Gate) -> Subscription:
         """Receive samples in batches, in the same order as with `subscribe`; ``gate`` judges each in the thread of
@@ -459,34 +466,10 @@ class Mesh:
 
     def watch_tokens(self, key: str, on_change: Callable[[str, bool], None]) -> Subscription:
         """Call ``on_change(key, alive)`` for every token that exists, comes or goes."""
-        news: deque[tuple[str, bool]] = deque()
-        lock, waking = threading.Lock(), False
-
-        def receive(sample: zenoh.Sample) -> None:
-            nonlocal waking
-            keep_attached()
-            with lock:  # Zenoh calls from more than one thread
-                news.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
-                awake, waking = waking, True
-            if not awake:  # to wake the loop for each costs more than the rest
-                self._from_thread(tell)
-
-        def tell() -> None:
-            nonlocal waking
-            try:
-                for _ in range(TOKENS_AT_ONCE):
-                    if not news:
-                        return
-                    on_change(*news.popleft())
-            finally:
-                with lock:
-                    more = waking = bool(news)
-                if more:
-                    self._loop.call_soon(tell)
-
+        news = TokenNews(self._loop, self._from_thread, on_change)
         return Subscription(
             self._session.liveliness().declare_subscriber(
-                key, zenoh.handlers.Callback(receive, indirect=False), history=True
+                key, zenoh.handlers.Callback(news.receive, indirect=False), history=True
             )
         )
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from macs_zenoh.mesh import Mesh, session
+from macs_zenoh.mesh import Mesh, token_news
 from macs_zenoh.protocol.keyexpr import LEASE
 from tests.support.local import patient
 from tests.support.waiting import until
@@ -47,7 +47,7 @@ async def test_two_threads_bring_one_each_in_the_same_moment(router: str, monkey
         return called(receive, **arguments)
 
     async with await Mesh.open(patient(router)) as mesh:
-        monkeypatch.setattr(session, "deque", Meeting)
+        monkeypatch.setattr(token_news, "deque", Meeting)
         monkeypatch.setattr(zenoh.handlers, "Callback", callback)
         watching = mesh.watch_tokens(LEASE.every(), lambda key, alive: told.add(key))
         monkeypatch.undo()
