@@ -28,9 +28,9 @@ class RecordSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     """So many files a ring writes by itself and for agents, then only for a signal: no robot fills the disk."""
     allow: list[AgentPattern] = []
     """Who may have the verb ``record`` write a ring or end the recording. Everybody may ask how it is getting on."""
-    nice: Annotated[int, Meta(ge=0, le=19)] = 10
-    """How far it steps back for others where processors are few, as `nice` has it: what is recorded waits in memory,
-    what a headset sees and commands does not. 0: not at all."""
+    nice: Annotated[int, Meta(ge=0, le=19)] = 0
+    """How far it steps back for others where processors are few, as `nice` has it. Where they are full all the time it
+    then takes too slowly what its router has for it, and who waits for that router waits as well."""
     folder_bytes: Annotated[int, Meta(ge=1 << 20, le=1 << 50)] = 50 * 1024 * 1024 * 1024
     """`--serve` begins no file when its folder has so much, and ends those that are written, of its ring too."""
     replay_first_id: Annotated[int, Meta(ge=1, le=0xFFFF)] = 65001
