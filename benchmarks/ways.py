@@ -54,6 +54,10 @@ class Tls(_Like):
             raise BlockingIOError from error
 
 
+HEADER_BYTES = 10
+"""So much at most a WebSocket message from a gateway has before what it carries."""
+
+
 class WebSocket(_Like):
     """Binary messages in both directions, and of what comes only what they carry."""
 
@@ -62,6 +66,10 @@ class WebSocket(_Like):
         self.raw = sock
         self._left = 0
         """Of the message that has begun."""
+        self._ahead = bytearray()
+        """What came behind the last message: the next one's header. To ask for that alone would be two more system
+        calls for each message."""
+        self._header = memoryview(bytearray(HEADER_BYTES))
         lines = [
             f"GET {WEBSOCKET_PATH} HTTP/1.1",
             f"Host: 127.0.0.1:{port}",
@@ -105,7 +113,18 @@ class WebSocket(_Like):
             elif size == 127:
                 (size,) = struct.unpack("!Q", self._exactly(8))
             self._left = size
-        got = int(self._sock.recv_into(memoryview(buffer)[: self._left]))
+        room = memoryview(buffer)[: self._left]
+        if self._ahead:  # of a small message not only the header
+            got = min(len(room), len(self._ahead))
+            room[:got] = self._ahead[:got]
+            del self._ahead[:got]
+            self._left -= got
+            return got
+        wanted = [room, self._header] if len(room) == self._left else [room]
+        got = int(self._sock.recvmsg_into(wanted)[0])
+        if got > self._left:
+            self._ahead += self._header[: got - self._left]
+            got = self._left
         self._left -= got
         return got
 
@@ -121,10 +140,12 @@ class WebSocket(_Like):
         self._sock.sendall(piece[sent - len(header) :])
 
     def _exactly(self, size: int) -> bytes:
-        data = b""
+        data = self._ahead
         while len(data) < size:
             got = self._sock.recv(size - len(data))
             if not got:
                 return b""
             data += got
-        return data
+        found = bytes(data[:size])
+        del data[:size]
+        return found
