@@ -17,7 +17,9 @@ def test_each_question_has_a_place() -> None:
     assert len({path for _, path, _ in rows}) >= 10
     for question, path, name in rows:
         source = (ROOT / path).read_text(encoding="utf-8")
-        assert re.search(rf"^\s*(?:class|def|async def) {name}\b|^\s*{name}\b.* = ", source, re.MULTILINE), question
+        assert re.search(
+            rf"^\s*(?:class|export class|def|async def) {name}\b|^\s*{name}\b.* = ", source, re.MULTILINE
+        ), question
 
 
 def test_each_pure_module_has_a_file_of_tests() -> None:

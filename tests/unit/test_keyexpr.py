@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from macs_zenoh.errors import UsageError
-from macs_zenoh.protocol import key_expressions, keyexpr
-from macs_zenoh.protocol.key_expressions import expression_problem, fits
+from macs_zenoh.protocol import keyexpr
+from macs_zenoh.protocol.key_expressions import fits
 from macs_zenoh.protocol.key_fields import StreamFields
 from macs_zenoh.protocol.keyexpr import (
     CALL,
@@ -324,38 +324,6 @@ def test_the_block_of_an_id_is_its_high_byte() -> None:
     assert [block_of(agent_id) for agent_id in (0, 1, 255, 256, 511, 512, 65535)] == [0, 0, 0, 1, 1, 2, 255]
 
 
-# -- expressions that people write -----------------------------------------------------------------------------------
-
-expressions = st.text("ab@*$/?#", max_size=9) | st.lists(
-    st.sampled_from(["*", "**", "a", "b", "ab", "@a", "a$*", "$*b", "a$*b", "$*", "@$*", "@a$*"]),
-    min_size=1,
-    max_size=5,
-).map("/".join)
-"""What may be a key expression or not, wildcards and all."""
-
-keys = st.lists(st.sampled_from(["a", "b", "ab", "aab", "@a", "@ab", "@"]), min_size=1, max_size=5).map("/".join)
-
-
-@settings(max_examples=examples(500), deadline=None)
-@given(text=expressions)
-def test_what_zenoh_takes_for_an_expression_is_known_without_it(text: str) -> None:
-    """Whatever is not a key expression in canonical form to Zenoh is refused with a reason, and nothing else is."""
-    try:
-        zenoh.KeyExpr(text)
-    except zenoh.ZError:
-        assert expression_problem(text)
-    else:
-        assert expression_problem(text) is None
-
-
-@settings(max_examples=examples(1000), deadline=None)
-@given(text=expressions.filter(lambda text: expression_problem(text) is None), key=keys)
-def test_a_key_fits_an_expression_as_zenoh_says(text: str, key: str) -> None:
-    """A key is among those of an expression exactly if it is to Zenoh, with all its wildcards and verbatim chunks."""
-    among = zenoh.KeyExpr(text).intersects(zenoh.KeyExpr(key))
-    assert fits(text, key) == among == zenoh.KeyExpr(text).includes(zenoh.KeyExpr(key))
-
-
 @by_space
 @settings(deadline=None)
 @given(data=st.data())
@@ -365,11 +333,6 @@ def test_a_key_of_ours_fits_what_every_gives(space_name: str, data: st.DataObjec
     fields = data.draw(fields_of(space))
     some = data.draw(st.sets(st.sampled_from(space.fields)))
     assert fits(space.every(**{name: fields[name] for name in some}), space.of(**fields))
-
-
-def test_many_wildcards_cost_little() -> None:
-    """Judging a long key by an expression of many wildcards ends: it tries no combinations."""
-    assert not fits("/".join(["**", "a"] * 30), "/".join(["a"] * 300 + ["b"]))
 
 
 # -- keys beside the table -------------------------------------------------------------------------------------------
@@ -406,18 +369,3 @@ def test_an_expression_for_each_robot() -> None:
     assert keyexpr.of_each("macs/from/ros/7/nd__map", 1, [7, 8]) == ["macs/from/ros/7/nd__map"]
     for other in ("macs/from/ros/*/nd__*", "macs/from/**", "macs/from/unity/*/n"):
         assert keyexpr.of_each(other, 1, [7, 8]) == []
-
-
-def test_expressions_that_another_one_covers_are_left_out() -> None:
-    """Each once, in their order; what is verbatim is covered by no wildcard."""
-    keys = ["macs/all/**", "macs/all/ros/7", "macs/all/**", "macs/all/@adv/**", "macs/group/3/ros"]
-    assert key_expressions.distinct(keys) == ("macs/all/**", "macs/all/@adv/**", "macs/group/3/ros")
-
-
-@pytest.mark.parametrize(
-    ("expression", "begins"),
-    [("macs/from/ros/*/n", "macs/from"), ("macs/**", None), ("macs", None), ("macs/f$*/x", None)],
-)
-def test_how_an_expression_begins(expression: str, begins: str | None) -> None:
-    """Two chunks, where they have no wildcards."""
-    assert key_expressions.begins(expression) == begins
