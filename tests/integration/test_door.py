@@ -794,6 +794,23 @@ async def test_a_flood_leaves_others_their_turn(start_door: StartDoor, what: str
     assert turns_s[-3] < 0.05, turns_s[-5:]  # what is done once is not what a flood costs
 
 
+async def test_a_token_that_is_for_a_robot_now_ends_its_headset(start_door: StartDoor) -> None:
+    """It would stay and be heard by nobody."""
+    door = await start_door(**NOBODY)
+    token = door.tokens.make("anna", may=["ask"], robots=[1])
+    async with await door.come("plain", token) as anna:
+        await until(lambda: list(door.gateway.agents.online()))
+
+        def edit(now):  # type: ignore[no-untyped-def]
+            return now.with_token(
+                Token(name="anna", rights=Rights(may=["robot"]), hashes=now.named("anna").hashes)
+            ), None
+
+        store.change(door.tokens.path, edit)
+        await until(lambda: not anna.connected)
+        await until(lambda: not list(door.gateway.agents.online()))
+
+
 @pytest.mark.parametrize("port", ["plain", "tls", "web"])
 async def test_a_connection_that_ends_leaves_no_circle(start_door: StartDoor, port: str) -> None:
     """What a frame that had begun has taken is given back when its connection ends, and not some time later."""
