@@ -20,6 +20,7 @@ PARTS = (
     "guards",
     "opened",
     "halt",
+    "halt_again",
 )
 
 

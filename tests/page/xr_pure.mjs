@@ -1,11 +1,37 @@
 // node xr_pure.mjs FOLDER-OF-MACS.JS < name of a part: runs the checks of that part; fails with the first that does not hold.
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
+import { mock } from "node:test";
 import { pathToFileURL } from "node:url";
 
 const load = (name) => import(pathToFileURL(`${process.argv[2]}/${name}`));
 const near = (one, other, by = 1e-6) => assert.ok(Math.abs(one - other) <= by, `${one} is not ${other}`);
 const half = Math.SQRT1_2;
+
+/** What begins a stop, whose robots say things, and are asked by `ask` or give their `status`. */
+async function halts() {
+  const { Halt } = await load("shared/halt.js");
+  const me = { may: ["stop"], robots: "any", groups: "any" };
+  return (ask = null) => {
+    const headset = new EventTarget();
+    const node = { robots: new Set(), register() {}, deregister() {} };
+    const sent = [];
+    let take;
+    headset.connected = true;
+    headset.subscribe = (_topic, _type, _options, listener) => ((take = listener), node);
+    headset.advertise = () => ({ ...node, publish: (data, { robots }) => sent.push([data[4], ...robots]) });
+    const status = new Map();
+    const halt = new Halt(headset, me, null, ask ?? (async (robot) => status.get(robot)));
+    const says = (senderId, stopped) => take({ senderId, data: new Uint8Array([0, 1, 0, 0, Number(stopped)]) });
+    const link = (up) => {
+      headset.connected = up;
+      headset.dispatchEvent(new CustomEvent("link", { detail: { up } }));
+    };
+    const words = () => halt.words(headset.connected);
+    const check = () => halt.check(performance.now() + 2000);
+    return { halt, says, link, words, sent, status, check };
+  };
+}
 
 const parts = {
   async axes() {
@@ -297,27 +323,7 @@ const parts = {
   },
 
   async halt() {
-    const { Halt } = await load("shared/halt.js");
-    const me = { may: ["stop"], robots: "any", groups: "any" };
-    const started = (kept = null) => {
-      const headset = new EventTarget();
-      const node = { robots: new Set(), register() {}, deregister() {} };
-      const sent = [];
-      let take;
-      headset.connected = true;
-      headset.subscribe = (_topic, _type, _options, listener) => ((take = listener), node);
-      headset.advertise = () => ({ ...node, publish: (data, { robots }) => sent.push([data[4], ...robots]) });
-      const status = new Map();
-      const halt = new Halt(headset, me, kept, async (robot) => status.get(robot));
-      const says = (senderId, stopped) => take({ senderId, data: new Uint8Array([0, 1, 0, 0, Number(stopped)]) });
-      const link = (up) => {
-        headset.connected = up;
-        headset.dispatchEvent(new CustomEvent("link", { detail: { up } }));
-      };
-      const words = () => halt.words(headset.connected);
-      const check = () => halt.check(performance.now() + 2000);
-      return { halt, says, link, words, sent, status, check };
-    };
+    const started = await halts();
     const stopped = (one) => {
       assert.equal(one.words().state, "stopped");
       assert.match(one.words().text, /^robot 1, 2 stopped after \d+ ms$/);
@@ -383,6 +389,56 @@ const parts = {
     assert.equal(others.words().state, "free", "somebody has let all of them go on");
     others.halt.setOnline([1, 2, 3]);
     assert.equal(others.words().state, "free");
+  },
+
+  async halt_again() {
+    mock.timers.enable({ apis: ["setInterval", "setTimeout"] });
+    const started = await halts();
+    const robots = Array.from({ length: 9 }, (_, at) => at + 1);
+    const one = started();
+    one.halt.setOnline(robots);
+    one.halt.press();
+    const others = robots.slice(1);
+    const later = (ms) => {
+      for (let at = 0; at < ms; at += 50) {
+        mock.timers.tick(50);
+        one.says(others[0], true);
+        others.push(others.shift());
+      }
+    };
+    for (const robot of others) one.says(robot, true);
+    one.sent.length = 0;
+    later(1000);
+    assert.deepEqual(one.sent, Array(5).fill([1, 1]), "every 200 ms, however often others answer");
+    one.halt.again();
+    later(150);
+    assert.equal(one.sent.length, 6, "said at once, and 200 ms after that");
+    later(50);
+    assert.equal(one.sent.length, 7);
+    one.says(1, true);
+    later(1000);
+    assert.equal(one.sent.length, 7, "until it holds");
+    one.halt.setOnline(others);
+    one.halt.setOnline(robots); // it has started anew: a timer of before is none
+    later(400);
+    assert.deepEqual(one.sent.slice(7), Array(3).fill([1, 1]));
+    one.halt.release();
+
+    const open = [];
+    const slow = started((robot) => new Promise((resolve) => open.push(() => resolve(robot > 1))));
+    slow.halt.setOnline(robots);
+    slow.halt.press();
+    for (const round of [1, 2]) {
+      const running = slow.check();
+      for (const robot of robots) {
+        slow.check();
+        assert.equal(open.length, Math.min(3, robots.length - robot + 1), `one round at a time: ${round}, ${robot}`);
+        open.shift()();
+        await new Promise(setImmediate);
+      }
+      await running;
+      assert.deepEqual([open.length, slow.halt.stopped().length], [0, 8]);
+    }
   },
 
   async guards() {

@@ -16,6 +16,8 @@ import { Topics } from "./topics.js";
 const TICK_MS = 250;
 const FOLLOW_MS = 1000;
 const SILENCE_MS = 3000;
+/** A robot that is asked whether it is stopped, and does not say in time, is asked anew. */
+const STATUS_MS = 3000;
 const REPEATED_MS = 5000;
 const RETRY_MS = [50, 100, 200, 300, 500];
 
@@ -36,7 +38,7 @@ class Page {
     this.topics = new Topics(this.headset);
     this.types = new Types("", (url) => this.get(url).then((answer) => answer ?? { error: "the gateway does not answer" }));
     this.tell = (kind, text) => this.#tell(kind, text);
-    this.stop = new Stop(this.headset, this.tell, (path) => this.get(path), me);
+    this.stop = new Stop(this.headset, this.tell, (path) => this.get(path, STATUS_MS), me);
     this.stop.onChange = () => this.robotView?.mark();
     this.online = { robots: [], headsets: [] };
     this.robotView = new RobotView(this);
@@ -58,10 +60,11 @@ class Page {
     requestAnimationFrame(draw);
   }
 
-  /** JSON of the gateway; null while it does not answer. */
-  async get(path) {
+  /** JSON of the gateway; null while it does not answer, or not within `patienceMs`. */
+  async get(path, patienceMs = null) {
     try {
-      const response = await fetch(path, { cache: "no-store" });
+      const signal = patienceMs === null ? null : AbortSignal.timeout(patienceMs);
+      const response = await fetch(path, { cache: "no-store", signal });
       return response.ok ? await response.json() : null;
     } catch {
       return null;

@@ -12,9 +12,10 @@ const TOPIC = "/emergency_stop";
 const TYPE = "std_msgs/Bool";
 const AGAIN_MS = 200;
 const RACE_MS = 1500;
-/** A robot is asked whether it is stopped when for so long nothing was heard of it; so many at a time. */
+/** A robot is asked whether it is stopped when for so long nothing was heard of it; so many in a round, and so many at a time. */
 const CHECK_MS = 1500;
-const CHECKED_AT_ONCE = 16;
+const IN_A_ROUND = 16;
+const AT_A_TIME = 3;
 const TRUE = new Uint8Array([0, 1, 0, 0, 1]);
 const FALSE = new Uint8Array([0, 1, 0, 0, 0]);
 const ANY_GROUP = Array.from({ length: 255 }, (_, at) => at + 1);
@@ -22,7 +23,7 @@ const ANY_GROUP = Array.from({ length: 255 }, (_, at) => at + 1);
 export class Halt extends EventTarget {
   /**
    * `me` is what this token may; `kept` what another page in this tab wrote down: {wanted, known, all}; `ask(robot)` gives what
-   * its status says: whether it is stopped, or undefined.
+   * its status says: whether it is stopped, or undefined, and ends in time.
    */
   constructor(headset, me, kept = null, ask = async () => undefined) {
     super();
@@ -43,6 +44,9 @@ export class Halt extends EventTarget {
     /** robot → when it was heard of last. */
     this.heardAt = new Map();
     this.turn = 0;
+    this.checking = false;
+    /** Until a press is said again; null: nobody waits for that. */
+    this.timer = null;
     this.state = headset.subscribe(TOPIC, TYPE, {}, (message) => this.#take(message));
     this.command = this.may ? headset.advertise(TOPIC, TYPE) : null;
     this.pressedAt = kept ? performance.now() : -Infinity;
@@ -121,19 +125,33 @@ export class Halt extends EventTarget {
     if (!this.said.has(robot)) this.#say(robot, stopped);
   }
 
-  /** What a robot says is lost at times; also to who was away meanwhile. Then it is asked. */
+  /** What a robot says is lost at times; also to who was away meanwhile. Then it is asked, in one round at a time. */
   async check(now = performance.now()) {
-    if (!this.headset.connected) return;
-    const heard = (robot) => Math.max(this.pressedAt, this.heardAt.get(robot) ?? -Infinity);
+    if (!this.headset.connected || this.checking) return;
     const doubted = (robot) => this.wanted.has(robot) || this.said.get(robot) || (this.all && !this.said.has(robot));
-    const due = [...this.online].filter((robot) => doubted(robot) && now - heard(robot) > CHECK_MS);
-    this.turn = due.length > CHECKED_AT_ONCE ? (this.turn + CHECKED_AT_ONCE) % due.length : 0;
-    const asked = [...due.slice(this.turn), ...due.slice(0, this.turn)].slice(0, CHECKED_AT_ONCE);
-    for (const robot of asked) {
-      const before = heard(robot);
-      const stopped = await this.ask(robot);
-      if (typeof stopped === "boolean" && heard(robot) === before && this.online.has(robot)) this.#say(robot, stopped);
+    const due = [...this.online].filter((robot) => doubted(robot) && now - this.#heard(robot) > CHECK_MS);
+    this.turn = due.length > IN_A_ROUND ? (this.turn + IN_A_ROUND) % due.length : 0;
+    const left = [...due.slice(this.turn), ...due.slice(0, this.turn)].slice(0, IN_A_ROUND);
+    const one = async () => {
+      for (let robot = left.shift(); robot !== undefined; robot = left.shift()) await this.#check(robot);
+    };
+    this.checking = true;
+    try {
+      await Promise.all(Array.from({ length: AT_A_TIME }, one));
+    } finally {
+      this.checking = false;
     }
+  }
+
+  async #check(robot) {
+    const before = this.#heard(robot);
+    const stopped = await this.ask(robot);
+    if (typeof stopped === "boolean" && this.#heard(robot) === before && this.online.has(robot)) this.#say(robot, stopped);
+  }
+
+  /** Since when it is to be asked: it was heard of, or a stop was pressed. */
+  #heard(robot) {
+    return Math.max(this.pressedAt, this.heardAt.get(robot) ?? -Infinity);
   }
 
   stopped() {
@@ -180,13 +198,17 @@ export class Halt extends EventTarget {
     this.#changed();
   }
 
-  /** Until each robot has said that it holds. */
+  /** Until each robot has said that it holds; at once, or by a timer that runs on, however often others say something. */
   #send(again = true) {
-    clearTimeout(this.timer);
     for (const robot of this.wanted) if (this.said.get(robot)) this.wanted.delete(robot);
     const online = [...this.wanted].filter((robot) => this.online.has(robot));
     if (again && online.length) this.command?.publish(TRUE, this.#whom(online));
-    if (this.wanted.size && this.may) this.timer = setTimeout(() => this.#send(), AGAIN_MS);
+    const waits = this.wanted.size > 0 && this.may;
+    if (again || !waits) {
+      clearTimeout(this.timer);
+      this.timer = null;
+    }
+    if (waits) this.timer ??= setTimeout(() => this.#send(), AGAIN_MS);
     this.#changed();
   }
 
