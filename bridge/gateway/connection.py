@@ -121,6 +121,8 @@ class Connection(asyncio.BufferedProtocol):
         """Whether that waits for its turn: then the agent is not read from."""
         self._lost = False
         """Whether the socket has ended meanwhile."""
+        self._closed = False
+        """Whether it was closed from here: what it says behind that does not count."""
         self.received_bytes = 0
         self._unfinished = 0
         """What is counted for it of a frame that has begun."""
@@ -303,7 +305,7 @@ class Connection(asyncio.BufferedProtocol):
                 rest, self._rest = self._rest, deque()
                 self._successor.take(chain.from_iterable(rest), began)
                 return
-            if isinstance(event, Joined) and self._transport.is_closing() and not self._lost:
+            if isinstance(event, Joined) and self._closed:
                 self._rest.clear()  # it was not let in, and nothing that it sent before counts
                 return
             if time.monotonic() > began + TURN_S:
@@ -496,8 +498,9 @@ class Connection(asyncio.BufferedProtocol):
 
     def close(self, reason: str) -> None:
         """Send what is gathered, then FIN."""
-        if self._transport.is_closing() and not self.asleep:
+        if self._transport.is_closing() and not (self.asleep or self._lost):
             return
+        self._closed = True
         self._expect_back_no_more()
         if not self.asleep:
             self.peer.lost()
@@ -506,7 +509,7 @@ class Connection(asyncio.BufferedProtocol):
         log.log(level, "%s leaves: %s", self, reason)
         if self.asleep:
             self.abort()
-        else:
+        elif not self._lost:
             self._writer.close(self._write_timeout_s)
 
     def finish(self, reason: str) -> None:

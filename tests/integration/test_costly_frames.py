@@ -7,11 +7,21 @@ import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
+from itertools import chain
 
 from bridge.gateway.connection import Connection
 from bridge.gateway.memory import Memory
 from bridge.gateway.shares import TURN_S
-from macs_zenoh.protocol.messages import ROS, UNITY, Configuration, Metadata, OnlineRequest, encode_management
+from macs_zenoh.protocol.kept import Kept, Room
+from macs_zenoh.protocol.messages import (
+    ROS,
+    UNITY,
+    Configuration,
+    GoOffline,
+    Metadata,
+    OnlineRequest,
+    encode_management,
+)
 from macs_zenoh.protocol.tcp_agent import AskedOnline, Event, Joined, Sent, TcpAgent
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.support.waiting import until
@@ -27,14 +37,19 @@ class Busy:
         self.did: list[tuple[int, str | int]] = []
         self.on_first: Callable[[], None] = lambda: None
         self.came = 0
+        self.connections: list[Connection] = []
+        self.robots_may_come = True
 
     def opened(self, connection: Connection) -> bool:
         self.came += 1
+        self.connections.append(connection)
         connection.greet(TcpAgent(self.came, self.came, time.monotonic()))
         return True
 
     def handle(self, connection: Connection, event: Event) -> None:
         if isinstance(event, Joined):
+            if event.agent_type == ROS and not self.robots_may_come:
+                connection.close("no robot may come")
             return
         assert isinstance(event, AskedOnline)
         self.did.append((connection.agent_id, event.request_id))
@@ -51,7 +66,10 @@ class Busy:
         self.did.append((connection.agent_id, "closed"))
 
     def sleeps(self, connection: Connection) -> bool:
-        return False
+        if connection.returns:
+            self.did.append((connection.agent_id, "asleep"))
+            connection.fall_asleep()
+        return connection.asleep
 
     def __getattr__(self, name: str) -> Callable[..., None]:
         return lambda *args: None
@@ -69,8 +87,8 @@ def said(node: str) -> bytes:
 
 
 @asynccontextmanager
-async def two(busy: Busy) -> AsyncIterator[tuple[socket.socket, socket.socket]]:
-    """Two headsets' sockets, whose connections are configured."""
+async def two(busy: Busy, *, configured: bool = True) -> AsyncIterator[tuple[socket.socket, socket.socket]]:
+    """Two headsets' sockets, whose connections are configured unless otherwise said."""
 
     memory = Memory(64 << 20, 32 << 20)
 
@@ -82,7 +100,7 @@ async def two(busy: Busy) -> AsyncIterator[tuple[socket.socket, socket.socket]]:
     hello = encode_frame(management=encode_management(Configuration(UNITY, 0)))
     with socket.create_connection(address) as one, socket.create_connection(address) as other:
         await until(lambda: busy.came == 2)
-        for each in (one, other):
+        for each in (one, other) if configured else ():
             each.sendall(hello)
         await asyncio.sleep(0)
         yield one, other
@@ -117,3 +135,35 @@ async def test_all_of_it_counts_when_the_connection_ends_meanwhile() -> None:
             one.shutdown(socket.SHUT_RDWR)
         await until(lambda: (1, "closed") in busy.did)
         assert [what for who, what in busy.did if who == 1] == [*range(1, MANY), "stop", "closed"]
+
+
+async def test_who_says_goodbye_does_not_sleep_when_the_connection_ends_meanwhile() -> None:
+    """A socket ends while a goodbye waits for its turn: the agent has left, and is not expected back."""
+    busy = Busy()
+    async with two(busy) as (one, _):
+        (connection,) = (each for each in busy.connections if each.agent_id == 1)
+        connection.expect_back(Kept(1 << 20, 100, Room(1 << 20)))
+        busy.on_first = connection.abort
+        goodbye = encode_frame(management=encode_management(GoOffline()))
+        one.sendall(b"".join(map(question, range(1, MANY))) + goodbye + said("behind"))
+        await until(lambda: busy.did[-1][1] in ("closed", "asleep") if busy.did else False)
+        assert [what for who, what in busy.did if who == 1] == [*range(1, MANY), "closed"]
+
+
+async def test_who_may_not_come_in_says_nothing_when_the_connection_ends_meanwhile() -> None:
+    """A socket ends while a robot's configuration waits for its turn: if it is not let in, nothing of what came
+    before its configuration or behind it goes out."""
+    busy = Busy()
+    busy.robots_may_come = False
+    async with two(busy, configured=False):
+        connection = busy.connections[0]
+        configured = encode_frame(management=encode_management(Configuration(ROS, 0)))
+        data = said("held") + configured + said("behind")
+        space, now = connection.peer.space(), time.monotonic()
+        space[: len(data)] = data
+        del space
+        busy.on_first = connection.abort
+        costly = [AskedOnline(number) for number in range(1, MANY)]
+        connection.take(chain(costly, connection.peer.advance(len(data), now) or ()), now)
+        await until(lambda: (1, "closed") in busy.did)
+        assert [what for who, what in busy.did if who == 1] == [*range(1, MANY), "closed"]
