@@ -47,8 +47,10 @@ class Entry:
         )
         self.churn = Churn()
         ids = len(set(settings.blocks)) * BLOCK_SIZE
-        self._ids = Budget("ids", each=1, per_address=ids - ids // 4, total=EVERY_ID) if ids else None
+        self._ids = Budget("ids", each=1, per_address=ids - ids // 8, total=EVERY_ID) if ids else None
         """Where there are only some: one address never takes all. Who waits for one, or sleeps, counts."""
+        self._most_to_join = ids - ids // 4
+        """Between the two are those who come back: each has another id until it has shown who it was."""
         self._coming: dict[Connection, asyncio.TimerHandle] = {}
         """Who does not even wait for an id yet, since many from there have come and gone."""
         self._waiting = WaitingRoom(settings.handshake_timeout_s, self._no_id)
@@ -110,6 +112,16 @@ class Entry:
             now = time.monotonic()
             self.churn.ended(connection.host, now - connection.greeted_at, now)
 
+    def may_join(self, connection: Connection) -> bool:
+        """Whether a connection, not of somebody who comes back, may have its id for longer than to say who it is."""
+        if self._ids is None or self._ids.at(connection.host) <= self._most_to_join:
+            return True
+        why = f"all at one address may have {self._most_to_join} ids (gateway.blocks)"
+        self._losses.once("too_many_ids", "%s is refused: %s", connection.address, why)
+        self._record.address("refused", connection.address, "too_many_ids", why)
+        connection.close(why)
+        return False
+
     def forget(self, connection: Connection) -> None:
         """Nobody has, or waits for, an id any more for this connection."""
         self._count(connection, 0)
@@ -118,8 +130,10 @@ class Entry:
     def moved(self, connection: Connection) -> Iterator[None]:
         """Within it an agent comes to have another address: its id counts for that."""
         self._count(connection, 0)
-        yield
-        self._count(connection, 1)
+        try:
+            yield
+        finally:
+            self._count(connection, 1)
 
     def _count(self, connection: Connection, ids: int) -> None:
         if self._ids is not None:

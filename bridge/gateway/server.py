@@ -29,11 +29,7 @@ from macs_zenoh.protocol.credit import Credit, Credits
 from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.directory import AgentInfo, Change
 from macs_zenoh.protocol.keyexpr import BROADCAST, STREAM, UNICAST
-from macs_zenoh.protocol.messages import (
-    ROS,
-    UNITY,
-    AccessRefused,
-)
+from macs_zenoh.protocol.messages import ROS, UNITY, AccessRefused
 from macs_zenoh.protocol.rate_limit import TOGETHER, Pace
 from macs_zenoh.protocol.recipient import Recipient, to_agent
 from macs_zenoh.protocol.registrations import AgentKey
@@ -455,6 +451,8 @@ class Gateway:
         self._entry.known(connection)
         if event.agent_type != UNITY and not self._admit(connection):
             return
+        if not self._entry.may_join(connection):
+            return
         self._declarations.declare(connection)
         self._groups.enter(connection)
         self._sleepers.joined(connection)
@@ -478,6 +476,7 @@ class Gateway:
             self.agents.renumber(connection, agent_id)
             self.agents.forget_former((connection.peer.agent_type, before), connection)
             self._leases.give_back(before)
+            self._entry.forget(connection)
         return True
 
     # -- subscriptions -------------------------------------------------------------------------------------------

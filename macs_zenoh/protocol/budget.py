@@ -37,6 +37,10 @@ class Budget:
         """What somebody has."""
         return self._of.get(holder, 0)
 
+    def at(self, address: str) -> int:
+        """What all at one address have."""
+        return self._at.get(address, 0)
+
     def judge(self, holder: Hashable, address: str, more: int = 1) -> str | None:
         """Why somebody at this address may not have ``more`` than now, None when it may."""
         mine = self._of.get(holder, 0)
@@ -73,12 +77,12 @@ class Ever:
 
     def may(self, holder: Hashable, what: Hashable) -> bool:
         """Whether somebody may have this, as one who has it already may. What he may have he has from now on."""
-        his = self._of.setdefault(holder, set())
+        his = self._of.get(holder, ())
         if what in his:
             return True
         if not may_have_one_more(self.used, len(his), each=self._each, total=self._total):
             return False
-        his.add(what)
+        self._of.setdefault(holder, set()).add(what)
         self.used += 1
         return True
 

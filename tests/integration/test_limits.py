@@ -11,19 +11,22 @@ from contextlib import AsyncExitStack, suppress
 import pytest
 
 import macs_zenoh
+from bridge.headset import frames
 from bridge.headset.client import Headset
 from bridge.headset.frames import NodeSpec, registration
 from macs_zenoh.errors import Refused, Unreachable
+from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.messages import (
     Configuration,
     Metadata,
     NodeRefused,
     NodeType,
     StreamData,
+    Welcome,
     decode_data,
     encode_management,
 )
-from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.protocol.wire import encode_frame, encode_message, split_message
 from macs_zenoh.streams import Streams
 from tests.support.gateways import answers, memory_bytes, site
 from tests.support.given import Connect, StartGateway
@@ -150,9 +153,15 @@ async def test_one_address_does_not_take_all_ids(start_gateway: StartGateway) ->
 
     async def connected(host: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter] | None:
         reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port, local_addr=(host, 0))
+        decoder = MessageDecoder()
         with suppress(ConnectionError):
-            if await asyncio.wait_for(reader.read(1), PATIENCE_S):
-                return reader, writer
+            while data := await asyncio.wait_for(reader.read(4096), PATIENCE_S):
+                if messages := decoder.feed(data):
+                    welcome = decode_data(Welcome, split_message(messages[0])[1])
+                    writer.write(frames.configuration(welcome.agent_id, 0, 1, 0, None))
+                    await until(lambda own=welcome.agent_id: gateway.agents.find(2, own) or reader.at_eof())
+                    if not reader.at_eof():
+                        return reader, writer
         writer.close()
         return None
 
@@ -172,6 +181,25 @@ async def test_one_address_does_not_take_all_ids(start_gateway: StartGateway) ->
     for each in (*taken, elsewhere):
         assert each is not None
         each[1].close()
+
+
+async def test_all_of_an_address_come_back_though_it_has_all_ids_that_it_may(
+    start_gateway: StartGateway, connect: Connect
+) -> None:
+    """A hall behind one address loses its Wi-Fi for a moment: each needs another id until it has shown who it was."""
+    gateway = await start_gateway(blocks=[3])
+    headsets = [await connect(gateway, reconnect=True) for _ in range(192)]
+    ids = [headset.id for headset in headsets]
+    await until(lambda: all(headset._session and headset._session.secret for headset in headsets))
+    for headset in headsets:
+        headset.drop_connection()
+    await until(lambda: not any(headset.connected for headset in headsets))
+    await until(lambda: all(headset.connected for headset in headsets))
+    assert [headset.id for headset in headsets] == ids
+    assert len(gateway.agents) == 192
+    late = await connect(gateway)
+    await until(lambda: not late.connected)
+    assert len(gateway.agents) == 192
 
 
 async def test_a_rate_is_kept(start_gateway: StartGateway, connect: Connect) -> None:
