@@ -14,6 +14,7 @@ PARTS = (
     "anew",
     "never_younger",
     "late",
+    "stamped",
     "owed",
     "owed_to_a_group",
     "grouped",

@@ -84,11 +84,11 @@ async def pictures(headset: Headset, folder: Path) -> None:
         (folder / f"{shade}.jpg").write_bytes(base64.b64decode(await headset.value(JPEG, [40 * shade])))
 
 
-async def measured(late: Late, offset: float) -> list[float]:
+async def measured(late: Late) -> list[float]:
     await until(lambda: len(late.ms) > 20)
     late.ms.clear()
     await asyncio.sleep(MEASURED_S)
-    return [each - offset for each in late.ms]
+    return list(late.ms)
 
 
 def camera(site: Site, folder: Path, hz: float, raw_hz: float) -> Process:
@@ -113,15 +113,15 @@ async def test_how_late_and_how_dear(site: Site, tmp_path: Path) -> None:
         offset = float(await headset.value(CLOCK))
         await headset.stick("right", 0, -1)
         holding = asyncio.create_task(hold_on(headset))
-        commands = await measured(drives, offset)
+        commands = await measured(drives)
         holding.cancel()
         await asyncio.gather(holding, return_exceptions=True)
         lines.append(told("command, browser to ROS node", commands))
         await headset.squeeze("right", held=False)
-        lines.append(told("pose, browser to ROS node", await measured(poses, offset)))
+        lines.append(told("pose, browser to ROS node", await measured(poses)))
         async with camera(site, tmp_path, 0, 30):
             await show(headset, ["/test/raw"])
-            beside = await measured(poses, offset)
+            beside = await measured(poses)
             raw_hz = await headset.value("[...macsXr.links.rates.values()].find(each => each.key.includes('raw')).hz")
             lines.append(told(f"pose beside {raw_hz:.0f} raw pictures of 0.9 MB a second", beside))
         async with camera(site, tmp_path, 30, 0):

@@ -36,7 +36,7 @@ async function halts() {
 const parts = {
   async axes() {
     const { heading, orientation, position, pose, toScene } = await load("xr/axes.js");
-    const { stamp } = await load("shared/twist.js");
+    const { stamp, wallTime } = await load("shared/twist.js");
     assert.deepEqual(position({ x: 0, y: 0, z: -1 }), { x: 1, y: 0, z: 0 }); // ahead
     assert.deepEqual(position({ x: 1, y: 0, z: 0 }), { x: 0, y: -1, z: 0 }); // right
     assert.deepEqual(position({ x: 0, y: 1, z: 0 }), { x: 0, y: 0, z: 1 }); // up
@@ -51,6 +51,7 @@ const parts = {
     assert.deepEqual(made, { position: { x: -3, y: -1, z: 2 }, orientation: { x: 0, y: 0, z: 0, w: 1 } });
     assert.deepEqual(stamp(1500.25), { sec: 1, nanosec: 500250000 });
     assert.ok(stamp(1999.9999999).nanosec <= 999999999);
+    assert.equal(wallTime(1000, 1250, 5e12), 5e12 - 250, "made 250 ms ago");
   },
 
   async hold() {

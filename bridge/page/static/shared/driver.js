@@ -5,7 +5,7 @@
 
 import { Hold, STILL_MS } from "./hold.js";
 import { Debts } from "./owed.js";
-import { TWIST } from "./twist.js";
+import { TWIST, wallTime } from "./twist.js";
 import { refused } from "./words.js";
 
 /** Nothing goes to a gateway that has not answered for so long. */
@@ -161,7 +161,7 @@ export class Driver {
     if (node.lastMadeAt > this.#madeAt) return; // a zero, say, is younger: what is held still is read again soon
     const [x, z] = [forward * this.limits.forward, turn * this.limits.turn];
     this.#sentAt = now;
-    const message = type.write(shape({ x }, { z }, performance.timeOrigin + this.#madeAt));
+    const message = type.write(shape({ x }, { z }, wallTime(this.#madeAt)));
     if (!this.isFresh(now) || !node.publish(message, { robots, groups, madeAt: this.#madeAt })) {
       this.release("the connection is not fresh");
       return;
@@ -185,7 +185,7 @@ export class Driver {
     this.#endedAt = performance.now();
     this.speed = { linear: 0, angular: 0 };
     const zero = (members = drive.members) => {
-      const message = drive.type.write(drive.shape({}, {}, performance.timeOrigin + performance.now()));
+      const message = drive.type.write(drive.shape({}, {}, Date.now()));
       const { robots, groups } = this.#others(drive, members);
       if (robots.length || groups.length) drive.node.publish(message, { robots, groups });
     };

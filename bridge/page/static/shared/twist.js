@@ -6,6 +6,14 @@ export function stamp(ms) {
   return { sec, nanosec: Math.min(999999999, Math.floor((ms - sec * 1000) * 1e6)) };
 }
 
+/**
+ * When something was done that was done at `at` of performance.now(), in ms since 1970 by the clock on the wall, as it is now. What
+ * performance.timeOrigin has was so when the page began: it follows no step of that clock, and no machine that slept.
+ */
+export function wallTime(at, now = performance.now(), wall = Date.now()) {
+  return wall - (now - at);
+}
+
 /** Type → a message of it; `ms` is its time since 1970. */
 export const TWIST = {
   "geometry_msgs/msg/Twist": (linear, angular) => ({ linear, angular }),

@@ -11,7 +11,7 @@ import { Headset } from "../macs.js";
 import { Types } from "../ros.js";
 import { Driver } from "../shared/driver.js";
 import { Halt } from "../shared/halt.js";
-import { stamp } from "../shared/twist.js";
+import { stamp, wallTime } from "../shared/twist.js";
 import { ONLY_BY_GROUP } from "../shared/words.js";
 import { get, persisted, soon } from "./asking.js";
 import { lockout } from "./freshness.js";
@@ -253,7 +253,7 @@ export class CommandLink {
   #sendPoses(poses, at) {
     const now = performance.now();
     if (!this.#poses.size || this.#quiet(now) || !this.driver.isFresh(now)) return;
-    const header = { stamp: stamp(performance.timeOrigin + at), frame_id: this.#settings.frame };
+    const header = { stamp: stamp(wallTime(at)), frame_id: this.#settings.frame };
     for (const [kind, one] of this.#poses) {
       const value = poses[kind];
       if (!value || !one.type || at - one.sentAt < 1000 / this.#settings.poseHz - 3) continue;
