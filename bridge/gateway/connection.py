@@ -608,8 +608,12 @@ class Connection(asyncio.BufferedProtocol):
         return transport
 
     def _give_up(self, reason: str) -> None:
-        """Nothing comes of its socket: close it, unless the agent may come back over another."""
-        if not self.owner.sleeps(self):
+        """Nothing comes of its socket: close it, unless the agent may come back over another. What waits for its turn
+        was said before, and comes before its end or its sleep: robots stop then, and must not move again."""
+        if self._waits:
+            log.info("%s: %s", self, reason)
+            self._transport.abort()
+        elif not self.owner.sleeps(self):
             self.close(reason)
 
     def all_drops(self) -> Counter[str]:

@@ -87,13 +87,15 @@ def said(node: str) -> bytes:
 
 
 @asynccontextmanager
-async def two(busy: Busy, *, configured: bool = True) -> AsyncIterator[tuple[socket.socket, socket.socket]]:
+async def two(
+    busy: Busy, *, configured: bool = True, write_timeout_s: float = 30.0
+) -> AsyncIterator[tuple[socket.socket, socket.socket]]:
     """Two headsets' sockets, whose connections are configured unless otherwise said."""
 
     memory = Memory(64 << 20, 32 << 20)
 
     def make() -> Connection:
-        return Connection(busy, memory=memory, outbox_bytes=64 << 20, write_timeout_s=30)  # type: ignore[arg-type]
+        return Connection(busy, memory=memory, outbox_bytes=64 << 20, write_timeout_s=write_timeout_s)  # type: ignore[arg-type]
 
     server = await asyncio.get_running_loop().create_server(make, "127.0.0.1", 0)
     address = server.sockets[0].getsockname()[:2]
@@ -141,7 +143,7 @@ async def test_who_says_goodbye_does_not_sleep_when_the_connection_ends_meanwhil
     """A socket ends while a goodbye waits for its turn: the agent has left, and is not expected back."""
     busy = Busy()
     async with two(busy) as (one, _):
-        (connection,) = (each for each in busy.connections if each.agent_id == 1)
+        connection = busy.connections[0]
         connection.expect_back(Kept(1 << 20, 100, Room(1 << 20)))
         busy.on_first = connection.abort
         goodbye = encode_frame(management=encode_management(GoOffline()))
@@ -167,3 +169,16 @@ async def test_who_may_not_come_in_says_nothing_when_the_connection_ends_meanwhi
         connection.take(chain(costly, connection.peer.advance(len(data), now) or ()), now)
         await until(lambda: (1, "closed") in busy.did)
         assert [what for who, what in busy.did if who == 1] == [*range(1, MANY), "closed"]
+
+
+async def test_who_is_given_up_sleeps_behind_what_it_said() -> None:
+    """A headset does not read, and its time is over while what it said waits: all of that comes before its sleep,
+    in which robots have stopped."""
+    busy = Busy()
+    async with two(busy, write_timeout_s=0.0) as (one, _):
+        connection = busy.connections[0]
+        connection.expect_back(Kept(1 << 20, 100, Room(1 << 20)))
+        busy.on_first = connection.pause_writing  # as its transport does when it is full
+        one.sendall(b"".join(map(question, range(1, MANY))) + said("drive"))
+        await until(lambda: {(1, "asleep"), (1, "drive")} <= set(busy.did))
+        assert [what for who, what in busy.did if who == 1] == [*range(1, MANY), "drive", "asleep"]
