@@ -30,6 +30,7 @@ ALONE = (
     "tests/integration/test_page_load.py",
     "tests/integration/test_page_many.py",
     "tests/integration/test_page_soak.py",
+    "tests/integration/test_stop_behind.py",
     "tests/page/test_page.py::test_a_network_that_stands_still",
     "tests/page/test_page.py::test_a_stop_is_seen_on_two_pages",
     "tests/page/test_page.py::test_it_stops_however_it_is_let_go",

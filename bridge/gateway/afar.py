@@ -37,6 +37,11 @@ class FarSender:
     zid: str
     receiver: Connection
 
+    @property
+    def patience(self) -> None:
+        """Its gateway reads from it all the time, four times a second."""
+        return None
+
     def pause(self) -> None:
         """It should slow down."""
         self._note(slow=True)

@@ -26,7 +26,7 @@ from macs_zenoh.protocol.rate_limit import Pace
 from macs_zenoh.protocol.recipient import Recipient, to_agent
 from macs_zenoh.protocol.tcp_agent import Arrived, Event, Joined, Left, Rejected, Sent, State, TcpAgent
 
-from .backpressure import Backpressure
+from .backpressure import Backpressure, Patience
 from .door import OPEN_TO_ALL, Entrance
 from .memory import Memory
 from .owner import Owner
@@ -137,6 +137,8 @@ class Connection(asyncio.BufferedProtocol):
         self.backpressure = Backpressure()
         self.robot_backpressure = Backpressure()
         """For robot programs, which can wait longer."""
+        self.patience = Patience()
+        """With others that it sends to."""
         self._toll = Toll(REQUESTS_PER_S)
         self._tolled: asyncio.TimerHandle | None = None
         self.grouped_at = -math.inf
@@ -234,6 +236,8 @@ class Connection(asyncio.BufferedProtocol):
     def resume_writing(self) -> None:
         self._writer.resume()
         self._account()
+        self.backpressure.has_moved()
+        self.robot_backpressure.has_moved()
         if not self._outbox:
             self.congested = False
             self.backpressure.release()

@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from bridge.gateway import backpressure
-from bridge.gateway.backpressure import HOLD_S, ROBOT_HOLD_S, STOPPED_S, Backpressure
+from bridge.gateway.backpressure import CALM_S, HELD_S, HOLD_S, ROBOT_HOLD_S, STOPPED_S, Backpressure, Patience
 
 
 class Clock:
@@ -47,6 +47,7 @@ class Sender:
 
     def __init__(self) -> None:
         self.held = 0
+        self.patience = Patience()
 
     def pause(self) -> None:
         self.held += 1
@@ -95,3 +96,59 @@ def test_a_robot_program_is_held_for_that_second_at_once(clock: Clock) -> None:
     clock.pass_time(ROBOT_HOLD_S)
     assert robot.held == 0
     assert not bottleneck.hold(robot, 1, ROBOT_HOLD_S)
+
+
+MANY = 20
+
+
+def held_by(clock: Clock, sender: Sender, places: list[Backpressure], frames: int, moves: bool) -> float:
+    """For how long a sender is held that sends frames to these in turn, as soon as it is read from."""
+    held_s = 0.0
+    for number in range(frames):
+        if places[number % len(places)].hold(sender, number if moves else 0):
+            clock.pass_time(HOLD_S)
+            held_s += HOLD_S
+        assert sender.held == 0
+    return held_s
+
+
+def test_many_that_stand_still_hold_a_sender_for_a_second_together(clock: Clock) -> None:
+    """However many it sends to in turn: what comes behind, a stop maybe, waits no longer. Each held it for a second.
+    Later they may again, once they have moved."""
+    places, sender, other = [Backpressure() for _ in range(MANY)], Sender(), Sender()
+    assert held_by(clock, sender, places, 10 * MANY, moves=False) == HELD_S
+    assert held_by(clock, other, places[-1:], 10, moves=False) == HELD_S  # each sender for itself
+    clock.pass_time(CALM_S)
+    assert not places[0].hold(sender, 0)
+    assert places[0].hold(sender, 1)
+
+
+def test_at_the_same_time_they_count_once(clock: Clock) -> None:
+    """A frame to many in one Wi-Fi that stands still: its sender is held until they have stopped."""
+    places, sender = [Backpressure() for _ in range(MANY)], Sender()
+    held_s = 0.0
+    while sum(place.hold(sender, 0) for place in places):
+        assert sender.held == MANY
+        clock.pass_time(HOLD_S)
+        assert sender.held == 0
+        held_s += HOLD_S
+    assert held_s == STOPPED_S
+
+
+def test_those_that_move_hold_a_sender_as_often_as_they_are_full(clock: Clock) -> None:
+    """Receivers that are merely slower get the time that they need, however many they are; so do they who say that
+    they have moved before the next frame comes."""
+    places, sender = [Backpressure() for _ in range(3)], Sender()
+    assert held_by(clock, sender, places, 30 * MANY, moves=True) == 30 * MANY * HOLD_S
+    for _ in range(MANY):
+        place = Backpressure()
+        assert held_by(clock, sender, [place], 1, moves=True) == HOLD_S
+        place.has_moved()
+
+
+def test_one_that_stands_still_takes_nothing_from_one_that_is_slower(clock: Clock) -> None:
+    """Of two receivers one has stopped, and the other moves: that one is waited for as before, but for the first look
+    at it, from which nobody knows."""
+    stopped, slower, sender = Backpressure(), Backpressure(), Sender()
+    assert held_by(clock, sender, [stopped], 10, moves=False) == HELD_S
+    assert held_by(clock, sender, [slower], 1 + MANY, moves=True) == MANY * HOLD_S
