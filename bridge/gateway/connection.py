@@ -502,7 +502,8 @@ class Connection(asyncio.BufferedProtocol):
 
     def close(self, reason: str) -> None:
         """Send what is gathered, then FIN."""
-        if self._transport.is_closing() and not (self.asleep or self._lost):
+        has_ended = self._closed or (self._transport is ENDED and not self._lost)
+        if has_ended and not self.asleep:
             return
         self._closed = True
         self._expect_back_no_more()
@@ -523,6 +524,7 @@ class Connection(asyncio.BufferedProtocol):
         elif not self._transport.is_closing():
             while self._rest:
                 self._handle_some(time.monotonic())
+            self._closed = True
             self._expect_back_no_more()
             self.peer.lost()
             log.info("%s leaves: %s", self, reason)

@@ -152,6 +152,18 @@ async def test_who_says_goodbye_does_not_sleep_when_the_connection_ends_meanwhil
         assert [what for who, what in busy.did if who == 1] == [*range(1, MANY), "closed"]
 
 
+async def test_who_says_goodbye_does_not_sleep_when_the_connection_is_just_ending() -> None:
+    """Likewise when the socket has ended and nobody has been told yet."""
+    busy = Busy()
+    async with two(busy) as (one, _):
+        connection = busy.connections[0]
+        connection.expect_back(Kept(1 << 20, 100, Room(1 << 20)))
+        busy.on_first = connection.abort
+        one.sendall(question(1) + encode_frame(management=encode_management(GoOffline())))
+        await until(lambda: busy.did[-1][1] in ("closed", "asleep") if busy.did else False)
+        assert busy.did == [(1, 1), (1, "closed")]
+
+
 async def test_who_may_not_come_in_says_nothing_when_the_connection_ends_meanwhile() -> None:
     """A socket ends while a robot's configuration waits for its turn: if it is not let in, nothing of what came
     before its configuration or behind it goes out."""
