@@ -335,7 +335,7 @@ class _Outer(asyncio.BufferedProtocol):
         if entered:
             self._inner.connection_lost(exc)
         if self._stream is not None:
-            self._stream.lost(exc)
+            self._stream.below_is_lost()
 
     def wait(self) -> None:
         """For a whole request and its answer, from now on."""

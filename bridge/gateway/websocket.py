@@ -50,6 +50,9 @@ class WebSocketTransport(asyncio.Transport):
         self._encrypts = bool(below.get_extra_info("sslcontext"))
         """Then each piece would be encrypted for itself."""
         self._closing: asyncio.Task[bool] | None = None
+        self._aborted = False
+        self._lost = False
+        """Whether what is below has ended, and what had come before is still given to the connection."""
         self._space: memoryview | None = None
         self._filled = 0
         """How much of it."""
@@ -73,8 +76,13 @@ class WebSocketTransport(asyncio.Transport):
         if self._connection is not None:
             self._connection.resume_writing()
 
+    def below_is_lost(self) -> None:
+        """It has ended: what came before counts, and is no more than aiohttp keeps. `lost` comes behind that."""
+        self._lost = True
+        self._may_read.set()
+
     def lost(self, exc: Exception | None) -> None:
-        """It has ended."""
+        """It has ended, and nothing more comes."""
         if self._connection is not None:
             connection, self._connection = self._connection, None
             self._may_read.set()
@@ -123,7 +131,7 @@ class WebSocketTransport(asyncio.Transport):
         """Put what a message carries where the connection's bytes belong: it looks at them when the next message has
         not come yet, so that frames that came together go on together."""
         view = memoryview(data)
-        while len(view) and self._connection is not None and not self.is_closing():
+        while len(view) and self._connection is not None and self._gives:
             if not self._may_read.is_set():
                 self._pass_on()
                 await self._may_read.wait()
@@ -141,8 +149,13 @@ class WebSocketTransport(asyncio.Transport):
         """Let the connection look at what was put there."""
         filled, self._filled = self._filled, 0
         self._space = None  # a view that is kept would keep a frame from growing
-        if filled and self._connection is not None and not self.is_closing():
+        if filled and self._connection is not None and self._gives:
             self._connection.buffer_updated(filled)
+
+    @property
+    def _gives(self) -> bool:
+        """Whether what comes still counts: also behind the other end's, but not behind ours."""
+        return self._closing is None and not self._aborted
 
     def _spares(self) -> bool:
         """Whether it has not sent too much that says nothing; who has is gone."""
@@ -200,7 +213,8 @@ class WebSocketTransport(asyncio.Transport):
         self._below.set_write_buffer_limits(high, low)
 
     def pause_reading(self) -> None:
-        self._may_read.clear()
+        if not self._lost:
+            self._may_read.clear()
 
     def resume_reading(self) -> None:
         self._may_read.set()
@@ -212,6 +226,8 @@ class WebSocketTransport(asyncio.Transport):
             self._closing = asyncio.get_running_loop().create_task(self._socket.close(code=WSCloseCode.OK))
 
     def abort(self) -> None:
+        self._aborted = True
+        self._may_read.set()
         self._below.abort()
 
 
