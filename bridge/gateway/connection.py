@@ -24,7 +24,7 @@ from macs_zenoh.protocol.messages import AgentsGone, GoneAgent, SessionResumed
 from macs_zenoh.protocol.outbox import Chunk, Outbox
 from macs_zenoh.protocol.rate_limit import Pace
 from macs_zenoh.protocol.recipient import Recipient, to_agent
-from macs_zenoh.protocol.tcp_agent import Arrived, Event, Joined, Left, Rejected, Sent, State, TcpAgent
+from macs_zenoh.protocol.tcp_agent import Arrived, Event, Failed, Joined, Left, Rejected, Sent, State, TcpAgent
 
 from .backpressure import Backpressure, Patience
 from .door import OPEN_TO_ALL, Entrance
@@ -342,6 +342,9 @@ class Connection(asyncio.BufferedProtocol):
                 self._give_up(event.reason)
             else:
                 self.close(event.reason)
+        elif isinstance(event, Failed):
+            if self._fails(event.frames):
+                log.error("%s: reading failed (logged once, counted as failed)", self, exc_info=event.error)
         elif isinstance(event, Arrived):
             if self._writer.kept is not None:
                 self._writer.kept.arrived(event.received)
@@ -350,11 +353,11 @@ class Connection(asyncio.BufferedProtocol):
             if isinstance(event, Joined) and self._successor is None and not self._transport.is_closing():
                 self._schedule()  # from now on silence counts, which may be less than what the handshake has
 
-    def _fails(self) -> bool:
+    def _fails(self, count: int = 1) -> bool:
         """What this agent said could not be carried out, for a reason that nobody thought of; whether that is the
         first time."""
-        self.drops["failed"] += 1
-        return self.drops["failed"] == 1
+        self.drops["failed"] += count
+        return self.drops["failed"] == count
 
     # -- out -----------------------------------------------------------------------------------------------------
 

@@ -183,6 +183,13 @@ class Rejected(NamedTuple):
     error: WireError
 
 
+class Failed(NamedTuple):
+    """A frame, or a run of them, could not be read for a reason that nobody thought of."""
+
+    error: Exception
+    frames: int
+
+
 class Left(NamedTuple):
     """The agent is gone; ``reason`` is for the log. Close the connection."""
 
@@ -230,6 +237,7 @@ Event = (
     | NotResumed
     | Arrived
     | Rejected
+    | Failed
     | Left
 )
 
@@ -382,7 +390,10 @@ class TcpAgent:
             if self._gone():
                 return
             events: list[Event] = []
-            self._read_frame(frame, now, events)
+            try:
+                self._read_frame(frame, now, events)
+            except Exception as fault:  # noqa: BLE001 - ours to mend; it costs no other frame that came with this one
+                events.append(Failed(fault, 1 if isinstance(frame, WireError) else frame.count))
             yield from events
         if error is not None and not self._gone():
             self.drops["FrameTooLarge"] += 1
@@ -634,6 +645,8 @@ class TcpAgent:
                 self._forbid(error, frame, events)
             except WireError as error:
                 self._reject(error, 1, events)
+            except Exception as error:  # noqa: BLE001 - as in `_read`
+                events.append(Failed(error, frame.count))
 
     def _let_in(self, configuration: Configuration, events: list[Event]) -> bool:
         """Judge the token that an agent shows, or does not show."""

@@ -9,6 +9,8 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from itertools import chain
 
+import pytest
+
 from bridge.gateway.connection import Connection
 from bridge.gateway.memory import Memory
 from bridge.gateway.shares import TURN_S
@@ -22,8 +24,8 @@ from macs_zenoh.protocol.messages import (
     OnlineRequest,
     encode_management,
 )
-from macs_zenoh.protocol.tcp_agent import AskedOnline, Event, Joined, Sent, TcpAgent
-from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.protocol.tcp_agent import AskedOnline, Event, Joined, Sent, State, TcpAgent
+from macs_zenoh.protocol.wire import Frames, encode_frame, encode_message
 from tests.support.waiting import until
 
 MANY = 100
@@ -194,3 +196,32 @@ async def test_who_is_given_up_sleeps_behind_what_it_said() -> None:
         one.sendall(b"".join(map(question, range(1, MANY))) + said("drive"))
         await until(lambda: {(1, "asleep"), (1, "drive")} <= set(busy.did))
         assert [what for who, what in busy.did if who == 1] == [*range(1, MANY), "drive", "asleep"]
+
+
+async def test_a_frame_that_cannot_be_read_costs_no_other(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of frames that came together one meets a fault of ours: it is counted, told once with where it was, and those
+    around it count, also when they waited for the configuration."""
+    busy = Busy()
+    frame_of, send_of = TcpAgent._frame, TcpAgent._send
+
+    def fails(name: str, read: Callable[..., None]) -> Callable[..., None]:
+        def reads(self: TcpAgent, frame: Frames, events: list[Event]) -> None:
+            if name.encode() in frame.data and self.state is State.ONLINE:
+                raise ZeroDivisionError(name)
+            read(self, frame, events)
+
+        return reads
+
+    monkeypatch.setattr(TcpAgent, "_frame", fails("early", frame_of))
+    monkeypatch.setattr(TcpAgent, "_send", fails("late", send_of))
+    hello = encode_frame(management=encode_management(Configuration(UNITY, 0)))
+    async with two(busy, configured=False) as (one, _):
+        one.sendall(said("before") + said("early") + said("between") + hello)
+        one.sendall(question(1) + said("late") + question(2) + said("late") + said("behind"))
+        await until(lambda: (1, "behind") in busy.did)
+        assert [what for who, what in busy.did if who == 1] == ["before", "between", 1, 2, "behind"]
+        assert busy.connections[0].all_drops() == {"failed": 3}
+    (told,) = [record for record in caplog.records if record.exc_info]
+    assert str(busy.connections[0]) in told.getMessage()
