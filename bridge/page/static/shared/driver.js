@@ -12,8 +12,8 @@ import { refused } from "./words.js";
 const FRESH_MS = 200;
 const ZEROS_MS = [40, 80];
 const AGAIN_MS = 500;
-/** A robot that has just come back may not have the topic yet: it is told once more after this. */
-const LATE_ZERO_MS = 1000;
+/** A robot that has just come back may not have the topic yet, and on a busy machine not soon: it is told again after these. */
+const LATE_ZEROS_MS = [1000, 3000, 7000, 15_000];
 const LEAST_TICK_MS = 5;
 
 export class Driver {
@@ -213,15 +213,19 @@ export class Driver {
     const owing = () => drive.debts === debts && !this.#drives(drive);
     const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
     let late = false;
+    let lastAt = 0;
     while (owing() && debts.isOpen(performance.now())) {
       const there = await this.headset.online().catch(() => null);
       const paid = there && owing() ? debts.pay(there.robots) : null;
       if (paid) zero(paid);
-      if (paid && late) await pause(LATE_ZERO_MS);
-      if (paid && late && owing()) zero(paid);
+      if (paid && late) {
+        for (const ms of LATE_ZEROS_MS) setTimeout(() => owing() && zero(paid), ms);
+        lastAt = performance.now() + LATE_ZEROS_MS.at(-1);
+      }
       late = true;
       if (debts.isOpen(performance.now())) await pause(AGAIN_MS);
     }
+    if (owing()) await pause(Math.max(0, lastAt + 1 - performance.now()));
     if (drive.debts !== debts) return;
     drive.debts = null;
     if (!this.#drives(drive) && debts.robots.length) {
