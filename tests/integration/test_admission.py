@@ -55,12 +55,12 @@ class Plain:
 
 
 @asynccontextmanager
-async def crowd(port: int, count: int, agent_type: int = UNITY) -> AsyncIterator[list[Plain]]:
-    """So many agents that connect at once, and have all joined."""
+async def crowd(port: int, count: int, agent_type: int = UNITY, host: str = "127.0.0.1") -> AsyncIterator[list[Plain]]:
+    """So many agents that connect from an address at once, and have all joined."""
     agents: list[Plain] = []
 
     async def come() -> None:
-        agent = Plain(*await asyncio.open_connection("127.0.0.1", port))
+        agent = Plain(*await asyncio.open_connection("127.0.0.1", port, local_addr=(host, 0)))
         agents.append(agent)
         await agent.join(agent_type)
 
@@ -136,8 +136,8 @@ async def test_who_waits_for_an_id_may_speak_and_leave(
 async def test_when_there_are_no_ids_a_newcomer_is_closed(start_gateway: StartGateway) -> None:
     """A gateway whose blocks are used up closes who comes, and counts it; when somebody leaves, the next is let in."""
     gateway: Gateway = await start_gateway(blocks=[5], handshake_timeout_s=10.0)
-    async with crowd(gateway.port, 256) as agents:
-        assert {agent.id for agent in agents} == set(range(5 * 256, 6 * 256))
+    async with crowd(gateway.port, 128) as agents, crowd(gateway.port, 128, host="127.0.0.2") as others:
+        assert {agent.id for agent in (*agents, *others)} == set(range(5 * 256, 6 * 256))
         reader, writer = await asyncio.open_connection("127.0.0.1", gateway.port)
         assert await asyncio.wait_for(reader.read(), PATIENCE_S) == b""
         writer.close()

@@ -193,11 +193,11 @@ async def test_top_shows_which_routers_are_linked() -> None:
 
 
 async def test_top_shows_how_long_each_link_takes() -> None:
-    """A link that takes 20 ms longer in either direction is the one that is shown to: what it is to its far end, less
+    """A link that takes 100 ms longer in either direction is the one that is shown to: what it is to its far end, less
     what it is to its near one. Those of the robot and of the gateway are not. In a namespace as well."""
     async with AsyncExitStack() as stack:
         first = await stack.enter_async_context(Router())
-        slow = await stack.enter_async_context(delayed(first.endpoint, 0.02))
+        slow = await stack.enter_async_context(delayed(first.endpoint, 0.1))
         second = await stack.enter_async_context(Router(connect=[slow]))
         words = ("--namespace", "hall")
         settings = MeshSettings(connect=[first.endpoint], namespace="hall")
@@ -219,11 +219,11 @@ async def test_top_shows_how_long_each_link_takes() -> None:
             if len(of_routers) != 2 or None in of_routers or "gateway" not in rows or behind is None:
                 return False
             near, far = sorted(row["round_trip_ms"] for row in routers)
-            assert far >= 40
+            assert far >= 200
             assert of_routers == pytest.approx([far - near] * 2, abs=0.01)
             assert rows["gateway"]["link"]["router"] != behind["router"]
             took = (behind["round_trip_ms"], rows["gateway"]["link"]["round_trip_ms"])
-            return None not in took and max(took) < 20 < of_routers[0]  # of one answer a busy machine may make more
+            return None not in took and max(took) < 100 < of_routers[0]  # of one answer a busy machine may make more
 
         await until(timed, every_s=0.2)
 
