@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 
+from bridge.pieces import small_joined
 from macs_zenoh.protocol.kept import Kept
 from macs_zenoh.protocol.outbox import Chunk, Outbox
 
@@ -225,19 +226,7 @@ class Writer:
 def joined(chunks: Sequence[Chunk]) -> list[Chunk]:
     """Small pieces that follow each other as one: TLS encrypts each by itself. A large one takes several of TLS's
     records anyway, and costs less than its copy."""
-    pieces: list[Chunk] = []
-    small: list[Chunk] = []
-    for chunk in chunks:
-        if len(chunk) < RECORD_BYTES:
-            small.append(chunk)
-            continue
-        if small:
-            pieces.append(b"".join(small))
-            small = []
-        pieces.append(chunk)
-    if small:
-        pieces.append(b"".join(small))
-    return pieces
+    return small_joined(chunks, RECORD_BYTES)
 
 
 class _Ended(asyncio.Transport):

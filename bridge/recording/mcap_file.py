@@ -31,6 +31,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from bridge.pieces import small_joined
 from bridge.recording import LIBRARY, PROFILE
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -235,7 +236,7 @@ class McapFile:
         is as before."""
         if not self._pieces:
             return
-        raw = _blocks(self._pieces)
+        raw = small_joined(self._pieces, LARGE_BYTES)
         entries, start_ns, end_ns = self._entries, self._start_ns, self._end_ns
         self._pieces, self._entries, self._pending = [], {}, 0
         compression = self._compression if self._gets_smaller(raw) else ""
@@ -375,23 +376,6 @@ class McapFile:
             os.lseek(self._file, self._at, os.SEEK_SET)
             raise
         self._at += written
-
-
-def _blocks(pieces: Sequence[bytes]) -> list[bytes]:
-    """The same in fewer pieces, none of which is both copied and large."""
-    blocks: list[bytes] = []
-    small: list[bytes] = []
-    for piece in pieces:
-        if len(piece) < LARGE_BYTES:
-            small.append(piece)
-            continue
-        if small:
-            blocks.append(b"".join(small))
-            small = []
-        blocks.append(piece)
-    if small:
-        blocks.append(b"".join(small))
-    return blocks
 
 
 def _cut(pieces: Sequence[bytes], start: int, end: int) -> bytes:
