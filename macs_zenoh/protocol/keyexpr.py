@@ -96,15 +96,15 @@ class Key(Generic[_F]):
     subscriber: str
     payload: str
     fields: tuple[str, ...] = field(init=False)
-    _in_blocks: bool = field(init=False, repr=False, compare=False)
-    """Whether an id's block stands before it, which follows from the id."""
+    _block_at: int | None = field(init=False, repr=False, compare=False)
+    """Which field is the block of the id behind it; None where none is."""
     _names: frozenset[str] = field(init=False, repr=False, compare=False)
     _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fields", tuple(re.findall(r"\{(\w+)\}", self.template)))
         object.__setattr__(self, "_names", frozenset(self.fields))
-        object.__setattr__(self, "_in_blocks", {"block", "id"} <= self._names)
+        object.__setattr__(self, "_block_at", self.fields.index("block") if {"block", "id"} <= self._names else None)
         pattern = re.sub(r"\{(\w+)\}", r"([^/*$?#]+)", self.template)
         object.__setattr__(self, "_pattern", re.compile(pattern))
 
@@ -147,12 +147,12 @@ class Key(Generic[_F]):
             fields = self.read(*map(_field, self.fields, match.groups()))
         except (UsageError, ValueError):
             return None
-        at = self.fields.index("block") if self._in_blocks else 0
-        return None if self._in_blocks and fields[at] != block_of(fields[at + 1]) else fields
+        at = self._block_at
+        return None if at is not None and fields[at] != block_of(fields[at + 1]) else fields
 
     def _complete(self, values: dict[str, FieldValue]) -> None:
         """Put the block of an id beside it."""
-        if not self._in_blocks or not isinstance(agent_id := values.get("id"), int):
+        if self._block_at is None or not isinstance(agent_id := values.get("id"), int):
             return
         block = block_of(agent_id)
         if values.setdefault("block", block) != block:
