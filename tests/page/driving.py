@@ -14,6 +14,7 @@ from geometry_msgs.msg import Twist
 from tests.page.conftest import HELD, Act, Site
 from tests.support.browser import Watched
 from tests.support.ros_peer import Peer
+from tests.support.waiting import until
 
 
 async def hold(page: Watched, across: float = 0.0, up: float = 0.8) -> None:
@@ -110,3 +111,16 @@ GAMEPAD_HELD = f"(() => {{ {GAMEPADS} have(gamepad(true)) }})()"
 GAMEPAD = f"(async () => {{ {GAMEPADS} have(gamepad(false)); await seen(); have(gamepad(true)); await seen() }})()"
 """The same, after it was seen with its button released."""
 NO_GAMEPAD = f"(async () => {{ {GAMEPADS} have(); await seen() }})()"
+
+
+async def drives(page: Watched, heard: Heard) -> None:
+    """Take hold until the robot is told to go."""
+    heard.speeds.clear()
+
+    async def told() -> bool:
+        if not await page.value(HELD):
+            await page.page.mouse.up()
+            await hold(page)
+        return len(heard.speeds) > 5 and (heard.last or 0.0) > 0
+
+    await until(told, every_s=0.05)

@@ -19,7 +19,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 from tests.page.conftest import HELD, ROBOT, Act, Site
-from tests.page.driving import Heard, heard_at, hold, within
+from tests.page.driving import Heard, drives, heard_at, within
 from tests.page.headsets import WEBGL, by_grip, headset_at, needs_headset
 from tests.support.browser import OFFLINE, Watched, browser, needs_browser
 from tests.support.waiting import until
@@ -53,19 +53,8 @@ class Place:
 async def at_the_pad(site: Site) -> Place:
     page = await site.with_robot()
 
-    async def drives(heard: Heard) -> None:
-        heard.speeds.clear()
-
-        async def told() -> bool:
-            if not await page.value(HELD):
-                await page.page.mouse.up()
-                await hold(page)
-            return len(heard.speeds) > 5 and (heard.last or 0.0) > 0
-
-        await until(told, every_s=0.05)
-
     ready = partial(page.page.wait_for_selector, '#pad[aria-disabled="false"]', timeout=60_000)
-    return Place(page, drives, ready, page.page.mouse.up, partial(page.value, HELD))
+    return Place(page, partial(drives, page), ready, page.page.mouse.up, partial(page.value, HELD))
 
 
 async def in_the_scene(site: Site) -> Place:

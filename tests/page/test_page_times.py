@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 from tests.page.conftest import HELD, Site, says
-from tests.page.driving import Heard, heard_at, hold, within
+from tests.page.driving import drives, heard_at, within
 from tests.support.browser import OFFLINE, Watched, needs_browser
 from tests.support.links import Link, counted
 from tests.support.waiting import until
@@ -38,19 +38,6 @@ LETTING_GO: dict[str, tuple[str, float]] = {
     "page closed": ("close", DEADMAN_MS),
     "connection cut": ("macsPage.headset.abort()", DEADMAN_MS),
 }
-
-
-async def drives(page: Watched, heard: Heard) -> None:
-    """Take hold until the robot is told to go."""
-    heard.speeds.clear()
-
-    async def told() -> bool:
-        if not await page.value(HELD):
-            await page.page.mouse.up()
-            await hold(page)
-        return len(heard.speeds) > 5 and (heard.last or 0.0) > 0
-
-    await until(told, every_s=0.05)
 
 
 @pytest.mark.parametrize("how", LETTING_GO)
