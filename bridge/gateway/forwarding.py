@@ -7,6 +7,7 @@ frame. What agents of this gateway get of it they get as it was judged here.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from macs_zenoh.mesh import Mesh, Payload, Traffic
@@ -16,7 +17,7 @@ from macs_zenoh.protocol.directory import Directory
 from macs_zenoh.protocol.existing import asks
 from macs_zenoh.protocol.guard import STOP_TYPES
 from macs_zenoh.protocol.halts import halts, may_halt
-from macs_zenoh.protocol.messages import ROS, NodeType
+from macs_zenoh.protocol.messages import ROS, Metadata, NodeType
 from macs_zenoh.protocol.rate_limit import Passing
 from macs_zenoh.protocol.routing import stream_key
 from macs_zenoh.protocol.tcp_agent import Sent, Streamed
@@ -49,11 +50,18 @@ class Run:
     """Whether all of them may go to existing programs as they are."""
 
 
-class Forwarding:
-    """For all connections of a gateway; within one read of a socket, for that connection."""
+OnNoRouter = Callable[[Connection, Metadata, list[int]], None]
 
-    def __init__(self, mesh: Mesh, agents: Agents, directory: Directory, judged: JudgedFrames) -> None:
+
+class Forwarding:
+    """For all connections of a gateway; within one read of a socket, for that connection. ``on_no_router`` hears of
+    commands that go nowhere: whose, of what, and to which robots."""
+
+    def __init__(
+        self, mesh: Mesh, agents: Agents, directory: Directory, judged: JudgedFrames, on_no_router: OnNoRouter
+    ) -> None:
         self._mesh = mesh
+        self._on_no_router = on_no_router
         self._directory = directory
         self._judged = judged
         self._routes: dict[Connection, Routes] = {}
@@ -211,6 +219,8 @@ class Forwarding:
     def _may_go(self, connection: Connection, sent: Sent, route: Route, traffic: Traffic) -> Sent | None:
         """What of a frame to robots goes on now; a command that has waited may, after all that came with it."""
         now, count, metadata = time.monotonic(), sent.frame.count, sent.metadata
+        if traffic is COMMAND and not self._mesh.linked:
+            self._goes_nowhere(connection, metadata, route)
         if traffic is not COMMAND:
             passing = connection.pace.request(count, now)
         elif metadata.data_exchange_type in STOP_TYPES:
@@ -230,6 +240,16 @@ class Forwarding:
             self._questions.drives(connection)
             return self._newest(connection, sent, route, passing, now)
         return sent
+
+    def _goes_nowhere(self, connection: Connection, metadata: Metadata, route: Route) -> None:
+        """There is no router: whoever is not at this gateway gets no command. The mesh counts those."""
+        robots = [number for kind, number in route.agents if kind == ROS and not self._is_here(kind, number)]
+        if robots or not route.agents:
+            self._on_no_router(connection, metadata, robots)
+
+    def _is_here(self, kind: int, number: int) -> bool:
+        agent = self._directory.get(kind, number)
+        return agent is not None and agent.zid == self._mesh.zid
 
     def _newest(self, connection: Connection, sent: Sent, route: Route, passing: Passing, now: float) -> Sent | None:
         """What of commands goes on now. Of those that have waited the newest is kept, and goes on before one that has

@@ -1,11 +1,13 @@
-"""What agents of a gateway are told, and what is recorded, when a token does not permit what they want."""
+"""What agents of a gateway are told when what they want is not done, and what of it is recorded: their tokens do not
+permit it, or there is no router."""
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Collection
 
-from macs_zenoh.protocol.messages import AccessRefused, DataRefused
+from macs_zenoh.protocol.messages import AccessRefused, DataRefused, Metadata
 from macs_zenoh.protocol.recipient import to_agent
 from macs_zenoh.protocol.rights import Grant
 from macs_zenoh.protocol.tcp_agent import Event, Forbidden
@@ -15,6 +17,9 @@ from .door import Door
 from .record import Record
 
 log = logging.getLogger("macs.gateway")
+
+NO_ROUTE = "no_route"
+"""As the mesh counts it."""
 
 
 class Refusing:
@@ -63,9 +68,21 @@ class Refusing:
         if not (about.node_name and connection.peer.extensions):
             self.tell(connection, AccessRefused(kind, event.reason, about.request_id))
             return
+        self._not_taken(connection, about, event.robots, kind, event.reason)
+
+    def no_router(self, connection: Connection, about: Metadata, robots: Collection[int]) -> None:
+        """A command goes nowhere, as this gateway has no router: who holds on would drive on by himself once there is
+        one, though the robot has stood still. ``robots`` is empty for those of a group."""
+        if connection.peer.extensions and connection.may_tell((NO_ROUTE, about.node_name, tuple(robots))):
+            self._not_taken(connection, about, robots, NO_ROUTE, "the gateway has no router now")
+
+    def _not_taken(
+        self, connection: Connection, about: Metadata, robots: Collection[int], kind: str, reason: str
+    ) -> None:
+        """In the place of these robots; 0 stands for those that are not known."""
         topic = connection.peer.topic_of(about.node_type, about.node_name)
-        for robot in event.robots or (0,):
-            refused = DataRefused(robot, about.node_type, about.node_name, topic, kind, event.reason)
+        for robot in robots or (0,):
+            refused = DataRefused(robot, about.node_type, about.node_name, topic, kind, reason)
             connection.send_call(to_agent(refused))
 
     def changed(self, connection: Connection, grant: Grant) -> list[Event]:

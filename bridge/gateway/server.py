@@ -137,7 +137,7 @@ class Gateway:
         self._refusing = Refusing(self._door, record, self._drops)
         stead = Stead(mesh, self._layout)
         judged = JudgedFrames()
-        self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged)
+        self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged, self._refusing.no_router)
         self._delivery = Delivery(self.agents, self.directory, self._layout, stead, judged, forwarding.afar)
         self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
         self._roll = Roll(self._presence, self.agents)

@@ -17,6 +17,8 @@ PARTS = (
     "stamped",
     "owed",
     "owed_to_a_group",
+    "no_router",
+    "stood",
     "grouped",
     "too_many",
     "standing",

@@ -212,6 +212,58 @@ const parts = {
     await until(() => headset.commands().some(({ groups, ids }) => groups.includes(5) && !ids.length));
   },
 
+  async no_router() {
+    const { headset, told, aim, grip, drive } = await linked();
+    headset.come(1); // for its gateway it is there until it is known again who is
+    aim([1]);
+    await drive();
+    const lost = () => headset.tell("refused", { robot: 1, name: "/cmd_vel", kind: "no_route", reason: "no router" });
+    lost();
+    assert.equal(told.state.held, false);
+    assert.match(told.state.why, /went nowhere/);
+    const telling = setInterval(lost, 300);
+    await pause(1000);
+    clearInterval(telling);
+    const said = headset.commands();
+    const zeros = () => said.push(...headset.commands()) - before;
+    const before = said.length;
+    await until(() => {
+      grip(); // held all the while
+      return zeros() >= 3;
+    });
+    assert.ok(said.every(({ x }) => x === 0), "who holds on drives on with another hold");
+    await pause(2200);
+    zeros();
+    const now = said.length;
+    await pause(1500);
+    assert.ok(said.length + headset.commands().length - now <= 1, "no more than to one that comes back late");
+    await drive();
+  },
+
+  async stood() {
+    const { headset, status, told, aim, grip, drive } = await linked();
+    headset.come(1);
+    const says = (trips) => (status[1] = { nodes: [{ name: "/cmd_vel", deadman: { silence_s: 0.5, trips } }], stopped: false });
+    says(3);
+    aim([1]);
+    await drive();
+    const holding = setInterval(() => grip(), 20);
+    await pause(1200);
+    assert.ok(told.state.held, "it has acted before");
+    says(4);
+    await until(() => !told.state.held);
+    assert.match(told.state.why, /dead-man has acted/);
+    await pause(100);
+    assert.equal(told.state.held, false, "held still");
+    clearInterval(holding);
+    says(5); // as it does after each hold
+    await drive();
+    const again = setInterval(() => grip(), 20);
+    await pause(1200);
+    assert.ok(told.state.held);
+    clearInterval(again);
+  },
+
   async grouped() {
     const { headset, link, status, told, aim, drive } = await linked();
     headset.come(1, 2, 3);

@@ -9,7 +9,15 @@ from contextlib import asynccontextmanager
 
 from bridge.gateway import Gateway
 from macs_zenoh.protocol.decoders import MessageDecoder
-from macs_zenoh.protocol.messages import Configuration, Metadata, Welcome, decode_data, encode_management
+from macs_zenoh.protocol.messages import (
+    Configuration,
+    Metadata,
+    NodeType,
+    Welcome,
+    decode_data,
+    encode_management,
+    node_name,
+)
 from macs_zenoh.protocol.wire import encode_frame, encode_message, split_message
 from tests.support.waiting import PATIENCE_S
 
@@ -49,10 +57,20 @@ class Socket:
         configuration = Configuration(agent_type=agent_type, agent_id=self.id, group_id=group, request_id=1)
         self.writer.write(encode_frame(management=encode_management(configuration)))
 
+    def ask_online(self, number: int) -> None:
+        """Ask who is online, with this request id."""
+        management = b'{"messageManager":"OnlineAgentsGetter"}'
+        asked = encode_message(Metadata(request_id=number).encode())
+        self.writer.write(encode_frame(management=management, message=asked))
+
+    def command(self, robot: int, topic: str, kind: str, data: bytes) -> None:
+        """Send a robot something for a topic."""
+        metadata = Metadata(node_type=NodeType.PUBLISHER, node_name=node_name(topic), data_exchange_type=kind)
+        self.writer.write(encode_frame(1, (robot,), message=encode_message(metadata.encode(), data)))
+
     async def online(self) -> tuple[list[int], list[int]]:
         """Ask who is online: an answer also shows that everything before was dealt with."""
-        management = b'{"messageManager":"OnlineAgentsGetter"}'
-        self.writer.write(encode_frame(management=management, message=encode_message(Metadata(request_id=7).encode())))
+        self.ask_online(7)
         while True:
             metadata, body = await self.message()
             if metadata.request_id == 7 and not metadata.message_manager:

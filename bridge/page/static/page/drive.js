@@ -43,8 +43,10 @@ export class Drive {
 
   /** What the robot said of itself: who has control, whether it is stopped. */
   setStatus(status) {
-    this.status = status;
     const node = status?.nodes?.find((each) => each.name === this.topic && (each.control || each.deadman));
+    // what it said before this hold says nothing of it
+    if (node?.deadman && status !== this.status) this.driver.acted(this.robot, node.deadman.trips);
+    this.status = status;
     this.control = node?.control ?? null;
     const holder = this.control?.holder ?? null;
     this.holder = holder;

@@ -15,6 +15,9 @@ const AGAIN_MS = 500;
 /** A robot that has just come back may not have the topic yet, and on a busy machine not soon: it is told again after these. */
 const LATE_ZEROS_MS = [1000, 3000, 7000, 15_000];
 const LEAST_TICK_MS = 5;
+/** A gateway without a router says so once a second of what is sent. So long after it has, what is sent does go. */
+const ROUTED_MS = 1600;
+const NO_ROUTE = "no_route";
 
 export class Driver {
   #hold;
@@ -28,6 +31,10 @@ export class Driver {
   #askedAt = -Infinity;
   #timer = null;
   #told = "";
+  /** When the gateway said last that it has no router. */
+  #noRouteAt = -Infinity;
+  /** robot → how often its dead-man had acted, as it said first since somebody took hold. */
+  #acted = new Map();
 
   /**
    * `bars(now)` says why nobody may drive, empty when he may, and `barsIn(now)` in how many ms that may change by itself;
@@ -45,6 +52,7 @@ export class Driver {
       if (!up) this.release("the connection is lost");
     });
     headset.addEventListener("refused", ({ detail: { name, kind, reason } }) => {
+      if (kind === NO_ROUTE) this.#noRouteAt = performance.now();
       if (name === this.#aimed?.topic) this.release(refused(kind, reason));
     });
     headset.clock.addEventListener("anew", () => this.release("another clock begins"));
@@ -115,7 +123,10 @@ export class Driver {
     const began = this.#hold.input(sample, made);
     if (was && !this.held) this.#ended();
     const due = this.held && performance.now() - this.#sentAt >= 1000 / this.limits.hz - 2;
-    if (began) this.changed();
+    if (began) {
+      this.#acted.clear();
+      this.changed();
+    }
     if (began || due) this.#tick();
     return true;
   }
@@ -125,6 +136,16 @@ export class Driver {
     const was = this.held;
     this.#hold.release(why);
     if (was) this.#ended();
+  }
+
+  /**
+   * A robot says how often the dead-man of what is driven has acted. Once more since somebody took hold: it has stood, as commands
+   * did not come, and goes on only when he takes hold anew.
+   */
+  acted(robot, times) {
+    if (!this.held) return;
+    if (!this.#acted.has(robot)) this.#acted.set(robot, times);
+    else if (times > this.#acted.get(robot)) this.release("the robot's dead-man has acted");
   }
 
   /** Something has changed that may bar driving, or permit it. */
@@ -216,8 +237,11 @@ export class Driver {
     let lastAt = 0;
     while (owing() && debts.isOpen(performance.now())) {
       const there = await this.headset.online().catch(() => null);
-      const paid = there && owing() ? debts.pay(there.robots) : null;
+      // without a router a gateway goes on with who was online: what is said now may come to nobody
+      const routed = performance.now() - this.#noRouteAt > ROUTED_MS;
+      const paid = there && owing() && routed ? debts.pay(there.robots) : null;
       if (paid) zero(paid);
+      else if (!routed && owing()) zero();
       if (paid && late) {
         for (const ms of LATE_ZEROS_MS) setTimeout(() => owing() && zero(paid), ms);
         lastAt = performance.now() + LATE_ZEROS_MS.at(-1);

@@ -4,6 +4,7 @@ const REFUSED = {
   too_old: "the command came too late",
   repeated: "the command came twice",
   out_of_order: "the command came behind a later one",
+  no_route: "the command went nowhere",
   no_clock: "the robot does not know how late it is here",
 };
 

@@ -46,7 +46,10 @@ export class CommandLink {
     this.poking = new Poke(this.headset);
     this.standing = new Standing({
       ask,
-      told: (robot, { stopped }) => this.halt.note(robot, stopped === true),
+      told: (robot, { stopped }, deadman) => {
+        this.halt.note(robot, stopped === true);
+        if (deadman) this.driver.acted(robot, deadman.trips);
+      },
       done: () => this.driver.judge(),
     });
     this.clock = new CommandClock(this.headset);

@@ -11,7 +11,10 @@ export class Standing {
   #busy = false;
   #again = false;
 
-  /** `ask(path)` gives JSON or null; `told(robot, answer)` is called for each that answers, `done()` after each round. */
+  /**
+   * `ask(path)` gives JSON or null; `told(robot, answer, deadman)` is called for each that answers, with what it says of the topic's
+   * dead-man, or null; `done()` after each round.
+   */
   constructor({ ask, told, done }) {
     this.ask = ask;
     this.told = told;
@@ -71,6 +74,6 @@ export class Standing {
       /** Whether it asks what time commands were made. */
       compares: typeof answer.max_timed_command_age_s === "number",
     });
-    this.told(robot, answer);
+    this.told(robot, answer, node?.deadman ?? null);
   }
 }
