@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from macs_zenoh.errors import Unreachable
 from macs_zenoh.protocol import trace
-from macs_zenoh.protocol.keyexpr import STREAM, UNICAST
+from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.messages import ROS, node_name
 from macs_zenoh.protocol.offers import absolute
 from macs_zenoh.protocol.trace import ROUTER, Hop, Offset, Point, Report, TraceRequest, at_share
@@ -88,7 +88,10 @@ class Traced:
 class Tracing:
     """One ``macs trace``."""
 
-    def __init__(self, site: Site, robot: int, topic: str, *, every: int, commands: bool) -> None:
+    def __init__(
+        self, site: Site, robot: int, topic: str, *, every: int, commands: bool, programs: Programs | None = None
+    ) -> None:
+        """``programs`` asks in another way than by pings."""
         self._site = site
         self._mesh = site.agent.mesh
         self._robot = robot
@@ -99,7 +102,7 @@ class Tracing:
         if found is None:
             raise Unreachable(f"robot {robot}", "it is not online (macs ls)")
         self._robot_zid = found.zid
-        self._programs = Programs(self._mesh, site.timeout_s)
+        self._programs = programs or Programs(self._mesh, site.timeout_s)
         self._names = self._programs.names
         self._names[found.zid] = f"robot {robot}"
         self._looking: list[Noting] = []
@@ -113,7 +116,7 @@ class Tracing:
     def _key(self) -> str:
         """How the keys begin of what is traced."""
         if self._commands:
-            return UNICAST.every(type=ROS, id=self._robot).removesuffix("**")
+            return trace.told_to(self._robot)
         return STREAM.of(type=ROS, id=self._robot, node=node_name(self._topic))
 
     async def begin(self) -> None:

@@ -49,7 +49,7 @@ class Page:
         self._robots = Robots(gateway.mesh)
         self._picture = Picture(gateway.mesh, gateway.directory, self._robots)
         self._definitions = Definitions(self._robots)
-        self._traces = Traces(gateway.mesh, gateway.directory)
+        self._traces = Traces(gateway.mesh, gateway.directory, self._robots.ask)
         self._drawn: dict[str, tuple[float, bytes]] = {}
         """By token, when the picture of the mesh was made, and what it was: of a large mesh it takes milliseconds."""
         self._credit = Credit(BYTES_PER_S, time.monotonic())

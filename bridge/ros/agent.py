@@ -2,8 +2,8 @@
 
 Verbs: ``add_node`` (data: AddNode) and ``remove_node`` (RemoveNode), answered with nothing or a refusal that says why;
 ``offers`` (no data), answered with `robot_state.Offered`; ``definitions`` (`DefinitionsRequest`), with the texts of
-types; ``status`` (no data), ``control`` (`ControlRequest`) and ``stop`` (``true`` or ``false``), answered with JSON.
-See docs/robot.md.
+types; ``status`` (no data), ``control`` (`ControlRequest`) and ``stop`` (``true`` or ``false``), answered with JSON;
+``trace``, see `traced`. See docs/robot.md.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from bridge.ros.safety import EmergencyStop
 from bridge.ros.side import NamesAndTypes, Side
 from bridge.ros.sleepers import stop_sleepers
 from bridge.ros.stop_line import StopLine
+from bridge.ros.traced import telling
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import MacsError, Refused, WireError
@@ -161,6 +162,7 @@ class RobotAgent:
             ("definitions", self._tell_definitions),
             ("status", self._status),
             ("control", self._control),
+            ("trace", telling(self.agent)),
         ):
             self.agent.serve(verb, handler, most_bytes=CALL_BYTES)
         self.agent.serve("stop", self._stopped, first=self._stop, stand_in=True)

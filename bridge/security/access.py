@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from bridge.security.policy import Client, Gateway, Operator, Policy, Robot, Router, kind_of
+from bridge.security.policy import LOOK_VERBS, Client, Gateway, Operator, Policy, Robot, Router, kind_of
 from macs_zenoh.protocol.key_expressions import distinct
 from macs_zenoh.protocol.keyexpr import (
     ADMIN,
@@ -47,6 +47,9 @@ from macs_zenoh.protocol.messages import NOBODY, OPERATOR, ROS, UNITY
 from macs_zenoh.protocol.rmw_zenoh.keyexpr import session_keys
 
 TYPES = {"robots": ROS, "gateways": UNITY, "operators": OPERATOR}
+
+VISITOR: dict[str, FieldValue] = {"from_type": UNITY, "from_id": 0}
+"""As whom a gateway asks for its page: a headset that has not joined, which has no id of any block."""
 
 INGRESS, EGRESS = "ingress", "egress"
 
@@ -275,6 +278,8 @@ class _Outbound:
     def queries(self) -> Iterator[str]:
         for sender in self._as:
             yield from _every(CALL, self._callees(), sender)
+        if isinstance(self._client, Gateway) and self._client.blocks:
+            yield from _every(CALL, self._looked_at(), VISITOR)
         if self._name is not None:
             for name in self._friends:
                 yield NAMED.every(name=name, from_name=self._name)
@@ -282,6 +287,13 @@ class _Outbound:
         if isinstance(self._client, Operator):
             yield PING.every()
             yield from ADMIN
+
+    def _looked_at(self) -> Iterator[Fields]:
+        """What its page asks of robots, whoever looks at it."""
+        for callee in self._callees():
+            if callee["type"] == ROS:
+                verbs = [verb for verb in LOOK_VERBS if callee.get("verb", verb) == verb]
+                yield from ({**callee, "verb": verb} for verb in verbs)
 
     def _callees(self) -> list[Fields]:
         policy, client = self._policy, self._client

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from bridge.security import access
 from bridge.security.expected import Expected, agent_of, presence_of, sender_of
-from bridge.security.policy import Client, Gateway, Operator, Policy, Robot
+from bridge.security.policy import LOOK_VERBS, Client, Gateway, Operator, Policy, Robot
 from macs_zenoh.protocol import keyexpr
 from macs_zenoh.protocol.keyexpr import (
     BROADCAST,
@@ -180,6 +180,7 @@ class Attempts:
             for name in self._here:
                 yield from self._calls(client, name)
                 yield from self._named_questions(client, name)
+            yield from self._looks(client)
             for other in self._here:
                 key = PING.of(zid=f"{MARK}-{other.name}")
                 yield Question(client.name, f"{client.name} pings {other.name}", key, isinstance(client, Operator))
@@ -207,6 +208,18 @@ class Attempts:
                         what = f"{impostor.name} answers {client.name} as {callee.name}"
                         permitted = self._expected.speaks_as(impostor, callee)
                         yield Question(client.name, what, key, permitted, impostor.name)
+
+    def _looks(self, client: Client) -> Iterator[Question]:
+        """What gateways ask for their pages, and nobody else may."""
+        for callee in self._here:
+            if not isinstance(callee, Robot) or callee is client:
+                continue
+            verbs = self._policy.verbs(client, callee) if isinstance(client, Gateway) else []
+            own = isinstance(client, Gateway) and not client.blocks  # it speaks for every headset
+            for verb in (MARK, *self._verbs):
+                key = CALL.of(**agent_of(callee), verb=verb, **access.VISITOR)
+                permitted = (verbs is None or verb in verbs) and (own or verb in LOOK_VERBS)
+                yield Question(client.name, f"{client.name} asks {callee.name} {verb} for a page", key, permitted)
 
     def _named_questions(self, client: Client, name: Client) -> Iterator[Question]:
         by = access.awareness_name(name)

@@ -53,8 +53,10 @@ RESERVED_KEYS = ("macs",)
 
 PORT = 7447
 
-SEE_VERBS = ("add_node", "remove_node", "offers", "definitions", "status")
-"""Calls that go with seeing a robot: to register for a topic, to ask what there is and how the robot is."""
+LOOK_VERBS = ("offers", "definitions", "status", "trace")
+"""Calls that only ask: what there is, how the robot is, and where the time of its messages goes."""
+SEE_VERBS = ("add_node", "remove_node", *LOOK_VERBS)
+"""Calls that go with seeing a robot: these, and to register for a topic."""
 COMMAND_VERBS = (*SEE_VERBS, "control", "stop")
 """Calls that go with commanding it."""
 

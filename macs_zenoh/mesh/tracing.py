@@ -102,14 +102,18 @@ class Tracing:
         except WireError as error:
             log.debug("a request for traces cannot be used: %s", error)
             return trace.encode_answer(TraceAnswer())
+        return trace.encode_answer(self.told(request))
+
+    def told(self, request: TraceRequest, beginning: str = "") -> TraceAnswer:
+        """The same of what has a key that begins so."""
         now = time.monotonic()
         if not self._answers.take(1, now):
-            return trace.encode_answer(TraceAnswer())
+            return TraceAnswer()
         self._want(request, now)
         with self._lock:
             reports = [report for report in self._reports if report.number > request.after]
             missed = max(0, self._number - request.after - len(reports)) if request.after else 0
-        return trace.encode_answer(TraceAnswer(reports, missed))
+        return TraceAnswer([report for report in reports if report.key.startswith(beginning)], missed)
 
     def _want(self, request: TraceRequest, now: float) -> None:
         until_s = now + request.seconds

@@ -15,7 +15,8 @@ from typing import Annotated, NamedTuple
 import msgspec
 
 from ..errors import BadField, BadJson, TooLong
-from .messages import Count
+from .keyexpr import STREAM, UNICAST
+from .messages import ROS, Count
 
 PREFIX = b"macs: trace "
 """How a ping begins that asks for traces; JSON follows it (`TraceRequest`)."""
@@ -81,6 +82,16 @@ class TraceAnswer(msgspec.Struct, frozen=True):
 
     reports: list[Report] = []
     missed: Count = 0
+
+
+def said_by(robot: int) -> str:
+    """How the keys begin of what a robot sends to all who registered."""
+    return STREAM.every(type=ROS, id=robot).removesuffix("**")
+
+
+def told_to(robot: int) -> str:
+    """How the keys begin of what is sent to a robot by its id, commands among others."""
+    return UNICAST.every(type=ROS, id=robot).removesuffix("**")
 
 
 def encode_request(request: TraceRequest) -> bytes:

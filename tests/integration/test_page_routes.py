@@ -476,7 +476,7 @@ async def test_whose_trace_is_awaited_does_not_lose_it_to_another(
 ) -> None:
     """So many topics are traced at one time, and one more is refused; once one is done, another takes its place."""
     gateway = await start_gateway()
-    made = traces.Traces(gateway.mesh, gateway.directory)
+    made = traces.Traces(gateway.mesh, gateway.directory, robots.Robots(gateway.mesh).ask)
     done = {f"/{number}": asyncio.Event() for number in range(traces.TOPICS + 1)}
 
     async def collect(_: traces.Traces, robot: int, topic: str) -> list[dict[str, Any]]:

@@ -174,8 +174,7 @@ export class LatencyView {
     if (!look) {
       if (now - this.lookedAt < SILENT_MS) return;
       const what = this.#commands ? "command has been sent" : `message of ${this.topicChoice.value} has come`;
-      const silent = `no ${what} for ${Math.round((now - this.lookedAt) / 1000)} s that was traced`;
-      say(this.state, `${silent}. Access rules may forbid this gateway to trace.`);
+      say(this.state, `no ${what} for ${Math.round((now - this.lookedAt) / 1000)} s that was traced`);
       return;
     }
     this.lookedAt = now;
