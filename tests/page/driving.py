@@ -110,6 +110,14 @@ GAMEPAD_HELD = f"(() => {{ {GAMEPADS} have(gamepad(true)) }})()"
 """Its shoulder button held, its stick pushed forward."""
 GAMEPAD = f"(async () => {{ {GAMEPADS} have(gamepad(false)); await seen(); have(gamepad(true)); await seen() }})()"
 """The same, after it was seen with its button released."""
+
+
+def face_buttons(*, a: bool, b: bool) -> str:
+    """A gamepad with these buttons pressed, and no other."""
+    pressed = f"[one.buttons[0].pressed, one.buttons[1].pressed] = [{str(a).lower()}, {str(b).lower()}]"
+    return f"(async () => {{ {GAMEPADS} const one = gamepad(false); {pressed}; have(one); await seen() }})()"
+
+
 NO_GAMEPAD = f"(async () => {{ {GAMEPADS} have(); await seen() }})()"
 
 

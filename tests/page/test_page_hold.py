@@ -16,7 +16,7 @@ pytest.importorskip("rclpy")
 
 from macs_zenoh.protocol.rights import Rights
 from tests.page.conftest import HELD, Site, StartSite, released, says, signed_in, with_token
-from tests.page.driving import GAMEPAD, GAMEPAD_HELD, NO_GAMEPAD, Heard, heard_at, hold
+from tests.page.driving import GAMEPAD, GAMEPAD_HELD, NO_GAMEPAD, Heard, face_buttons, heard_at, hold
 from tests.support.browser import Watched, needs_browser
 from tests.support.waiting import until
 
@@ -153,6 +153,28 @@ async def test_a_pressed_stop_ends_a_hold(site: Site, heard: Heard) -> None:
     await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
     await page.page.mouse.up()
     await released(page)
+
+
+async def test_two_buttons_of_a_gamepad_stop(site: Site, heard: Heard) -> None:
+    """A and B together, in any view and while it drives: each press once, and neither of them alone."""
+    page = await site.with_robot()
+    await drives(page, heard, partial(page.value, GAMEPAD))
+    for alone in ({"a": True, "b": False}, {"a": False, "b": True}):
+        await page.value(face_buttons(**alone))
+        assert not await page.value("macsPage.stop.open || macsPage.stop.stopped().length")
+    await page.value(face_buttons(a=True, b=True))
+    await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
+    await stands(page, heard)
+    await released(page)
+    await page.value("new Promise((done) => setTimeout(done, 400))")
+    assert not await page.value("macsPage.stop.open"), "held since before it was released"
+    await page.value("location.hash = 'mesh'")
+    await page.value(face_buttons(a=False, b=False))
+    await page.value(face_buttons(a=True, b=True))
+    await until(lambda: says(page, "#stop-status", "robot 1 stopped"))
+    await page.value(NO_GAMEPAD)
+    await released(page)
+    await page.value("location.hash = 'robot'")
 
 
 async def test_a_zero_comes_through_a_network_that_stood_still(site: Site, heard: Heard) -> None:

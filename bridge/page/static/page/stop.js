@@ -1,13 +1,17 @@
 /**
- * The emergency stop on the page: what `Halt` does, with its button, its key, and its words. A page that is loaded again goes on
- * with a press of before.
+ * The emergency stop on the page: what `Halt` does, with its button, its key, a gamepad's, and its words. A page that is loaded
+ * again goes on with a press of before.
  */
 
+import { gamepadsStop } from "../shared/gamepads.js";
 import { Halt } from "../shared/halt.js";
 import { readKept, writeKept } from "../shared/kept-stop.js";
+import { Press } from "../shared/press.js";
 import { h, say, show } from "./dom.js";
 
 const SURE_MS = 3000;
+/** So often gamepads are read. */
+const READ_MS = 50;
 
 export class Stop {
   /** `tell` tells an event; `get` asks the gateway for JSON; `me` is what this page may (/view/me). */
@@ -24,6 +28,8 @@ export class Stop {
       this.tell("stop", stopped ? `robot ${robot} is stopped` : `robot ${robot} may go on`);
     });
     document.addEventListener("visibilitychange", () => this.halt.again());
+    const pressed = new Press();
+    setInterval(() => pressed.read(gamepadsStop()) && this.press(), READ_MS);
     this.element = this.#build();
     this.halt.again();
   }
@@ -72,7 +78,7 @@ export class Stop {
   #build() {
     this.button = h(
       "button",
-      { type: "button", class: "stop", id: "stop", title: "Stop all robots (Escape)", onclick: () => this.press() },
+      { type: "button", class: "stop", id: "stop", title: "Stop all (Escape, a gamepad's A and B)", onclick: () => this.press() },
       h("span", { class: "stop-sign", "aria-hidden": "true" }),
       h("span", {}, "Stop"),
     );

@@ -16,11 +16,16 @@ export function gamepadDrive(gamepad) {
 }
 
 /** The stop of a gamepad: its two lower face buttons, A and B, by one thumb. */
-export function stopGamepad(gamepad) {
+function stopGamepad(gamepad) {
   return Boolean(gamepad?.buttons[0]?.pressed && gamepad.buttons[1]?.pressed);
 }
 
-export function gamepads() {
+/** Whether the stop is held at any of them. */
+export function gamepadsStop() {
+  return gamepads().some(stopGamepad);
+}
+
+function gamepads() {
   return [...(navigator.getGamepads?.() ?? [])].filter((each) => each?.connected && each.mapping !== "xr-standard");
 }
 

@@ -4,6 +4,7 @@
 
 import { asked, login } from "../page/login.js";
 import { h } from "../page/dom.js";
+import { Press } from "../shared/press.js";
 import { TWIST } from "../shared/twist.js";
 import { Hands } from "./hands.js";
 import { Immersion } from "./immersion.js";
@@ -27,7 +28,7 @@ const CHOSEN = "macs.xr.robot";
 
 class Scene {
   #idleAt = 0;
-  #stopping = true;
+  #stopping = new Press();
   #before = 0;
   #absent = "";
   #blurred = false;
@@ -124,7 +125,7 @@ class Scene {
     const space = this.stage.renderer.xr.getReferenceSpace();
     const immersive = Boolean(frame && space && this.immersion.session);
     const sources = immersive ? this.input.read(frame, space, this.immersion.session.inputSources) : this.looking.sources();
-    this.#stopIfPressed(sources);
+    if (this.#stopping.read(this.input.stops(sources))) this.stop();
     this.#follows(immersive ? space : null);
     this.#undrawn = this.#draw(sources, dt);
     this.#attend();
@@ -179,13 +180,6 @@ class Scene {
     if (idle && at - this.#idleAt < IDLE_MS) return;
     this.#idleAt = at;
     this.links.input(sample, poses, at);
-  }
-
-  /** Pressed anew: who comes with it pressed has pressed nothing. */
-  #stopIfPressed(sources) {
-    const stopping = this.input.stops(sources);
-    if (stopping && !this.#stopping) this.stop();
-    this.#stopping = stopping;
   }
 
   /** Kinds of poses that have a topic. */

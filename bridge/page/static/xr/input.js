@@ -7,7 +7,7 @@
 
 import { Vector3 } from "../vendor/three.js";
 import { pose } from "./axes.js";
-import { gamepads, readGamepads, stopGamepad } from "../shared/gamepads.js";
+import { gamepadsStop, readGamepads } from "../shared/gamepads.js";
 import { Opened } from "../shared/opened.js";
 import { handDrive, joy, pinchPoint, pinched, stickDrive, stopButtons, stopHand } from "./gestures.js";
 
@@ -42,8 +42,7 @@ export class Input {
 
   /** Whether the stop is pressed anywhere. */
   stops(sources) {
-    const pads = gamepads();
-    return sources.some(({ gamepad, stop }) => stop || stopButtons(gamepad)) || pads.some(stopGamepad);
+    return sources.some(({ gamepad, stop }) => stop || stopButtons(gamepad)) || gamepadsStop();
   }
 
   /** {source, forward, turn} while somebody holds on, else null: what drove before goes on. */
