@@ -27,6 +27,9 @@ ZERO_MS = 100.0
 DEADMAN_MS = 500.0 + ZERO_MS
 """As the site's rule has it."""
 BACK_MS = 2000.0
+LOST_MS = 3000.0
+CAMERA = "#camera--camera-image-compressed"
+SHOWN = f"document.querySelector('{CAMERA} canvas').dataset.shown"
 FRESH = 4
 """Commands of a fifth of a second: so many may be on their way when a network stands still."""
 
@@ -122,6 +125,38 @@ async def test_it_is_back_soon_after_its_gateway(site: Site) -> None:
 
     print("gateway", await within(BACK_MS, measured))
     assert await page.value("window.same") == "page"
+
+
+async def test_it_is_back_soon_after_its_router(site: Site) -> None:
+    """Killed and started again: the robot's pictures come again, from the moment at which the router is ready."""
+    page = await site.with_robot()
+
+    async def more(before: int) -> bool:
+        return int(await page.value(SHOWN)) > before
+
+    async def measured() -> float:
+        await site.router.stop(signal.SIGKILL)
+        await page.page.wait_for_selector(f"{CAMERA} .overlay", timeout=60_000)
+        await site.router.start()
+        return await since(partial(more, int(await page.value(SHOWN))))
+
+    print("router", await within(BACK_MS, measured))
+
+
+async def test_a_lost_robot_is_shown_soon(site: Site) -> None:
+    """Its agent is killed: from that moment until the page says so."""
+    page = await site.with_robot()
+    state = "document.querySelector('[data-robot=\"1\"]').dataset.state"
+
+    async def measured() -> float:
+        site.agent.send_signal(signal.SIGKILL)
+        took_ms = await since(partial(page.value, f"{state} === 'lost'"))
+        await site.agent.stop()
+        await site.agent.start()
+        await until(partial(page.value, f"{state} === 'online'"))
+        return took_ms
+
+    print("robot", await within(LOST_MS, measured))
 
 
 async def since(true: Callable[[], Awaitable[object]], began: float | None = None) -> float:
