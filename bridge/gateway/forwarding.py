@@ -32,6 +32,8 @@ from .questions import Questions
 from .routes import Route, Routes
 
 PUBLISHER = int(NodeType.PUBLISHER)
+STOP_BYTES = 64
+"""A message of std_msgs/Bool has 5; what is larger is none, and counts as other commands do."""
 SLOWED_EACH_S, SLOWED_S = 0.02, 0.25
 """So long for each who floods now nobody of them is read from, and so long at most: a headset may freeze."""
 
@@ -218,16 +220,16 @@ class Forwarding:
 
     def _may_go(self, connection: Connection, sent: Sent, route: Route, traffic: Traffic) -> Sent | None:
         """What of a frame to robots goes on now; a command that has waited may, after all that came with it."""
-        now, count, metadata = time.monotonic(), sent.frame.count, sent.metadata
+        now, count, size, metadata = time.monotonic(), sent.frame.count, len(sent.frame.data), sent.metadata
         if traffic is COMMAND and not self._mesh.linked:
             self._goes_nowhere(connection, metadata, route)
         if traffic is not COMMAND:
-            passing = connection.pace.request(count, now)
-        elif metadata.data_exchange_type in STOP_TYPES:
+            passing = connection.pace.request(count, now, size)
+        elif metadata.data_exchange_type in STOP_TYPES and len(sent.frame.last.body) <= STOP_BYTES:
             waits = metadata.node_name == STOP_NAME and self._waits_for_stop(connection, sent, route)
             return None if waits else sent
         else:
-            passing = connection.pace.command((sent.frame.destination, metadata.node_name), count, now)
+            passing = connection.pace.command((sent.frame.destination, metadata.node_name), count, now, size)
         if passing is Passing.FLOODED:
             halt = self._halt(connection, sent, passing, now) if traffic is COMMAND else None
             lost = count - (halt is not None)

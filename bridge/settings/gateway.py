@@ -62,7 +62,8 @@ class GatewaySettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=
     max_frames_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0
     """Frames of every kind from one connection; the rest is dropped and counted. 0: no limit."""
     max_commands_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
-    """Of these, commands to robots; as a robot's own limit, before they fill the way to it. Stops are not counted."""
+    """Of these, commands to robots; as a robot's own limit, before they fill the way to it. Stops are not counted, and
+    each 16 KiB of what is larger."""
     max_requests_per_s: Annotated[float, Meta(ge=0, le=1_000_000)] = 2000.0
     """And all else that goes to robots. All who send much have four times as much together."""
     handshake_timeout_s: Seconds = 10.0

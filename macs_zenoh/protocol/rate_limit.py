@@ -33,6 +33,9 @@ class Passing(Enum):
 
 NOW, FLOODED, WAITED, TOO_OLD = Passing.NOW, Passing.FLOODED, Passing.WAITED, Passing.TOO_OLD
 
+SINGLE_BYTES = 16 << 10
+"""What is larger counts as several, for it is on the way of all others for as long."""
+
 
 TOGETHER_S = 0.05
 """What has waited comes with smaller gaps than this, as far as they are not the network's."""
@@ -124,6 +127,9 @@ class Pace:
     KINDS = 256
     """So many flows are known; of more than these the one that began first is forgotten."""
 
+    NEW_KIND = 8
+    """A command of a kind that is not known counts as so many: robots look for its node, and keep it for a moment."""
+
     DOUBT_S = 10.0
     """Who sends commands for so long, and no answer that proves any recent, is judged by its pace from then on."""
 
@@ -151,19 +157,21 @@ class Pace:
         """It goes on for an agent that comes back, which has earned nothing by that: it has what it had left."""
         self._commands, self._requests, self._halts = former._commands, former._requests, former._halts
 
-    def request(self, count: int, now: float) -> Passing:
-        """Of so many messages that are no commands."""
-        if not self._requests.take(count, now):
+    def request(self, count: int, now: float, size: int = 0) -> Passing:
+        """Of so many messages that are no commands, of ``size`` bytes together."""
+        cost = _cost(count, size, self._requests)
+        if not self._requests.take(cost, now):
             return FLOODED
         if self._together is None or self._requests.left(now) >= self._little:
             return NOW
-        return NOW if self._together.take(count, now) else FLOODED
+        return NOW if self._together.take(cost, now) else FLOODED
 
-    def command(self, kind: Hashable, count: int, now: float) -> Passing:
-        """Of so many commands of one kind that came together; of those that may be an emergency stop nobody asks."""
-        if not self._commands.take(count, now):
-            return FLOODED
+    def command(self, kind: Hashable, count: int, now: float, size: int = 0) -> Passing:
+        """Of so many commands of one kind, of ``size`` bytes, that came together; stops are not asked about."""
         flow = self._flows.get(kind)
+        cost = _cost(count, size, self._commands, 1 if flow is not None else self.NEW_KIND)
+        if not self._commands.take(cost, now):
+            return FLOODED
         if flow is None:
             if len(self._flows) >= self.KINDS:
                 del self._flows[next(iter(self._flows))]
@@ -219,3 +227,9 @@ class Pace:
         if self._doubted_s > self.DOUBT_S:
             self._answers_count = self._in_doubt = False
         return self._in_doubt
+
+
+def _cost(count: int, size: int, credit: Credit, least: int = 1) -> float:
+    """What messages take of it: one each, or as many as they are large. Never more than half a second's worth, so that
+    the largest passes as well."""
+    return max(count, min(max(-(-size // SINGLE_BYTES), least), credit.frames_per_s / 2))

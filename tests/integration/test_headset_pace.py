@@ -227,6 +227,19 @@ async def test_a_flood_is_held_to_its_share_and_a_stop_is_not(
         assert len(taken(robot)) < 5000
 
 
+@pytest.mark.parametrize("node", [MOVE, STOP], ids=["commands", "what is no stop"])
+async def test_large_commands_count_as_many(start_gateway: StartGateway, robot: Agent, node: tuple[str, str]) -> None:
+    """Of forty of 1 MiB a few go on, also where they are said to be an emergency stop; the rest is counted."""
+    gateway = await start_gateway(max_commands_per_s=100)
+    metadata = Metadata(node_type=2, node_name=node[0], data_exchange_type=node[1])
+    large = encode_frame(1, (7,), message=encode_message(metadata.encode(), bytes(1 << 20)))
+    async with socket(gateway) as headset:
+        await ready(gateway, headset)
+        headset.writer.write(large * 40)
+        await until(lambda: len(robot._inbox) + drops(gateway, headset).get("flooded", 0) == 40)
+        assert 0 < len(robot._inbox) <= 20, "two at once, and two more each second"
+
+
 class Answering:
     """A headset that speaks as existing programs do, through a connection that can stand still: what it says waits
     there, an answer to its gateway behind the commands that it has said before."""

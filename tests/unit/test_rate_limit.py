@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from macs_zenoh.protocol.credit import Credit
-from macs_zenoh.protocol.rate_limit import FLOODED, NOW, TOGETHER, TOO_OLD, WAITED, Pace, Passing
+from macs_zenoh.protocol.rate_limit import FLOODED, NOW, SINGLE_BYTES, TOGETHER, TOO_OLD, WAITED, Pace, Passing
 from macs_zenoh.protocol.recency import Recency
 
 MOVE, ARM = "move", "arm"
@@ -25,6 +25,45 @@ def test_commands_and_requests_have_limits_of_their_own(pace: Pace) -> None:
     assert [pace.request(1, 0.0) for _ in range(12)] == [NOW] * 10 + [FLOODED] * 2
     assert [pace.command(MOVE, 50, 0.0) for _ in range(3)] == [NOW] * 2 + [FLOODED]
     assert pace.request(5, 0.5) is NOW
+
+
+def test_large_messages_count_as_several() -> None:
+    """A second's worth of small ones is 16 KiB each of large ones; the largest passes, if not many of them do."""
+    size, frames_per_s = 1 << 20, 2000
+    each = size // SINGLE_BYTES
+    for judge in (lambda pace, size: pace.command(MOVE, 1, 0.0, size), lambda pace, size: pace.request(1, 0.0, size)):
+        pace = Pace(frames_per_s, frames_per_s, 0.0)
+        assert [judge(pace, size) for _ in range(100)].count(NOW) == frames_per_s // each
+        pace = Pace(frames_per_s, frames_per_s, 0.0)
+        assert [judge(pace, 1 << 30) for _ in range(100)].count(NOW) == 2
+        pace = Pace(frames_per_s, frames_per_s, 0.0)
+        assert [judge(pace, SINGLE_BYTES) for _ in range(3000)].count(NOW) == frames_per_s
+
+
+def test_small_messages_that_come_together_count_one_each() -> None:
+    """However many bytes a run of them has."""
+    pace = Pace(2000, 2000, 0.0)
+    assert pace.command(MOVE, 2000, 0.0, 2000 * 300) is NOW
+    assert pace.command(MOVE, 1, 0.0, 300) is FLOODED
+
+
+def test_of_ever_new_kinds_few_pass() -> None:
+    """Each makes robots look for a node; who has a hundred, one after the other, sends as much as others."""
+    frames_per_s = 2000
+    pace = Pace(frames_per_s, 0, 0.0)
+    assert [pace.command(number, 1, 0.0) for number in range(4000)].count(NOW) == frames_per_s // Pace.NEW_KIND
+    kinds = [number * 7919 % 2000 for number in range(8000)]
+    assert [pace.command(kind, 1, 1 + number / 4000) for number, kind in enumerate(kinds)].count(NOW) < frames_per_s
+    pace = Pace(frames_per_s, 0, 0.0)
+    for number in range(100):
+        assert pace.command(number, 1, 0.0) is NOW
+    assert {pace.command(number % 100, 1, 1 + number / 1900) for number in range(10_000)} == {NOW}
+
+
+def test_the_largest_passes_at_a_low_limit_too() -> None:
+    """Of one a second, one a second."""
+    pace = Pace(1, 1, 0.0)
+    assert [pace.command(MOVE, 1, now, 1 << 30) for now in (0.0, 0.5, 1.0, 2.5)] == [NOW, FLOODED, NOW, NOW]
 
 
 def test_many_who_send_all_that_one_may_share_what_a_few_may() -> None:
