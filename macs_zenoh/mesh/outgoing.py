@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -28,7 +28,7 @@ from .tracing import Marked, Tracing
 
 log = logging.getLogger("macs.mesh")
 
-CALL = Traffic.CALL  # looked up by a Python call otherwise, for each message
+CALL, COMMAND = Traffic.CALL, Traffic.COMMAND  # looked up by a Python call otherwise, for each message
 
 
 class _Bare:
@@ -69,6 +69,8 @@ class Outgoing:
     PUBLISHERS = 4096
     LARGE_BYTES = 128 << 10
     """Larger ones are given to Zenoh by a thread: on a slow link that takes long."""
+    COMMANDS_BYTES = 32 << 20
+    """So much of large commands may wait for it, as long as it takes Zenoh to drop what does not get on."""
     HERE_BYTES = 8 << 10
     """From so much on, Zenoh is not given what only our own subscriptions take: the copy alone takes it longer than
     all else (64 KiB: 25 of 31 us, measured)."""
@@ -115,6 +117,10 @@ class Outgoing:
         """Keys that have or had a publisher, by who sends."""
         self._on_room: Callbacks[Callable[[], None]] = Callbacks()
         self._sender = Sender(backlog_bytes, loopback.put, lambda: from_thread(self._room))
+        self._commands = Sender(self.COMMANDS_BYTES, loopback.put, lambda: None)
+        """For large commands put on the loop, and what follows them with their keys: Zenoh waits for room for their
+        fragments (``fragment_wait_ms``)."""
+        self._loop_thread = threading.get_ident()
         self._heartbeats = Heartbeats(self.HEARTBEAT_S)
 
     def link_changed(self, linked: bool) -> None:
@@ -125,6 +131,7 @@ class Outgoing:
     def close(self, timeout_s: float) -> None:
         """Send what is queued, for at most so long."""
         self._sender.close(timeout_s)
+        self._commands.close(timeout_s)
         self._heartbeats.close(timeout_s)
 
     def undeclare(self) -> None:
@@ -143,7 +150,10 @@ class Outgoing:
             self.drops["no_route"] += 1
         if self._marked and (mark := self._tracing.mark(key, command=traffic is Traffic.COMMAND)) is not None:
             publisher = Marked(publisher, mark)
-        if traffic is not CALL or (len(payload) < self.HERE_BYTES and self._sender.idle):
+        if traffic is COMMAND and self._is_for_thread(key, payload):
+            if not self._commands.put(publisher, payload, key):
+                self.drops["backlog"] += 1
+        elif traffic is not CALL or (len(payload) < self.HERE_BYTES and self._sender.idle):
             self._loopback.put(publisher, payload)
         elif not kept:
             self._put_large(key, publisher, payload)
@@ -217,7 +227,7 @@ class Outgoing:
 
     def when_sent(self, callback: Callable[[], None]) -> None:
         """Call ``callback``, from any thread, when Zenoh has all that was put before."""
-        self._sender.when_sent(callback)
+        self._sender.when_sent(lambda: self._commands.when_sent(callback))
 
     def _room(self) -> None:
         for callback in self._on_room:
@@ -232,6 +242,11 @@ class Outgoing:
 
     def _is_quick(self, payload: Payload) -> bool:
         return self._sender.idle and len(payload) <= self.LARGE_BYTES
+
+    def _is_for_thread(self, key: str, payload: Payload) -> bool:
+        """Whether a command is left to a thread, since it may take long or would overtake one that does."""
+        large = len(payload) > self.LARGE_BYTES and threading.get_ident() == self._loop_thread
+        return large or self._commands.has(key)
 
     def _put_large(self, key: str, publisher: Outlet, payload: Payload) -> None:
         """Our own subscriptions get the payload as it is, now; Zenoh copies it for others, if any listen."""
@@ -351,8 +366,10 @@ class Sender:
         self._limit_bytes = limit_bytes
         self._on_room = on_room
         self._bytes = 0
-        self._queue: deque[tuple[Outlet, Payload] | Callable[[], None]] = deque()
+        self._queue: deque[tuple[Outlet, Payload, str] | Callable[[], None]] = deque()
         """What is to be put, and who is to be told that all before it has been."""
+        self._keys: Counter[str] = Counter()
+        """How much waits of those that whoever puts has named."""
         self._wake = threading.Condition()
         self._thread: threading.Thread | None = None
         self._closing = False
@@ -367,14 +384,19 @@ class Sender:
         """Nothing is waiting or being sent."""
         return self._bytes == 0
 
-    def put(self, publisher: Outlet, payload: Payload) -> bool:
-        """Queue it; False when that would be more than the limit (one payload may always wait)."""
+    def has(self, key: str) -> bool:
+        """Whether anything with this key is waiting or being sent."""
+        return key in self._keys
+
+    def put(self, publisher: Outlet, payload: Payload, key: str = "") -> bool:
+        """Queue it; False when that would be more than the limit (one payload may always wait). ``key``: for `has`."""
         with self._wake:
             if self._closing or (self._bytes and self._bytes + len(payload) > self._limit_bytes):
                 return False
             self._bytes += len(payload)
             self.backlogged = self._bytes > self._limit_bytes // 4
-            self._queue.append((publisher, payload))
+            self._queue.append((publisher, payload, key))
+            self._keys[key] += 1
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="macs-sender", daemon=True)
                 self._thread.start()
@@ -408,10 +430,13 @@ class Sender:
             if not isinstance(entry, tuple):
                 entry()
                 continue
-            publisher, payload = entry
+            publisher, payload, key = entry
             self._put(publisher, payload)
             with self._wake:
                 self.sent += 1
+                self._keys[key] -= 1
+                if not self._keys[key]:
+                    del self._keys[key]
                 self._bytes -= len(payload)
                 relieved = self.backlogged and self._bytes < self._limit_bytes // 8
                 if relieved:
