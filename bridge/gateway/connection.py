@@ -460,9 +460,9 @@ class Connection(asyncio.BufferedProtocol):
         if self._pauses == 0 and not self._transport.is_closing():
             self._transport.resume_reading()
 
-    def charge(self) -> None:
+    def charge(self, requests: int = 1) -> None:
         """The agent asked for something that costs: one that does so too often is not read from for a moment."""
-        hold_s = self._toll.pay(time.monotonic())
+        hold_s = self._toll.pay(time.monotonic(), requests)
         if hold_s > 0 and self.slow_down(hold_s):
             self.complain("slowed_down", f"it asks for more than {REQUESTS_PER_S} things a second")
 

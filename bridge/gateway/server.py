@@ -29,6 +29,7 @@ from macs_zenoh.protocol.credit import Credit, Credits
 from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.directory import AgentInfo, Change
 from macs_zenoh.protocol.keyexpr import BROADCAST, STREAM, UNICAST
+from macs_zenoh.protocol.limits import REGISTRATION_REQUESTS
 from macs_zenoh.protocol.messages import ROS, UNITY, AccessRefused
 from macs_zenoh.protocol.rate_limit import TOGETHER, Pace
 from macs_zenoh.protocol.recipient import Recipient, to_agent
@@ -420,7 +421,7 @@ class Gateway:
             connection.charge()
         elif isinstance(event, Registering):
             self._registry.register(connection, event)
-            connection.charge()
+            connection.charge(REGISTRATION_REQUESTS)
         elif isinstance(event, RegistrationRefused):
             self._registry.refused(connection.key, event.refused)
         elif isinstance(event, Forbidden):
@@ -492,7 +493,7 @@ class Gateway:
                 continue
             if registrants is None:
                 self._delivery.streams.pop(key, None)
-                self._subscriptions.remove(key)
+                self._subscriptions.leave(key)
             else:
                 self._delivery.streams[key] = Stream((ROS, robot_id), node, registrants)
                 # whether a robot keeps a stream for recovery is seen from its messages: others cost nothing more

@@ -100,9 +100,9 @@ class Toll:
         self._each_s = 1 / per_s
         self._paid_until = 0.0
 
-    def pay(self, now: float) -> float:
-        """A piece of work is done for it: for how many seconds nothing more should be taken from it."""
-        self._paid_until = max(now - self.FREE_S, self._paid_until) + self._each_s
+    def pay(self, now: float, pieces: int = 1) -> float:
+        """Work is done for it: for how many seconds nothing more should be taken from it."""
+        self._paid_until = max(now - self.FREE_S, self._paid_until) + pieces * self._each_s
         return min(self.LONGEST_S, max(0.0, self._paid_until - now))
 
 

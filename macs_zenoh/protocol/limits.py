@@ -70,6 +70,10 @@ UNFINISHED_FREE_BYTES = 128 << 10
 REQUESTS_PER_S = 1000
 """Management messages of one TCP agent, 250 at once; one that sends more is read from more slowly."""
 
+REGISTRATION_REQUESTS = 5
+"""So many of these a registration counts as: it is asked of robots, which make something of it in ROS, and declared on
+the mesh."""
+
 NODES_EACH = 1024
 """Interface nodes that one TCP agent may have registered; recorded programs have tens."""
 

@@ -14,6 +14,7 @@ import pytest
 
 import macs_zenoh
 from bridge.gateway.connection import Connection
+from bridge.gateway.subscriptions import Subscriptions
 from bridge.headset.client import Headset
 from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.messages import (
@@ -22,9 +23,11 @@ from macs_zenoh.protocol.messages import (
     Metadata,
     NodeRefused,
     Registration,
+    RemoveNode,
     decode_data,
     encode_data,
     encode_management,
+    node_name,
 )
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message, split_message
 from tests.support.gateways import answers, memory_bytes, site
@@ -269,3 +272,40 @@ async def test_keys_that_are_used_again_get_a_publisher(start_gateway: StartGate
     assert any(
         f"/{receiver.id}/unity/" in key for outlets in gateway.mesh._outgoing._outlets.values() for key in outlets
     )
+
+
+def toggled(topic: str) -> bytes:
+    """A registration on a topic of robot 7, and its end."""
+    nodes = AddNode(2, 1, 1, node_name(topic), topic, "std_msgs/String"), RemoveNode(2, 1, 1, node_name(topic))
+    management = encode_management(Registration(1, 1, node_name(topic), [7], [], topic))
+    said = [encode_message(Metadata(2, 1, message_manager=node.manager).encode(), encode_data(node)) for node in nodes]
+    return b"".join(encode_frame(management=management, message=message) for message in said)
+
+
+async def test_who_registers_and_leaves_again_and_again_declares_once(
+    start_gateway: StartGateway, router: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To declare what a topic needs costs everybody on the mesh, so it stays for a moment when nobody wants it any
+    more, of a few topics at one time; then it ends."""
+    monkeypatch.setattr(Subscriptions, "LINGERING", 8)
+    gateway = await start_gateway()
+    declared: list[str] = []
+    subscribe = gateway.mesh.subscribe
+    monkeypatch.setattr(
+        gateway.mesh, "subscribe", lambda key, *a, **k: (declared.append(key), subscribe(key, *a, **k))[1]
+    )
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)):
+        await until(lambda: (1, 7) in gateway.directory)
+        attacker, before = Raw(gateway.port), set(gateway._subscriptions._by_key)
+
+        def listening() -> set[str]:
+            return set(gateway._subscriptions._by_key) - before
+
+        await attacker.send(toggled("/again") * 50)
+        await until(lambda: len(declared) == 1 and not listening())
+        assert len(declared) == 1
+        await attacker.send(b"".join(toggled(f"/{number}") for number in range(30)))
+        await until(lambda: len(declared) == 31)
+        assert len(listening()) <= 9
+        await until(lambda: not listening())
+        attacker.socket.close()

@@ -76,6 +76,8 @@ def test_work_beyond_a_seconds_worth_is_paid_with_time() -> None:
         done += 1
     assert 950 <= done <= 1050
     assert toll.pay(70.0) == 0.0
+    assert toll.pay(80.0, 25) == 0.0
+    assert 0.04 < toll.pay(80.0, 5) < 0.06, "as five by themselves"
 
 
 def test_of_unfinished_frames_the_oldest_goes() -> None:

@@ -60,7 +60,7 @@ LIMITS = {
         *(limits.NODES_EACH, limits.NODES_PER_ADDRESS, limits.NODES_IN_ALL),
         *(limits.NODES_EACH, NODES),
     ],
-    "registrations, groups, questions who is online": [limits.REQUESTS_PER_S],
+    "questions who is online, groups, registrations": [limits.REQUESTS_PER_S, limits.REGISTRATION_REQUESTS],
     "claims by token of who is online": [Directory.PER_SESSION, Directory.IN_ALL],
     "sessions that claim the same agent, block of ids, name, or type of a name": [Directory.PER_AGENT],
     "names, and message types that names take": [Names.NAMES, Names.TYPES, Names.NAMES_IN_ALL, Names.TYPES_IN_ALL],
