@@ -350,7 +350,8 @@ class InterfaceNodes:
             return
         for lost in self._early.hold(key, message, time.monotonic()):
             reason = "more data before the registration than can be kept"
-            self.drops.note("held_full", key.node_name[:80], reason)
+            about = f"{key.node_name[:80]}: {reason}"  # once for each sender, who may make up names
+            self.drops.note("held_full", str(Registrant.of(message)), about)
             self._tell_unanswered(lost, reason)
         if not self._expiring:
             self._expiring = True
