@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import partial
 
@@ -52,6 +54,9 @@ OPEN_CALLS_EACH = 16
 """Those of one agent among them."""
 CALLS_EACH = 8192
 """Calls of one agent, to all robots, that may be wanted at one time."""
+
+TURN_S = 0.003
+"""After so long of making calls everything else has its turn."""
 
 CallKey = tuple[int, int, str]
 """(robot id, node type, node name)."""
@@ -98,6 +103,12 @@ class RobotCalls:
         self._online: Robots = {agent.id: agent.group for agent in directory.of_type(ROS)}
         self._calls: dict[AgentKey, dict[CallKey, _Call]] = {}
         self._turns: dict[int, Turns[CallKey, _Call]] = {}
+        self._ready: dict[Turns[CallKey, _Call], int] = {}
+        """Those of which calls may be made, with their robots."""
+        self._goes_on = False
+        """Whether they are in another round of the loop."""
+        self._to_start: deque[Iterator[Task]] = deque()
+        """Tasks whose calls are not wanted yet, since there are many."""
         self._message: tuple[AddNode | RemoveNode | None, bytes] = (None, b"")
         """What robots were told last, as a message."""
         self._closed = False
@@ -112,6 +123,8 @@ class RobotCalls:
                     wanted.again.cancel()
         self._calls.clear()
         self._turns.clear()
+        self._ready.clear()
+        self._to_start.clear()
 
     def register(self, node: AddNode | RemoveNode, robot_ids: list[int], groups: list[int]) -> None:
         """An agent registers on, or leaves, a node of these robots."""
@@ -167,8 +180,7 @@ class RobotCalls:
             return
         if agent.type != ROS:
             if not online:
-                for task in self._registrations.holder_left(agent.key, self._online):
-                    self._start(task)
+                self._start_all(self._registrations.holder_left(agent.key, self._online))
             return
         if not online:
             self._online.pop(agent.id, None)
@@ -177,8 +189,7 @@ class RobotCalls:
         self._online[agent.id] = agent.group
         left = self._registrations.seen(agent.id, agent.group)
         self._streams_changed()
-        for task in [*(left if was_online else ()), *self._registrations.of_robot(agent.id, agent.group)]:
-            self._start(task)
+        self._start_all([*(left if was_online else ()), *self._registrations.of_robot(agent.id, agent.group)])
 
     def to_prepare(self, agent: AgentKey, agent_id: int) -> list[Task]:
         """What makes robots know an agent under the id that it is about to have, too. Services, which take one agent
@@ -201,7 +212,9 @@ class RobotCalls:
         """An agent has another id now; robots forget the one before. ``told`` is what `prepare` gave."""
         before = self._registrations.of_agent(agent, self._online)
         self._registrations.rename(agent, agent_id)
-        self._streams_changed()  # it is registered under the new id
+        self._streams_changed()
+        for task in self._registrations.of_agent((agent[0], agent_id), self._online):
+            self._listen(task)  # it is registered under the new id
         self._forget_calls(agent)
         forget = [Task(task.robot_id, removal(task.node)) for task in before]
         forgotten = await self._try(forget, slow)
@@ -228,14 +241,12 @@ class RobotCalls:
 
     def repeat(self, agent: AgentKey) -> None:
         """Tell robots again everything that one agent registered."""
-        for task in self._registrations.of_agent(agent, self._online):
-            self._start(task)
+        self._start_all(self._registrations.of_agent(agent, self._online))
 
     def repeat_all(self) -> None:
         """Our own link was lost: robots may have seen our agents leave, so tell them everything again."""
         for robot_id, group in self._online.items():
-            for task in self._registrations.of_robot(robot_id, group):
-                self._start(task)
+            self._start_all(self._registrations.of_robot(robot_id, group))
 
     def refuse(self, node: AddNode | RemoveNode, robot_id: int, reason: str) -> None:
         """Tell an agent that it does not get a node of a robot, 0 being all of them."""
@@ -250,11 +261,46 @@ class RobotCalls:
             self._on_refused((node.registrant_agent_type, node.registrant_agent_id), refused)
 
     def _streams_changed(self) -> None:
-        changes = list(self._registrations.news())
-        if changes:
-            self._on_streams(changes)
+        gone: StreamChanges = [(key, None) for key in self._registrations.gone()]
+        if gone:
+            self._on_streams(gone)
+
+    def _listen(self, task: Task) -> None:
+        """A robot is about to be asked for a topic: whoever receives it must do so before."""
+        if isinstance(task.node, AddNode) and task.node.node_type == NodeType.SUBSCRIBER:
+            key = (task.robot_id, task.node.node_name)
+            registrants = self._registrations.wanted(key)
+            if registrants is not None:
+                self._on_streams([(key, registrants)])
 
     # -- calls ---------------------------------------------------------------------------------------------------
+
+    def _start_all(self, tasks: Iterable[Task]) -> None:
+        """Many may be for one robot: what there is no time for now is wanted in other rounds of the loop."""
+        self._to_start.append(iter(tasks))
+        if len(self._to_start) == 1:
+            self._start_some()
+
+    def _start_some(self) -> None:
+        until = time.monotonic() + TURN_S
+        while self._to_start:
+            for task in self._to_start[0]:
+                try:
+                    if self._is_due(task):
+                        self._start(task)
+                except Exception:  # as in `_answered`
+                    log.exception("%s failed", _What(task))
+                if time.monotonic() > until:
+                    asyncio.get_running_loop().call_soon(self._start_some)
+                    return
+            self._to_start.popleft()
+
+    def _is_due(self, task: Task) -> bool:
+        """Whether a task that may have waited is still wanted, as it is."""
+        node, holds = task.node, self._registrations.holds(task, self._online)
+        if not isinstance(node, AddNode):
+            return task.robot_id in self._online and not holds
+        return holds and self._registrations.find(_keys(task)[0], node.node_type, node.node_name) is node
 
     def _start(self, task: Task, attempt: int = 0) -> None:
         agent, key = _keys(task)
@@ -272,10 +318,29 @@ class RobotCalls:
         self._next(task.robot_id, turns)
 
     def _next(self, robot_id: int, turns: Turns[CallKey, _Call]) -> None:
-        while not self._closed and (turn := turns.take()) is not None:
-            self._run(turn[2], turns)
-        if not turns.open and self._turns.get(robot_id) is turns:
-            del self._turns[robot_id]
+        if self._closed:
+            return
+        self._ready[turns] = robot_id
+        if not self._goes_on:
+            self._make_calls()
+
+    def _make_calls(self) -> None:
+        """As many as there is time for now, and the others in other rounds of the loop."""
+        until = time.monotonic() + TURN_S
+        self._goes_on = False
+        while self._ready:
+            turns, robot_id = next(iter(self._ready.items()))
+            turn = turns.take()
+            if turn is not None:
+                self._run(turn[2], turns)
+            else:
+                del self._ready[turns]
+                if not turns.open and self._turns.get(robot_id) is turns:
+                    del self._turns[robot_id]
+            if self._ready and time.monotonic() > until:
+                self._goes_on = True
+                asyncio.get_running_loop().call_soon(self._make_calls)
+                return
 
     def _turn_over(self, robot_id: int, turns: Turns[CallKey, _Call], agent: AgentKey) -> None:
         turns.done(agent)
@@ -312,6 +377,7 @@ class RobotCalls:
         wanted.asked = True
         answered = partial(self._answered, wanted, turns)
         try:
+            self._listen(wanted.task)
             self._mesh.ask(
                 *self._question(wanted.task), answered, timeout_s=CALL_TIMEOUT_S, traffic=Traffic.REGISTRATION
             )
@@ -365,6 +431,7 @@ class RobotCalls:
             log.warning("%s: the robot does not answer", _What(task))
 
     async def _ask(self, task: Task) -> None:
+        self._listen(task)
         await self._mesh.query(*self._question(task), timeout_s=CALL_TIMEOUT_S, traffic=Traffic.REGISTRATION)
 
     def _question(self, task: Task) -> tuple[str, bytes]:

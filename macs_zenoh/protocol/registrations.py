@@ -70,7 +70,9 @@ class Registrations:
         self._members: dict[int, set[int]] = {}
         self._refused: set[_Wish] = set()
         self.streams: dict[StreamKey, set[AgentKey]] = {}
-        self._news: dict[StreamKey, None] = {}
+        self._told: dict[StreamKey, set[AgentKey]] = {}
+        """Of these, which `wanted` has told."""
+        self._gone: dict[StreamKey, None] = {}
 
     def __len__(self) -> int:
         return self._count
@@ -227,11 +229,22 @@ class Registrations:
                 self._refused.discard(wish)
         return tasks
 
-    def news(self) -> Iterator[tuple[StreamKey, set[AgentKey] | None]]:
-        """Streams that somebody wants since this was asked last, and who; None for those that nobody wants now."""
-        news, self._news = self._news, {}
-        for key in news:
-            yield key, self.streams.get(key)
+    def wanted(self, key: StreamKey) -> set[AgentKey] | None:
+        """Who is registered on a robot's topic, as it is from now on, if that was not told before. It is asked when it
+        matters: what a topic needs costs time, and one may register on thousands."""
+        registrants = self.streams.get(key)
+        if registrants is None or self._told.get(key) is registrants:
+            return None
+        self._told[key] = registrants
+        return registrants
+
+    def gone(self) -> Iterator[StreamKey]:
+        """Streams of which `wanted` has told, and that nobody wants any more since this was asked last."""
+        gone, self._gone = self._gone, {}
+        for key in gone:
+            if key not in self.streams:
+                del self._told[key]
+                yield key
 
     # -- inside --------------------------------------------------------------------------------------------------
 
@@ -261,7 +274,6 @@ class Registrations:
             self.streams[key].add(agent)
         else:
             self.streams[key] = {agent}
-            self._news[key] = None
 
     def _unregister(self, key: StreamKey, agent: AgentKey) -> None:
         registrants = self.streams.get(key)
@@ -269,7 +281,8 @@ class Registrations:
             registrants.discard(agent)
             if not registrants:
                 del self.streams[key]
-                self._news[key] = None
+                if key in self._told:
+                    self._gone[key] = None
 
     def _unindex(self, wish: _Wish, robot_ids: Iterable[int], groups: Iterable[int]) -> None:
         for index, names in ((self._by_id, robot_ids), (self._by_group, groups)):

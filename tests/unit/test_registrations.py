@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -136,10 +138,11 @@ def test_robots_have_what_is_wanted_of_them(story_steps: list[tuple[str, tuple[o
 @given(steps)
 def test_streams_are_those_that_somebody_wants(story_steps: list[tuple[str, tuple[object, ...]]]) -> None:
     """A gateway listens to the topics of robots that have a registrant here, also while one is away that it has seen,
-    and knows for each who is registered; what it was told of since it last asked is all that has changed."""
+    and knows for each who is registered once it asks: for robot 1 at once, for 2 later, for all in the end. Of what it
+    was told and nobody wants any more it hears, and of nothing else."""
     story = Story()
     known: dict[tuple[int, str], set[AgentKey]] = {}
-    for what, arguments in story_steps:
+    for step, (what, arguments) in enumerate(story_steps):
         getattr(story, what)(*arguments)
         expected: dict[tuple[int, str], set[AgentKey]] = {}
         for (agent, node_type, name), (ids, groups) in story.wanted.items():
@@ -148,12 +151,19 @@ def test_streams_are_those_that_somebody_wants(story_steps: list[tuple[str, tupl
                     if robot_id in ids or (group and group in groups):
                         expected.setdefault((robot_id, name), set()).add(agent)
         assert story.registrations.streams == expected
-        for key, registrants in story.registrations.news():
-            if registrants is None:
-                del known[key]
-            else:
-                known[key] = registrants
-        assert known == expected
+        for key in story.registrations.gone():
+            del known[key]
+        assert known.keys() <= expected.keys()
+        known |= told(story.registrations, {key for key in expected if key[0] == 1 or (key[0] == 2 and step % 3)})
+        assert {key: known[key] for key in known if key[0] == 1} == {k: v for k, v in expected.items() if k[0] == 1}
+    known |= told(story.registrations, expected)
+    assert known == story.registrations.streams
+    assert told(story.registrations, known) == {}
+
+
+def told(registrations: Registrations, keys: Iterable[tuple[int, str]]) -> dict[tuple[int, str], set[AgentKey]]:
+    """What is told of these streams, now that somebody asks."""
+    return {key: registrants for key in keys if (registrants := registrations.wanted(key)) is not None}
 
 
 # -- examples --------------------------------------------------------------------------------------------------------
@@ -249,7 +259,7 @@ def test_robots_that_nobody_has_seen_cost_nothing() -> None:
     registrations.add(adding(7, NODES[0]), range(1, 1000), [], {})
     assert registrations.streams == {}
     registrations.seen(500, 0)
-    assert list(registrations.news()) == [((500, NODES[0]), {(2, 7)})]
+    assert told(registrations, registrations.streams) == {(500, NODES[0]): {(2, 7)}}
 
 
 def test_who_holds_a_service_keeps_it() -> None:
