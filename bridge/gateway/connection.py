@@ -476,6 +476,7 @@ class Connection(asyncio.BufferedProtocol):
 
     def _go_on(self) -> None:
         self._tolled = None
+        self.peer.floods = False
         self.resume()
 
     def cut_unfinished(self) -> None:

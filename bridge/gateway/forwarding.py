@@ -236,6 +236,7 @@ class Forwarding:
             if lost:
                 connection.complain("flooded", "it sends robots more than one agent may", lost)
             self._slow_down(connection, now)
+            connection.peer.floods |= traffic is COMMAND
             return halt
         if traffic is COMMAND:
             connection.drove_at = now

@@ -317,6 +317,9 @@ class TcpAgent:
         self.state = GREETED
         self.drops: Counter[str] = Counter()
         self.corrected = 0
+        self.floods = False
+        """Whether it sends robots more commands than it may: those are dropped unread, until whoever set this resets
+        it."""
         self.partial_bytes = 0
         """How much memory a frame has that has begun and is not whole."""
         self._limits = limits
@@ -411,7 +414,10 @@ class TcpAgent:
             if (self._limits.frames_per_s or self.grant.credit is not None) and not self._covered(frame, now):
                 self._too_fast(frame, now, events)
             elif self.state is ONLINE and not frame.has_management:
-                self._send(frame, events)
+                if self.floods and self._is_one_more(frame):
+                    self.drops["flooded"] += frame.count
+                else:
+                    self._send(frame, events)
             else:
                 self._frame(frame, events)
         except NotPermitted as error:
@@ -844,6 +850,14 @@ class TcpAgent:
         sent = self._judged(frame)
         return Streamed(sent.frame, sent.metadata, sent.readable, stream.targets())
 
+    def _is_one_more(self, frame: Frames) -> bool:
+        """Whether a frame is a command to robots, and surely none that stops one. Not parsed: that is what a flood
+        costs."""
+        if frame.data[0] != ROS:
+            return False
+        raw = frame.metadata
+        return _IS_COMMAND in raw and not any(word in raw for word in _MAY_STOP)
+
     def _send(self, frame: Frames, events: list[Event]) -> None:
         sent = self._judged(frame)
         if self._rights is not None:
@@ -875,6 +889,10 @@ class TcpAgent:
     def _gone(self) -> bool:
         return self.state is GONE
 
+
+_IS_COMMAND = b'"nodeType":%d,' % COMMAND
+_MAY_STOP = (b"Bool", b"Twist")
+"""In the types of messages that stop a robot, or say that it stand still (`guard.STOP_TYPES`, `halts`)."""
 
 _NO_NODE = (
     f"its message names neither {AddNode.manager} nor {RemoveNode.manager}: management data and message are one "

@@ -1143,3 +1143,26 @@ def test_all_who_have_a_token_share_its_rate() -> None:
     events = [event for peer in peers for _ in range(4) for event in peer.receive(message(), 0.0)]
     assert len([event for event in events if isinstance(event, Sent)]) == 3
     assert errors(events) == [TooFast] * 5
+
+
+def test_who_floods_robots_is_not_read() -> None:
+    """Of what it sends them, commands are counted and not parsed; what may stop one passes, and all that is none."""
+    peer = online()
+
+    def said(to: int, node_type: int, data_type: str) -> bytes:
+        metadata = Metadata(UNITY, 7, node_type=node_type, node_name="nd__x", data_exchange_type=data_type)
+        return encode_frame(to, (5,), message=encode_message(metadata.encode(), b"12345"))
+
+    dropped = said(ROS, 2, "std_msgs/String")
+    passing = [
+        *(said(ROS, 2, kind) for kind in ("std_msgs/Bool", "geometry_msgs/Twist", "geometry_msgs/msg/TwistStamped")),
+        *(said(ROS, 3, "std_srvs/Trigger"), said(UNITY, 2, "std_msgs/String"), said(0, 2, "std_msgs/String")),
+    ]
+    for floods in (False, True, False):
+        peer.floods = floods
+        sent = singles(peer.receive(b"".join([dropped, *passing, dropped, dropped]), 1.0))
+        assert all(isinstance(event, Sent) for event in sent)
+        assert len(sent) == len(passing) + 3 * (not floods)
+    assert peer.drops == {"flooded": 3}
+    peer.floods = True
+    assert peer.receive(dropped.replace(b"{", b"["), 1.0) == []
