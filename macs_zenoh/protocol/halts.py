@@ -21,6 +21,8 @@ _BEGIN = 4
 _STAMP = 8
 _VELOCITY = 6
 """Numbers: along and around three axes."""
+_MOST_BYTES = 1024
+"""What says it passes limits, so it is small."""
 
 
 def may_halt(data_type: str) -> bool:
@@ -30,7 +32,7 @@ def may_halt(data_type: str) -> bool:
 
 def halts(data_type: str, data: Buffer) -> bool:
     """Whether a command says it; CDR that is cut short or written in another way does not."""
-    if len(data) < _BEGIN or data[0] or data[1] > 1:
+    if not _BEGIN <= len(data) <= _MOST_BYTES or data[0] or data[1] > 1:
         return False
     order = "<" if data[1] else ">"
     kind = short_type(data_type)

@@ -140,7 +140,7 @@ class Paced(Pace):
         super().__init__(0, 0, 0.0)
         self._clock, self.seen = clock, 0
 
-    def command(self, kind: Hashable, count: int, now: float) -> Passing:
+    def command(self, kind: Hashable, count: int, now: float, size: int = 0) -> Passing:
         self.seen += 1
         return super().command(kind, count, self._clock[0])
 
@@ -148,7 +148,7 @@ class Paced(Pace):
 class OnePaused(Pace):
     """Of a connection whose first command has waited, and the second not: they are far apart in one long read."""
 
-    def command(self, kind: Hashable, count: int, now: float) -> Passing:
+    def command(self, kind: Hashable, count: int, now: float, size: int = 0) -> Passing:
         first, self._flows[kind] = kind not in self._flows, Flow()
         return Passing.WAITED if first else Passing.NOW
 
@@ -382,7 +382,7 @@ class Said(Pace):
         super().__init__(0, 0, 0.0)
         self._passings = [*passings]
 
-    def command(self, kind: Hashable, count: int, now: float) -> Passing:
+    def command(self, kind: Hashable, count: int, now: float, size: int = 0) -> Passing:
         return self._passings.pop(0) if len(self._passings) > 1 else self._passings[0]
 
 

@@ -69,6 +69,7 @@ async def test_a_large_command_is_put_by_a_thread_and_what_follows_it_comes_behi
     here: list[tuple[int, bytes]] = []
     async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
         mesh.subscribe(KEY, keeper(here))
+        await until(lambda: mesh.linked)
         sent = payloads(40)
         for payload in sent:
             looped = mesh.looped

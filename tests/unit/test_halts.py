@@ -50,6 +50,8 @@ def test_what_is_no_whole_velocity_says_nothing() -> None:
             assert not halts(kind, whole[:size])
         assert not halts(kind, b"\0\x07" + whole[2:])
         assert not halts(kind, b"\1" + whole[1:])
+        assert halts(kind, whole + bytes(16))
+        assert not halts(kind, whole + bytes(1 << 20)), "large"
     assert not halts(TWIST_STAMPED, b"\0\1\0\0" + bytes(8) + b"\xff" * 4 + bytes(64)), "a name beyond the end"
     for name in ("std_msgs/Float64", "geometry_msgs/Point", "geometry_msgs/Accel", "Twist", ""):
         assert not may_halt(name)

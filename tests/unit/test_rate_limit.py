@@ -37,7 +37,9 @@ def test_large_messages_count_as_several() -> None:
         pace = Pace(frames_per_s, frames_per_s, 0.0)
         assert [judge(pace, 1 << 30) for _ in range(100)].count(NOW) == 2
         pace = Pace(frames_per_s, frames_per_s, 0.0)
-        assert [judge(pace, SINGLE_BYTES) for _ in range(3000)].count(NOW) == frames_per_s
+        assert (
+            frames_per_s - Pace.NEW_KIND < [judge(pace, SINGLE_BYTES) for _ in range(3000)].count(NOW) <= frames_per_s
+        )
 
 
 def test_small_messages_that_come_together_count_one_each() -> None:
