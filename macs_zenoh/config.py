@@ -43,6 +43,21 @@ class ZenohEntry(NamedTuple):
     chosen: bool
 
 
+NEVER_BLOCKS: dict[str, Any] = {
+    "id": "commands wait for nobody",
+    "messages": ["put"],
+    "flows": ["ingress"],
+    "qos": {"priority": "real_time"},
+    "key_exprs": ["**/macs/**"],
+    "overwrite": {"congestion_control": "drop"},
+}
+"""What a router makes of puts with the priority of commands: where a link is full they are dropped.
+
+Ours say so themselves. A blocking put of somebody else keeps the lock of its queue while it waits, so everybody's
+commands to that robot wait behind it, and with them the threads that read their links: a router of Zenoh 1.10.2 has
+two. Then a stop is not even read."""
+
+
 class MeshSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a program joins the mesh. The comments name Zenoh's own paths and say why we differ from its defaults."""
 
@@ -156,6 +171,7 @@ class MeshSettings(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
                 for name in get_args(Priority)
                 for field in ["stream_queue_batches" if name in STREAM_PRIORITIES else "tx_queue_batches"]
             ),
+            *([("qos/network", [NEVER_BLOCKS], ())] if self.mode == "router" else []),
             # As zenohd has it: `macs doctor` reads versions, sessions and links between routers there.
             *([("adminspace/enabled", True, ())] if self.mode == "router" else []),
             *([("namespace", self.namespace, ("namespace",))] if self.namespace else []),

@@ -106,7 +106,8 @@ def router_json5(policy: Policy, router: Router, directory: str) -> str:
     _put(tree, "transport/link/protocols", protocols)
     tree["adminspace"] = {"enabled": True, "permissions": {"read": True, "write": False}}
     tree["metadata"] = {"name": router.name}
-    body = [*_members(tree, "", 1), "", *_access(policy, router), *_traffic(policy)]
+    own_rules = tree.pop("qos")["network"]
+    body = [*_members(tree, "", 1), "", *_access(policy, router), *_traffic(policy, own_rules)]
     return "\n".join(
         [
             f"// Router {router.name}, made by `macs security generate` from a policy: change that, not this.",
@@ -236,16 +237,15 @@ GUARD = 2.0
 message that was a little late there must not be lost here."""
 
 
-def _traffic(policy: Policy) -> Iterator[str]:
+def _traffic(policy: Policy, own_rules: list[dict[str, Any]]) -> Iterator[str]:
     """The policy's traffic rules as Zenoh has them, against programs that do not keep them."""
-    if not policy.traffic:
-        return
     yield ""
-    yield "  // Traffic rules of the policy. Programs apply them where messages enter the mesh; the router stops what"
-    yield "  // comes from a program that does not."
+    if policy.traffic:
+        yield "  // Traffic rules of the policy. Programs apply them where messages enter the mesh; the router stops"
+        yield "  // what comes from a program that does not."
     yield from _downsampling(policy)
     yield from _low_pass(policy)
-    yield from _priorities(policy)
+    yield from _priorities(policy, own_rules)
 
 
 def _downsampling(policy: Policy) -> Iterator[str]:
@@ -293,7 +293,7 @@ STREAMS = begins(STREAM.template)
 """How the keys of robots' topics begin, and no others."""
 
 
-def _priorities(policy: Policy) -> Iterator[str]:
+def _priorities(policy: Policy, own_rules: list[dict[str, Any]]) -> Iterator[str]:
     """Not of robots' topics: a robot's own rule for a topic wins over one for its key; a router would undo that."""
     entries: list[str] = []
     given = [(number, rule) for number, rule in enumerate(policy.traffic) if rule.priority is not None]
@@ -310,11 +310,16 @@ def _priorities(policy: Policy) -> Iterator[str]:
         else:
             yield f"  // priorities from {rule.match} on are left to the programs: robots' topics are among its keys"
             break
+    yield "  // What has the priority of commands is dropped where a link is full: who waits there holds up everybody."
+    yield "  qos: { network: ["
+    for own in own_rules:
+        *_, (last, overwrite) = own.items()
+        yield f"    {_inline({name: value for name, value in own.items() if name != last})[:-2]},"
+        yield f"      {last}: {_inline(overwrite)} }},"
     if entries:
-        yield "  // the last one that fits wins here, the first one in the policy"
-        yield "  qos: { network: ["
-        yield from reversed(entries)
-        yield "  ] },"
+        yield "    // the last one that fits wins here, the first one in the policy"
+    yield from reversed(entries)
+    yield "  ] },"
 
 
 def _inside(policy: Policy, key: str) -> str:

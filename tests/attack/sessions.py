@@ -37,10 +37,16 @@ def session(target: Target) -> Iterator[zenoh.Session]:
         yield opened
 
 
-def puts(target: Target, keys: list[str], payloads: list[bytes], *, every_s: float = 0.0, urgent: bool = True) -> None:
+def puts(
+    target: Target,
+    keys: list[str],
+    payloads: list[bytes],
+    *,
+    every_s: float = 0.0,
+    priority: zenoh.Priority = URGENT,
+) -> None:
     """Put each payload on each key, again and again: at full rate, or a round every so often."""
     with session(target) as mesh:
-        priority = URGENT if urgent else zenoh.Priority.DATA
         publishers = [mesh.declare_publisher(key, congestion_control=BLOCK, priority=priority) for key in keys]
         while target.running():
             for publisher in publishers:
@@ -215,6 +221,14 @@ def small_samples_to_the_robot(target: Target) -> None:
     """Messages to the robot at full rate and the highest priority, from ever other senders."""
     keys = [f"macs/to/ros/0/{target.robot}/unity/{n}" for n in range(4000, 4050)]
     puts(target, keys, [frame(metadata=metadata(message_manager="Hello"), data=b"x", to=ROS, ids=[1])])
+
+
+@attack(3, "mesh")
+def small_samples_that_wait_to_the_robot(target: Target) -> None:
+    """The same at the priority of calls, which wait where a link is full."""
+    keys = [f"macs/to/ros/0/{target.robot}/unity/{n}" for n in range(4000, 4050)]
+    frames = [frame(metadata=metadata(message_manager="Hello"), data=b"x", to=ROS, ids=[1])]
+    puts(target, keys, frames, priority=zenoh.Priority.INTERACTIVE_HIGH)
 
 
 @attack(3, "mesh")

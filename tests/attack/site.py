@@ -12,7 +12,7 @@ from tests.attack import secured
 from tests.attack.ways import Way
 from tests.support.certificates import Authority
 from tests.support.programs import Program, free_port
-from tests.support.routers import Router
+from tests.support.routers import Router, as_macs_router
 
 MIB = 1 << 20
 ROBOT = 1
@@ -59,7 +59,7 @@ class Site:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.mesh = MeshSettings(connect=[self.endpoint])
         common = ("-e", self.endpoint, "--settings", str(settings))
-        self.router = Router(listen=[self.endpoint])
+        self.router = Router(listen=[self.endpoint], overrides=as_macs_router(MeshSettings()))
         self.gateway = Program("gateway", *self._ports(settings.parent), "--robots", "any", *common)
         self.robot = Program("agent", "--id", str(ROBOT), *common, env=env)
 

@@ -49,7 +49,7 @@ MESH = load(WAN / "policy.yaml").mesh
 ROUTER = [
     f"{path}:{json5}"
     for path, json5, _ in changed(MESH, mode="router").zenoh()
-    if path.startswith("transport/") or path == "connect/retry"
+    if path.startswith(("transport/", "qos/")) or path == "connect/retry"
 ]
 CHOSEN = {name: value for name, value in asdict(MESH).items() if value != getattr(MeshSettings(), name)}
 KERNEL = dict(re.findall(r"^([\w.]+) = (\w+)$", (WAN / "90-macs.conf").read_text(), re.MULTILINE))

@@ -7,9 +7,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.sections import changed
 from tests.support.processes import Process
 from tests.support.programs import READY, free_port
 from tests.support.tools import zenohd
+
+
+def as_macs_router(settings: MeshSettings) -> list[str]:
+    """What `macs router` with these settings does with links and messages, as ``overrides``."""
+    table = changed(settings, mode="router").zenoh()
+    return [f"{path}:{json5}" for path, json5, _ in table if path.startswith(("transport/", "qos/"))]
 
 
 class Router(Process):

@@ -243,7 +243,8 @@ def test_traffic_rules_are_a_guard_in_the_router(tmp_path: Path) -> None:
         (["macs/from/ros/7/**"], 5000000),
         (["macs/**"], 5000000),
     ]
-    priorities = json.loads(conf.get_json("qos/network"))
+    own, *priorities = json.loads(conf.get_json("qos/network"))
+    assert own["overwrite"]["congestion_control"] == "drop"
     assert [(one["key_exprs"], one["overwrite"]["priority"]) for one in priorities] == [
         (["macs/to/ros/**"], "interactive_high"),
         (["macs/to/**"], "data"),
@@ -255,7 +256,7 @@ def test_a_router_leaves_the_priorities_of_topics_to_robots(tmp_path: Path) -> N
     rule that holds for topics and others alike nothing is exported, because there the last one would win."""
     text = TEXT + TRAFFIC.replace("macs/to/ros/**", "macs/**")
     conf = loaded(policy.parse(text), "site", tmp_path)
-    assert not json.loads(conf.get_json("qos/network"))
+    assert not [rule for rule in json.loads(conf.get_json("qos/network")) if rule["overwrite"]["priority"]]
     written = (tmp_path / "router.json5").read_text()
     assert "priority of macs/from/ros/7/** is left to the programs" in written
     assert "priorities from macs/** on are left to the programs" in written
