@@ -33,7 +33,7 @@ from bridge.settings import Settings
 from macs_zenoh.errors import CallTimeout, MacsError, NotServed, Refused, Unreachable, UsageError
 from macs_zenoh.plain import plain
 from macs_zenoh.protocol.messages import ROS
-from macs_zenoh.protocol.robot_state import RobotStatus
+from macs_zenoh.protocol.robot_state import RobotStatus, release
 
 SUMMARY = "stop robots, and release them"
 
@@ -123,12 +123,15 @@ async def _settle(operator: Operator, robot: int, args: argparse.Namespace) -> O
     loop = asyncio.get_running_loop()
     deadline = loop.time() + args.timeout
     wanted, patience_s, outcome, unserved = not args.release, FIRST_S, Outcome(robot, False), False
+    seen: int | None = None
     while (left_s := deadline - loop.time()) > 0:
+        verb, data = ("stop", b"true") if wanted else ("status", b"") if seen is None else ("stop", release(seen))
         try:
-            answer = await operator.ask(
-                robot, "stop", b"true" if wanted else b"false", timeout_s=min(patience_s, left_s), urgent=True
-            )
+            answer = await operator.ask(robot, verb, data, timeout_s=min(patience_s, left_s), urgent=True)
             _, status = robots.read(answer, RobotStatus)
+            if verb == "status":  # a release is for what was seen when it was asked for, however often it is said
+                seen = status.stop.presses
+                continue
         except Refused as refusal:
             return Outcome(robot, False, problem=refusal.reason)
         except CallTimeout:

@@ -55,7 +55,7 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.registrations import check_own
-from macs_zenoh.protocol.robot_state import STATUS, ControlReply, ControlRequest
+from macs_zenoh.protocol.robot_state import STATUS, ControlReply, ControlRequest, released
 from macs_zenoh.protocol.schemas import DefinitionsRequest
 from macs_zenoh.protocol.wire import Layout
 from macs_zenoh.serving import Call
@@ -347,18 +347,18 @@ class RobotAgent:
         return self.agent.serve("stop", self._stopped, first=self._stop, mesh=mesh)
 
     def _stop(self, call: Call) -> None:
-        """The emergency stop with an answer: data ``true`` or ``false``, as on its topic. In a thread of Zenoh's."""
+        """The emergency stop with an answer: data ``true``, ``false`` or a `release`. In a thread of Zenoh's."""
         stop, topic = self.nodes.stop, call.metadata.node_name
         sender = Registrant(type_number(call.sender_type), call.sender_id)
         if stop is None:
             raise Refused(self.nodes.robot.no_stop or "this robot has no emergency stop")
         if topic and topic != stop.key.node_name:  # a gateway asks, as what a headset sent may be a stop
             raise Refused(f"{topic[:80]} is not the emergency stop of this robot, which is {stop.topic}")
-        presses = call.data != b"false"
-        if presses and self._guard is not None:
+        releases, seen = released(call.data)
+        if not releases and self._guard is not None:
             # before it stops: a release that is on its way must not come between the two
             self._guard.pressed(sender, now_s())
-        stop.set(sender, presses)
+        stop.set(sender, not releases, seen=seen)
 
     async def _stopped(self, _call: Call) -> bytes:
         return self.state()

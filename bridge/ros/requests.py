@@ -72,6 +72,7 @@ def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int])
             seconds=round(time.time() - stop.since, 1) if stop.stopped else 0,
             times=stop.times,
             history=stop.history,
+            presses=stop.presses,
         ),
         nodes=[node.status() for node in nodes],
         trips={topic: TripsStatus(*told) for topic, told in nodes.robot.trips.all().items()},

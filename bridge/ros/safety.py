@@ -159,6 +159,8 @@ class EmergencyStop:
     since: float = 0.0
     """Seconds since the epoch."""
     times: int = 0
+    presses: int = 0
+    """How often somebody stopped it who had not before: whoever releases it says up to which he knows."""
     changes: int = 0
     """The number of the last change, here or elsewhere."""
     history: list[str] = field(default_factory=list)
@@ -242,6 +244,7 @@ class EmergencyStop:
         return True
 
     def _become(self, pressed: list[str], by: str, now: float) -> None:
+        self.presses += any(agent not in self.pressed for agent in pressed)
         was, self.pressed, self.stopped = self.stopped, pressed, bool(pressed)
         self.own = {agent: number for agent, number in self.own.items() if agent in pressed}
         if was == self.stopped:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from bridge.ros.stream import cdr_problem
 from bridge.ros.topics import check_topic_type
 from bridge.settings import WHO_STOPPED
 from macs_zenoh.errors import Refused
+from macs_zenoh.mesh import now_s
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.protocol.messages import ROS, AddNode, NodeType, node_name
 from macs_zenoh.protocol.reading import Message
@@ -40,6 +42,7 @@ HEAR_S = 0.5
 FIND_S = 0.15
 """How long in any case: an agent that was not found yet is not known to be unheard."""
 LOOK_S = 0.01
+PRESSED_SINCE = "the stop was pressed again after this release was sent"
 
 
 class StopNode(InterfaceNode):
@@ -59,6 +62,8 @@ class StopNode(InterfaceNode):
         """Held while the stop changes and that is told: what is told last is what holds."""
         self.overtaken: Callable[[Message], bool] = lambda message: False
         """Whether a release was sent before its sender asked for a stop, which is faster."""
+        self._pressed_at = -math.inf
+        """When the last press was sent, whoever's it is."""
 
     @property
     def in_use(self) -> bool:
@@ -101,18 +106,26 @@ class StopNode(InterfaceNode):
             return
         try:
             with self._lock:
-                if not message.data[4] and self.overtaken(message):
-                    self.robot.drops.note("too_old", f"{self.topic} from {sender}", "it released before it stopped")
+                sent_at = now_s() - message.age_s
+                if not message.data[4] and (self.overtaken(message) or sent_at < self._pressed_at):
+                    self.robot.drops.note("too_old", f"{self.topic} from {sender}", PRESSED_SINCE)
+                    self.robot.tell_refused(message, self.topic, "too_old", PRESSED_SINCE)
                     return
-                self.set(sender, message.data[4] != 0)
+                self.set(sender, message.data[4] != 0, sent_at=sent_at)
         except Refused as refusal:
             self.robot.drops.note("not_allowed", f"{self.topic} from {sender}", refusal.reason)
             self.robot.tell_refused(message, self.topic, "not_allowed", refusal.reason)
 
-    def set(self, sender: Registrant, stop: bool) -> None:
-        """Stop or release. Raises Refused when the settings do not allow it to this agent."""
+    def set(self, sender: Registrant, stop: bool, *, seen: int | None = None, sent_at: float | None = None) -> None:
+        """Stop or release, ``sent_at`` of `now_s` if that is known; who releases has ``seen`` so many presses. Raises
+        Refused when the settings do not allow it to this agent, or somebody has pressed it since."""
         try:
-            self._set(sender, stop)
+            with self._lock:
+                if not stop and seen not in (None, self.robot.stop.presses):
+                    raise Refused(f"{PRESSED_SINCE}, by {' and '.join(self.robot.stop.pressed) or self.robot.stop.by}")
+                self._set(sender, stop)
+                if stop:
+                    self._pressed_at = max(self._pressed_at, now_s() if sent_at is None else sent_at)
         except Refused as refusal:
             self.robot.audit.record("stop" if stop else "release", who(str(sender)), self.topic, refusal.reason)
             raise

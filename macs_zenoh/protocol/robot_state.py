@@ -73,13 +73,37 @@ class NodeStatus(Struct, frozen=True):
 
 
 class StopStatus(Struct, frozen=True):
-    """The emergency stop: who pressed it last, who has and has not taken that back, how long ago, how often in all."""
+    """The emergency stop: who pressed it last, who has and has not taken that back, how long ago, how often in all.
+
+    ``presses`` counts those who joined in as well, for `release`.
+    """
 
     by: str = ""
     pressed: list[str] = []
     seconds: float = 0
     times: Count = 0
     history: list[str] = []
+    presses: Count = 0
+
+
+RELEASE = b"false"
+DIGITS = 12
+"""Of a number that somebody says."""
+
+
+def release(presses: int) -> bytes:
+    """What the verb ``stop`` is asked by who ends the stop and has seen so many ``presses``: one that came since
+    stays."""
+    return b"%s %d" % (RELEASE, presses)
+
+
+def released(data: bytes) -> tuple[bool, int | None]:
+    """Whether the verb ``stop`` is asked to end the stop, and which presses the asker has seen, if he says so.
+    Whatever is neither stops."""
+    word, _, seen = data.partition(b" ")
+    if word != RELEASE or (seen and not (seen.isdigit() and len(seen) <= DIGITS)):
+        return False, None
+    return True, int(seen) if seen else None
 
 
 class RobotStatus(Struct, frozen=True):

@@ -113,6 +113,10 @@ class Site:
         """An agent like a headset, to be entered."""
         return join("unity", id=number, settings=self.mesh)
 
+    def operator(self, number: int) -> Any:
+        """An operator, to be entered."""
+        return join("operator", id=number, settings=self.mesh)
+
 
 @asynccontextmanager
 async def site(domain: int, tmp_path: Path, settings: str = SETTINGS.format(deadman_s=0.5)) -> AsyncIterator[Site]:

@@ -283,6 +283,26 @@ async def test_an_emergency_stop_holds_until_it_is_released(nodes: InterfaceNode
     assert (await get(received)).linear.x == 0.7
 
 
+async def test_a_release_from_before_a_press_is_not_carried_out(nodes: InterfaceNodes, peer: Peer) -> None:
+    """It has waited on its way, and meanwhile somebody else has stopped the robot: that stop holds, also where its
+    sender may release everybody's; what he sends once he has seen it counts."""
+    await driving(nodes, peer)
+    press, release = (command("/emergency_stop", Bool(data=state), "std_msgs/Bool") for state in (True, False))
+    nodes.deliver(press._replace(age_s=0.3))
+    nodes.deliver(release._replace(sender_id=6, age_s=0.2))  # both have waited, and this one was sent later
+    assert not nodes.robot.stop.stopped
+    nodes.deliver(press)
+    nodes.deliver(release._replace(sender_id=6))
+    assert not nodes.robot.stop.stopped
+    nodes.deliver(press)
+    nodes.deliver(release._replace(sender_id=6, age_s=0.2))
+    assert nodes.robot.stop.stopped
+    assert nodes.drops == {"too_old": 1}
+    nodes.deliver(press._replace(age_s=0.3))
+    nodes.deliver(release._replace(sender_id=6))
+    assert not nodes.robot.stop.stopped
+
+
 @pytest.mark.parametrize("bad", [b"", b"\x01", b"\x00\x01\x00\x00", b"\x01\x00\x00\x00\x01"])
 async def test_a_bad_emergency_stop_changes_nothing(nodes: InterfaceNodes, bad: bytes) -> None:
     """Bytes that are no Bool neither stop nor release, and the next one works."""

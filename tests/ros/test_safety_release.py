@@ -12,6 +12,7 @@ import pytest
 from bridge.ros.safety import EmergencyStop
 from macs_zenoh.agent import Agent
 from macs_zenoh.errors import Refused
+from macs_zenoh.protocol.robot_state import release
 from tests.ros.driven import STOPPED, driving, hear, may_command, send_bool, site
 from tests.support.programs import ended
 from tests.support.ros_peer import Peer
@@ -119,3 +120,26 @@ async def test_whose_session_ended_cannot_take_back(domain: int, tmp_path: Path)
             assert (status["stopped"], status["stop"]["pressed"]) == (True, ["unity/301 (left)"])
         code, _, _ = await ended("stop", "1", "--release", "-e", place.router.endpoint)
         assert code == 0
+
+
+async def test_a_release_is_for_what_its_sender_has_seen(domain: int, tmp_path: Path) -> None:
+    """Whoever says which presses he has seen releases those: one by somebody else that came since stays, and so does
+    one that comes before the release is said again."""
+    async with (
+        site(domain, tmp_path) as place,
+        place.robot(),
+        place.headset(301) as other,
+        place.operator(5) as operator,
+    ):
+        await until(lambda: all((1, 1) in agent.directory for agent in (operator, other)))
+        seen = json.loads(await operator.call("ros", 1, "stop", b"true"))["stop"]["presses"]
+        await other.call("ros", 1, "stop", b"true")
+        for _ in range(2):
+            with pytest.raises(Refused, match="again after this release was sent, by operator/5 and unity/301"):
+                await operator.call("ros", 1, "stop", release(seen))
+        seen = json.loads(await operator.call("ros", 1, "status"))["stop"]["presses"]
+        assert json.loads(await operator.call("ros", 1, "stop", release(seen)))["stopped"] is False
+        await other.call("ros", 1, "stop", b"true")
+        with pytest.raises(Refused, match="by unity/301"):
+            await operator.call("ros", 1, "stop", release(seen))  # a second time, late
+        assert json.loads(await operator.call("ros", 1, "status"))["stopped"] is True

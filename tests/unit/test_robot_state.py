@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import msgspec
+import pytest
 
 from macs_zenoh.protocol.robot_state import (
     ControlStatus,
@@ -12,6 +13,8 @@ from macs_zenoh.protocol.robot_state import (
     RobotStatus,
     StopStatus,
     TopicQos,
+    release,
+    released,
 )
 
 STATUS = RobotStatus(
@@ -60,3 +63,22 @@ def test_offers_say_how_a_topic_is_sent() -> None:
         publishers={"/map": "nav_msgs/msg/OccupancyGrid"}, qos={"/map": TopicQos("reliable", "volatile")}
     )
     assert msgspec.json.decode(msgspec.json.encode(offered), type=Offered) == offered
+
+
+@pytest.mark.parametrize(
+    ("data", "means"),
+    [
+        (b"false", (True, None)),
+        (release(0), (True, 0)),
+        (release(17), (True, 17)),
+        (b"true", (False, None)),
+        (b"", (False, None)),
+        (b"false x", (False, None)),
+        (b"false -1", (False, None)),
+        (b"false " + b"9" * 5000, (False, None)),
+        (b"falsely", (False, None)),
+    ],
+)
+def test_what_is_no_release_stops(data: bytes, means: tuple[bool, int | None]) -> None:
+    """A number is read only if it is short; whatever is not understood is the safer of the two."""
+    assert released(data) == means
