@@ -1,9 +1,12 @@
-"""The page of a gateway of a large mesh: what it costs the browser, with robots and headsets that are only seen."""
+"""What a large mesh costs who looks at it, the page's browser and `macs top`, with robots and headsets that are only
+seen."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import re
+import time
 from collections.abc import AsyncIterator
 from functools import partial
 from typing import Any
@@ -15,8 +18,10 @@ from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.keyexpr import CALL
 from macs_zenoh.protocol.messages import ROS, UNITY
 from tests.support.browser import browser, needs_browser, opened
+from tests.support.gateways import cpu_s, memory_bytes
 from tests.support.given import StartGateway
 from tests.support.local import patient
+from tests.support.terminals import terminal
 from tests.support.waiting import until
 
 ROBOTS, HEADSETS, TOPICS = 200, 1000, 500
@@ -33,6 +38,11 @@ STATUS: dict[str, Any] = {
     ],
     "drops": {},
 }
+CARRIED = {"registrants": ["unity/20001"], "carried": {"messages": 10, "bytes": 800, "age_s": 0.1}}
+MORE = [
+    {"role": "subscriber", "name": f"/{name}", "type": "std_msgs/msg/Float64", **CARRIED}
+    for name in ("pose", "scan", "odom")
+]
 OFFERS = {
     "subscribers": {"/cmd_vel": "geometry_msgs/msg/Twist"},
     "publishers": {f"/sensor_{number}/value": "std_msgs/msg/Float64" for number in range(TOPICS)},
@@ -46,7 +56,8 @@ async def crowd(router: str) -> AsyncIterator[None]:
     async def answer(key: str, payload: bytes) -> bytes:
         fields = CALL.parse(key)
         assert fields is not None
-        return json.dumps({"status": STATUS, "offers": OFFERS}.get(str(fields.verb), {})).encode()
+        status = {**STATUS, "nodes": [*STATUS["nodes"], *MORE[: 2 + fields.id % 2]]}  # 500 in all that carry something
+        return json.dumps({"status": status, "offers": OFFERS}.get(str(fields.verb), {})).encode()
 
     async with await Mesh.open(patient(router)) as mesh:
         serving = mesh.serve(CALL.every(type=ROS), answer)
@@ -96,3 +107,23 @@ async def test_a_large_mesh_is_still_usable(start_gateway: StartGateway, crowd: 
         await page.page.fill("#topics input[type=search]", "sensor_41")
         await until(partial(page.value, "document.querySelectorAll('tr[data-topic]').length === 11"))
         page.judge()
+
+
+async def test_top_of_a_large_mesh_takes_little(start_gateway: StartGateway, crowd: None, router: str) -> None:
+    """With 200 robots, 1000 headsets and 500 topics `macs top` takes a quarter of a core and 150 MB at most in each
+    view, and follows keys."""
+    gateway = await start_gateway()
+    await until(lambda: len(gateway.directory) >= ROBOTS + HEADSETS)
+    async with terminal("top", "-e", router, columns=120) as shown:
+        pid = shown.process.pid
+        await until(lambda: re.findall(rb"(\d+) robots .*? (\d+) topics", shown.seen)[-1:] == [(b"200", b"500")])
+        for view in b"123456":
+            shown.type(bytes([view]))
+            before, began = cpu_s(pid), time.monotonic()
+            await asyncio.sleep(MEASURED_S / 2)
+            share, size = (cpu_s(pid) - before) / (time.monotonic() - began), memory_bytes(pid)
+            print(f"view {view - ord('0')}: {100 * share:.1f} % of a core, {size / 1e6:.1f} MB")
+            assert share <= MOST_CPU
+            assert size <= MOST_BYTES
+        shown.type(b"q")
+        assert await shown.ended() == 0

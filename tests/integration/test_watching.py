@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import json
-import os
-import pty
 import socket
-import struct
 import sys
-import termios
 from contextlib import AsyncExitStack
 from typing import Any
 
@@ -24,6 +19,7 @@ from tests.support.links import delayed
 from tests.support.processes import ROOT
 from tests.support.programs import Program, ended, free_port, macs
 from tests.support.routers import Router
+from tests.support.terminals import terminal
 from tests.support.waiting import PATIENCE_S, until
 
 STATE: dict[str, Any] = {
@@ -149,35 +145,14 @@ async def test_top_fills_a_terminal_of_80_by_24(router: str) -> None:
     """It draws, follows keys, and leaves the terminal as it was."""
     async with macs_zenoh.join("ros", id=7, connect=[router]) as agent:
         Told(agent)
-        master, slave = pty.openpty()
-        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-        before = termios.tcgetattr(slave)
-        seen = bytearray()
-        loop = asyncio.get_running_loop()
-        loop.add_reader(master, lambda: seen.extend(os.read(master, 65536)))
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "bridge", "top", "-e", router),
-            cwd=ROOT,
-            stdin=slave,
-            stdout=slave,
-            stderr=slave,
-            env={**os.environ, "TERM": "xterm"},
-        )
-        try:
-            await until(lambda: b"1 robots 2 topics" in seen and b"ROBOT" in seen)
-            os.write(master, b"2")
-            await until(lambda: b"/pose" in seen and b"CONTROL" in seen)
-            os.write(master, b"q")
-            assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
-            await until(lambda: b"\x1b[?1049l" in seen)
-            assert termios.tcgetattr(slave) == before
-        finally:
-            loop.remove_reader(master)
-            if process.returncode is None:
-                process.kill()
-                await process.wait()
-            os.close(master)
-            os.close(slave)
+        async with terminal("top", "-e", router) as shown:
+            await until(lambda: b"1 robots 2 topics" in shown.seen and b"ROBOT" in shown.seen)
+            shown.type(b"2")
+            await until(lambda: b"/pose" in shown.seen and b"CONTROL" in shown.seen)
+            shown.type(b"q")
+            assert await shown.ended() == 0
+            await until(lambda: b"\x1b[?1049l" in shown.seen)
+            assert shown.settings == shown.before
 
 
 async def test_top_shows_which_routers_are_linked() -> None:
