@@ -260,7 +260,7 @@ async def test_the_last_other_may_leave_while_one_subscribes(router: str) -> Non
         subscribing = asyncio.create_task(agent.subscribe(TOPIC, robot=1, type=STRING, timeout_s=PATIENCE_S))
         await asyncio.wait_for(asked.wait(), PATIENCE_S)
         other.close()
-        third = await agent.subscribe(TOPIC, robot=1, type=STRING, timeout_s=1)
+        third = await agent.subscribe(TOPIC, robot=1, type=STRING, timeout_s=PATIENCE_S)
         may_say.set()
         second = await subscribing
         await hears(third, 1)

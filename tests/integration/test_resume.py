@@ -137,6 +137,7 @@ class Site:
         async with network(number) as net:
             connecting = Headset.connect("127.0.0.1", net.port, reconnect=True, way=way, **options)  # type: ignore[arg-type]
             async with await connecting as headset:
+                await told(headset)
                 yield headset, net
 
 
@@ -155,6 +156,11 @@ async def start_site(start_gateway: StartGateway, tmp_path: Path) -> StartSite:
         return Site(gateway, str(authority.ca))
 
     return start
+
+
+async def told(headset: Headset) -> None:
+    """Wait until it knows by which secret it can come back: whoever loses its connection before is another one."""
+    await until(lambda: headset._session is not None and headset._session.secret)
 
 
 async def back(headset: Headset, net: Network, how: Loss) -> None:
@@ -333,7 +339,8 @@ async def test_the_secret_alone_opens_nothing(start_site: StartSite, tmp_path: P
         net.lose("rst")
         store.change(path, lambda tokens: (tokens.without("anna"), None))
         assert await headset.wait_ended() in ("a valid token is wanted here", "this token holds no longer")
-    await until(lambda: len(site.gateway.agents) == 0)
+    # who tried sleeps for half a minute more
+    await until(lambda: own_id not in {each.agent_id for each in site.gateway.agents.online()})
 
 
 async def test_a_gateway_that_died_has_new_agents(router: str, robot: Robot) -> None:
@@ -376,6 +383,7 @@ async def test_it_holds_on_the_loop_that_programs_use(router: str, tmp_path: Pat
                 await Headset.connect("127.0.0.1", gateway.port) as other,
             ):
                 own_id = headset.id
+                await told(headset)
                 await other.online()
                 for number, how in enumerate(LOSSES * 5):
                     await headset.send(b"%d" % number, to=UNITY, ids=[other.id])

@@ -196,8 +196,7 @@ async def test_a_stop_is_seen_on_two_pages_at_once(site: Site) -> None:
         took.append(max(saw) - await one.value("window.pressed"))
         await one.page.wait_for_selector('#pad[aria-disabled="true"]')
         assert "stopped" in await text(two, "#drive-hint")
-        await one.page.click("#release")
-        await one.page.click("#release")
+        await released(one)
         for page in (one, two):
             await page.page.wait_for_selector('#pad[aria-disabled="false"]')
             await until(partial(page.value, "document.querySelector('#stop-status').textContent === ''"))

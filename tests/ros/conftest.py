@@ -29,7 +29,7 @@ from tests.support.isolation import worker_number
 from tests.support.local import patient
 from tests.support.once import made_of
 from tests.support.ros_peer import ROBOT, Peer
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 DOMAINS = 100
 _domains = itertools.cycle(range(1, 1 + DOMAINS))
@@ -101,7 +101,8 @@ async def peer(domain: int) -> AsyncIterator[Peer]:
 @pytest.fixture
 async def robot(router: str, domain: int) -> AsyncIterator[RobotAgent]:
     """Robot 7 in group 3."""
-    settings = Settings(mesh=patient(router), robot=RobotSettings(id=ROBOT, group=3))
+    patience = RobotSettings(id=ROBOT, group=3, call_timeout_s=PATIENCE_S)
+    settings = Settings(mesh=patient(router), robot=patience)
     async with open_robot(settings, domain_id=domain) as robot:
         yield robot
 

@@ -102,7 +102,7 @@ async def test_a_headset_that_may_come_back_stops_the_robot(site: Site, how: Any
     site.net.is_cut = True
     site.net.lose(how)
     await until(lambda: site.heard.last == STOPPED)
-    assert site.is_asleep
+    await until(lambda: site.is_asleep)
     await site.others.publish(twist(0.25))
     await until(lambda: site.others.refusing())
     site.net.is_cut = False
@@ -110,8 +110,7 @@ async def test_a_headset_that_may_come_back_stops_the_robot(site: Site, how: Any
     await until(lambda: not site.is_asleep)
     assert site.heard.last == STOPPED
     assert 0.25 not in [value for _, value in site.heard.values]
-    await site.commands.publish(twist(0.75))
-    await until(lambda: site.heard.last == 0.75)
+    await drive(site, site.commands, 0.75)
 
 
 @pytest.mark.parametrize("site", [60], indirect=True)
@@ -122,8 +121,7 @@ async def test_another_socket_is_another_connection(site: Site) -> None:
     site.driver.drop_connection()
     await until(lambda: site.heard.last == STOPPED)
     await until(lambda: site.driver.connected)
-    await site.commands.publish(twist(0.75))
-    await until(lambda: site.heard.last == 0.75)
+    await drive(site, site.commands, 0.75)
 
 
 @pytest.mark.parametrize("site", [1.0], indirect=True)

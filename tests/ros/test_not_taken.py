@@ -101,9 +101,10 @@ async def test_pub_says_why_a_command_is_not_taken(site: Site) -> None:
     host, _, port = site.gateway.rpartition(":")
     async with await Headset.connect(host, int(port), group=3) as holder:
         commands = await holder.advertise("/cmd_vel", TWIST, agents=[7])
-        await commands.publish(b"\0\1\0\0" + bytes(48))
-        while (taken := await site.drive())[0] == 0:  # until ours has come
-            pass
+        taken = (0, "")
+        while taken[0] == 0:  # until ours has come first
+            await commands.publish(b"\0\1\0\0" + bytes(48))
+            taken = await site.drive()
         assert taken == (1, f"unity/{holder.id} has control")
 
     assert (await ended("stop", "7", "-e", site.endpoint, "--as", "unity/9"))[0] == 0
