@@ -66,5 +66,6 @@ def _crate_file() -> Path | None:
     pattern = f"registry/cache/*/{CRATE}-{CRATE_VERSION}.crate"
     if not list(home.glob(pattern)) and shutil.which("cargo"):
         command = ["cargo", "info", "--quiet", f"{CRATE}@{CRATE_VERSION}"]
-        subprocess.run(command, capture_output=True, timeout=120, check=False)
+        once = {**os.environ, "CARGO_NET_RETRY": "0"}  # workers of a parallel run may have no network
+        subprocess.run(command, capture_output=True, timeout=120, check=False, env=once)
     return next(home.glob(pattern), None)
