@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 
 from bridge.headset.client import Headset
-from tests.support.processes import LINE_BYTES
+from tests.support.forks import LINE_BYTES
 from tests.support.programs import ROOT, free_port
 from tests.support.tools import zenohd
 from tests.support.waiting import PATIENCE_S

@@ -10,17 +10,16 @@ import asyncio
 import os
 import signal
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
-ROOT = Path(__file__).parents[2]
+from tests.support.forks import ROOT as ROOT
+from tests.support.forks import Forked, started
+
 START_S = 60.0
 """By when a program is ready, on a machine that has much else to do."""
 STOP_S = 20.0
 """By when one that was told to stop has ended; how soon that is when nothing else runs is for tests of its own."""
-LINE_BYTES = 64 << 20
-"""zenohd logs its whole configuration, with every access rule, as one line."""
 SHOWN = 20
 """How many lines of a log a failure shows."""
 
@@ -38,7 +37,7 @@ class Process:
         self.log: list[str] = []
         """What it wrote to standard error."""
         self._env = {**os.environ, **(env or {})}
-        self._process: asyncio.subprocess.Process
+        self._process: asyncio.subprocess.Process | Forked
         self._reading: list[asyncio.Task[None]] = []
         self._ready: asyncio.Event
         self._stdin: int | None = None
@@ -62,10 +61,7 @@ class Process:
     async def start(self) -> None:
         """Start it, or start it again, and wait until it says that it is ready."""
         self._ready = asyncio.Event()
-        pipe = asyncio.subprocess.PIPE
-        self._process = await asyncio.create_subprocess_exec(
-            *self.command, cwd=ROOT, env=self._env, stdin=self._stdin, stdout=pipe, stderr=pipe, limit=LINE_BYTES
-        )
+        self._process = await started(self.command, self._env, self._stdin)
         assert self._process.stdout is not None
         assert self._process.stderr is not None
         self._reading = [
@@ -141,13 +137,7 @@ class Process:
 
 async def finished(*command: str, env: Mapping[str, str] | None = None) -> tuple[int, str, str]:
     """Run a command to its end: exit code, standard output, standard error. It is killed when it takes too long."""
-    process = await asyncio.create_subprocess_exec(
-        *command,
-        cwd=ROOT,
-        env={**os.environ, **(env or {})},
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-    )
+    process = await started(command, {**os.environ, **(env or {})})
     try:
         out, errors = await asyncio.wait_for(process.communicate(), START_S)
     finally:
