@@ -6,111 +6,19 @@ import logging
 import os
 import signal
 import sys
-import zlib
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.support import tiers
 from tests.support.isolation import isolate
 from tests.support.patience import be_patient
-from tests.support.thorough import PART, examples
+from tests.support.thorough import examples
 
 NEED_ROS_TESTS = "MACS_NEED_ROS_TESTS"
 """Set by ``make test`` and CI: a run in which no ROS test passed is a failed run."""
-
-
-ALONE = (
-    "tests/attack/",
-    "tests/network/",
-    "tests/integration/test_at_once.py",
-    "tests/integration/test_direct_writer.py",
-    "tests/integration/test_limits.py::test_a_thousand_headsets",
-    "tests/integration/test_page_load.py",
-    "tests/integration/test_page_many.py",
-    "tests/integration/test_page_soak.py",
-    "tests/integration/test_stop_behind.py",
-    "tests/page/test_page.py::test_a_network_that_stands_still",
-    "tests/page/test_page.py::test_a_stop_is_seen_on_two_pages",
-    "tests/page/test_page.py::test_it_stops_however_it_is_let_go",
-    "tests/page/test_page_times.py",
-    "tests/page/test_page_uplink.py",
-    "tests/page/test_xr_links.py",
-    "tests/page/test_xr_never_old.py",
-    "tests/page/test_xr_scene.py",
-    "tests/page/test_xr_there.py",
-    "tests/ros/test_commands_at_once.py",
-    "tests/ros/test_deadman.py",
-    "tests/ros/test_graph_verbs.py::test_the_rate_of_a_fast_sensor",
-    "tests/ros/test_killed.py",
-    "tests/ros/test_safety_floods.py",
-)
-"""What measures how long something takes, or needs the machine for itself: marked ``alone``."""
-
-SOAK = (
-    "tests/attack/",
-    "tests/conformance/test_conformance.py::test_right_and_wrong_routers_are_told_apart",
-    "tests/network/",
-    "tests/integration/test_deploy_doc.py",
-    "tests/integration/test_hostile_text.py::test_every_program",
-    "tests/integration/test_limits.py::test_a_thousand_headsets",
-    "tests/integration/test_nothing_lost.py::test_large_frames",
-    "tests/integration/test_nothing_lost.py::test_many_destinations",
-    "tests/integration/test_nothing_lost.py::test_slower_receivers_in_a_group",
-    "tests/integration/test_operator.py::test_an_answer_that_makes_no_sense",
-    "tests/integration/test_operator.py::test_numbers_that_are_none",
-    "tests/integration/test_output.py::test_json_is_json",
-    "tests/integration/test_page_load.py",
-    "tests/integration/test_page_many.py",
-    "tests/integration/test_security_web.py::test_chromium",
-    "tests/integration/test_wrong_port.py::test_why_no_router_answers",
-    "tests/integration/test_rmw_mirrors.py::test_each_robot",
-    "tests/integration/test_rmw_secured.py::test_the_check",
-    "tests/integration/test_trace_hops.py::test_a_slow_link",
-    "tests/integration/test_router_links.py::test_a_link_that_flaps",
-    "tests/page/test_macs_js.py::test_it_conforms_in_chromium[page]",
-    "tests/page/test_macs_js.py::test_it_conforms_in_node",
-    "tests/page/test_page.py::test_it_can_be_used_by_everybody",
-    "tests/page/test_page.py::test_the_picture_of_the_readme",
-    "tests/page/test_page_hold.py::test_a_robot_that_drops_out",
-    "tests/page/test_page_record.py",
-    "tests/page/test_page_times.py",
-    "tests/page/test_page_uplink.py",
-    "tests/page/test_xr_guard.py::test_a_camera_that_dies",
-    "tests/page/test_xr_guard.py::test_a_picture_that_is_said_again",
-    "tests/page/test_xr_links.py",
-    "tests/page/test_xr_never_old.py::test_a_frozen_picture",
-    "tests/page/test_xr_never_old.py::test_who_wears_it_no_more",
-    "tests/page/test_xr_there.py",
-    "tests/page/test_xr_world.py",
-    "tests/integration/test_wheel.py::test_a_shipped_interface_package_builds",
-    "tests/integration/test_wheel.py::test_every_verb_is_there",
-    "tests/integration/test_wheel.py::test_init_writes_what_programs_take",
-    "tests/ros/test_agents_page.py",
-    "tests/ros/test_awareness_page.py",
-    "tests/ros/test_awareness_robots.py",
-    "tests/ros/test_both_kinds.py",
-    "tests/ros/test_headset_page.py",
-    "tests/ros/test_interfaces.py",
-    "tests/ros/test_not_taken.py::test_verbs",
-    "tests/ros/test_record_page.py::test_every_command",
-    "tests/ros/test_record_story.py",
-    "tests/ros/test_secured_verbs.py",
-    "tests/ros/test_tutorial_page.py",
-    "tests/ros/test_typed_values.py",
-    "tests/ros/test_unity_page.py::test_every_command_runs",
-    "tests/ros/test_unity_cdr.py",
-    "tests/ros/test_up_demo.py::test_the_demo_drives",
-    "tests/ros/test_up_demo.py::test_the_demo_leaves",
-    "tests/ros/test_up_demo.py::test_two_demos",
-)
-"""What takes minutes, and seldom finds what others do not: marked ``soak``, run by ``make test-all`` and CI."""
-
-FAMILY = range(3, 16)
-"""So many cases of one test are programs started so many times, and one in `PART` of them is in ``make test``, another
-one in each test: of four ports, say, each test has one. More are rows of a table, and cheap; so are those of
-tests/unit."""
 
 LOGGERS = ("macs", "macs.mesh", "macs.demo")
 """Those whose level our programs set."""
@@ -169,28 +77,21 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if config.getoption("--backwards"):
-        order = {path: -number for number, path in enumerate(dict.fromkeys(item.path for item in items))}
-        items.sort(key=lambda item: order[item.path])
-    for item in items:
-        if item.nodeid.startswith(ALONE):
-            item.add_marker(pytest.mark.alone)
-        if item.nodeid.startswith(SOAK):
-            item.add_marker(pytest.mark.soak)
-    for name, cases in _families(items).items():
-        chosen = zlib.crc32(name.encode()) % min(PART, len(cases))
-        for number, item in enumerate(cases):
-            if number % PART != chosen:
-                item.add_marker(pytest.mark.soak)
+        backwards = {path: -number for number, path in enumerate(dict.fromkeys(item.path for item in items))}
+        items.sort(key=lambda item: backwards[item.path])
+    tiers.mark(items)
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        from tests.support.sharing import order  # what needs xdist; a run of one process does not
+
+        items[:] = [items[index] for index in order([item.nodeid for item in items])]
 
 
-def _families(items: list[pytest.Item]) -> dict[str, list[pytest.Item]]:
-    """Tests with several cases, by their names."""
-    found: dict[str, list[pytest.Item]] = {}
-    for item in items:
-        name, _, case = item.nodeid.partition("[")
-        if case and not name.startswith("tests/unit/") and not item.get_closest_marker("soak"):
-            found.setdefault(name, []).append(item)
-    return {name: cases for name, cases in found.items() if len(cases) in FAMILY}
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """How tests are shared out among workers."""
+    from tests.support.sharing import Sharing
+
+    return Sharing(config, log)
 
 
 @pytest.fixture(scope="session", autouse=True)

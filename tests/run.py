@@ -1,4 +1,5 @@
-"""The tests: those that may share the machine at the same time, then one by one those that measure time.
+"""The tests: those that may share the machine at the same time, then a few at a time those that measure time and bear
+it, then one by one those that do not.
 
 ``python -m tests.run`` is what ``make test`` runs; ``--all`` adds those that take minutes, and all
 examples of those that draw their input (``make test-all``, CI);
@@ -12,14 +13,20 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 from typing import NamedTuple
 
-from tests.support import tools
+import pytest
+
+from tests.support import tiers, tools
 from tests.support.thorough import THOROUGH
 
 CORES = os.cpu_count() or 1
 WORKERS = min(4 * CORES, 12)
 """More than there are cores: most tests wait most of the time."""
+
+FEW_WORKERS = max(2, min(CORES, 3))
+"""Of those that measure time, and bear some others."""
 
 TIERS = "not chaos and not kin"
 
@@ -37,7 +44,7 @@ class Part(NamedTuple):
 def part(name: str, *argv: str, workers: int = 0) -> Part:
     """Run pytest."""
     print(f"::: {name}", flush=True)
-    shared = ("-n", str(workers), "--dist", "worksteal") if workers else ()
+    shared = ("-n", str(workers)) if workers else ()
     process = subprocess.Popen([sys.executable, "-m", "pytest", *shared, *argv], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     closing, named = "", []
@@ -50,6 +57,17 @@ def part(name: str, *argv: str, workers: int = 0) -> Part:
     return Part(good, counts.get("passed", 0), counts.get("failed", 0) + counts.get("error", 0), named)
 
 
+def compile_once() -> None:
+    """In a new checkout, so that not all workers do at the same time: half a minute otherwise."""
+    tests = Path("tests")
+    if len(list(tests.rglob(f"test_*-pytest-{pytest.__version__}.pyc"))) < len(list(tests.rglob("test_*.py"))) // 2:
+        folders = {str(path.parent) for path in tests.glob("*/test_*.py")}
+        collect = [sys.executable, "-m", "pytest", "--collect-only", "-qq"]
+        halves = [["tests/unit"], sorted(folders - {"tests/unit"})]
+        for each in [subprocess.Popen([*collect, *half], stdout=subprocess.DEVNULL) for half in halves]:
+            each.wait()
+
+
 def run(words: list[str]) -> list[Part]:
     """The parts that were asked for."""
     order = ["--backwards"] if "--backwards" in words else []
@@ -57,10 +75,12 @@ def run(words: list[str]) -> list[Part]:
         return [part("fast", "tests/unit", *order, workers=max(2, CORES))]
     if "--all" in words:
         os.environ[THOROUGH] = "1"
-    tiers = TIERS if "--all" in words else f"{TIERS} and not soak"
-    parts = [part("together", "-m", f"{tiers} and not alone", *order, workers=WORKERS)]
+    tier = TIERS if "--all" in words else f"{TIERS} and not soak"
+    compile_once()
+    parts = [part("together", "-m", f"{tier} and not alone and not few", *order, workers=WORKERS)]
     os.environ.pop("MACS_NEED_ROS_TESTS", None)  # judged by the first part
-    return [*parts, part("alone", "-m", f"{tiers} and alone", *order)]
+    parts += [part("few", *tiers.files("few"), "-m", f"{tier} and few", *order, workers=FEW_WORKERS)]
+    return [*parts, part("alone", *tiers.files("alone"), "-m", f"{tier} and alone", *order)]
 
 
 def main() -> int:

@@ -27,7 +27,7 @@ from tests.support.waiting import until
 if TYPE_CHECKING:
     from playwright.async_api import Browser
 
-pytestmark = [needs_browser, pytest.mark.alone, pytest.mark.timeout(240)]
+pytestmark = [needs_browser, pytest.mark.timeout(240)]
 AGE_S = 1.0
 RULES = f"[robot]\nmax_timed_command_age_s = {AGE_S}\n{ROBOT}"
 """On a busy machine commands get older than they are by default. The dead-man is that of each site."""

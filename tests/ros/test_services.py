@@ -422,7 +422,6 @@ async def test_a_service_at_its_end_is_not_kept_by_callers(
     assert (await asyncio.wait_for(response, PATIENCE_S))[0].message == "next"
 
 
-@pytest.mark.alone
 async def test_a_thousand_calls_with_every_third_unanswered(
     nodes: InterfaceNodes, headsets: Headsets, peer: Peer
 ) -> None:
