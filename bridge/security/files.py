@@ -310,15 +310,15 @@ def _priorities(policy: Policy, own_rules: list[dict[str, Any]]) -> Iterator[str
         else:
             yield f"  // priorities from {rule.match} on are left to the programs: robots' topics are among its keys"
             break
-    yield "  // What has the priority of commands is dropped where a link is full: who waits there holds up everybody."
     yield "  qos: { network: ["
+    if entries:
+        yield "    // the last one that fits wins here, the first one in the policy"
+    yield from reversed(entries)
+    yield "    // What has the priority of commands now is dropped where a link is full: who waits holds up everybody."
     for own in own_rules:
         *_, (last, overwrite) = own.items()
         yield f"    {_inline({name: value for name, value in own.items() if name != last})[:-2]},"
         yield f"      {last}: {_inline(overwrite)} }},"
-    if entries:
-        yield "    // the last one that fits wins here, the first one in the policy"
-    yield from reversed(entries)
     yield "  ] },"
 
 

@@ -243,8 +243,8 @@ def test_traffic_rules_are_a_guard_in_the_router(tmp_path: Path) -> None:
         (["macs/from/ros/7/**"], 5000000),
         (["macs/**"], 5000000),
     ]
-    own, *priorities = json.loads(conf.get_json("qos/network"))
-    assert own["overwrite"]["congestion_control"] == "drop"
+    *priorities, own = json.loads(conf.get_json("qos/network"))
+    assert own["overwrite"]["congestion_control"] == "drop", "also of what the rules before give that priority"
     assert [(one["key_exprs"], one["overwrite"]["priority"]) for one in priorities] == [
         (["macs/to/ros/**"], "interactive_high"),
         (["macs/to/**"], "data"),
