@@ -123,14 +123,14 @@ async def _settle(operator: Operator, robot: int, args: argparse.Namespace) -> O
     loop = asyncio.get_running_loop()
     deadline = loop.time() + args.timeout
     wanted, patience_s, outcome, unserved = not args.release, FIRST_S, Outcome(robot, False), False
-    seen: int | None = None
+    said = b"true" if wanted else b""
     while (left_s := deadline - loop.time()) > 0:
-        verb, data = ("stop", b"true") if wanted else ("status", b"") if seen is None else ("stop", release(seen))
+        verb = "stop" if said else "status"
         try:
-            answer = await operator.ask(robot, verb, data, timeout_s=min(patience_s, left_s), urgent=True)
+            answer = await operator.ask(robot, verb, said, timeout_s=min(patience_s, left_s), urgent=True)
             _, status = robots.read(answer, RobotStatus)
             if verb == "status":  # a release is for what was seen when it was asked for, however often it is said
-                seen = status.stop.presses
+                said = release(status.stop.presses)
                 continue
         except Refused as refusal:
             return Outcome(robot, False, problem=refusal.reason)

@@ -104,9 +104,9 @@ class StopNode(InterfaceNode):
             self.robot.drops.note("bad_cdr", f"{self.topic} from {sender}", problem)
             self.robot.tell_refused(message, self.topic, "bad_cdr", problem)
             return
+        sent_at = now_s() - message.age_s  # before it waits for a press that is being carried out
         try:
             with self._lock:
-                sent_at = now_s() - message.age_s
                 if not message.data[4] and (self.overtaken(message) or sent_at < self._pressed_at):
                     self.robot.drops.note("too_old", f"{self.topic} from {sender}", PRESSED_SINCE)
                     self.robot.tell_refused(message, self.topic, "too_old", PRESSED_SINCE)
@@ -121,20 +121,18 @@ class StopNode(InterfaceNode):
         Refused when the settings do not allow it to this agent, or somebody has pressed it since."""
         try:
             with self._lock:
-                if not stop and seen not in (None, self.robot.stop.presses):
-                    raise Refused(f"{PRESSED_SINCE}, by {' and '.join(self.robot.stop.pressed) or self.robot.stop.by}")
-                self._set(sender, stop)
-                if stop:
-                    self._pressed_at = max(self._pressed_at, now_s() if sent_at is None else sent_at)
+                if not stop and self.robot.stop.stopped and seen not in (None, self.robot.stop.presses):
+                    raise Refused(f"{PRESSED_SINCE}, by {' and '.join(self.robot.stop.pressed)}")
+                self._set(sender, stop, sent_at)
         except Refused as refusal:
             self.robot.audit.record("stop" if stop else "release", who(str(sender)), self.topic, refusal.reason)
             raise
 
-    def _set(self, sender: Registrant, stop: bool) -> None:
+    def _set(self, sender: Registrant, stop: bool, sent_at: float | None) -> None:
         if stop:
             if not self._names(self.robot.rules.settings.stop_allow, sender):
                 raise Refused(f"{sender} may not stop this robot")
-            self.press(str(sender))
+            self.press(str(sender), sent_at)
         elif self._names(self.robot.rules.settings.release_allow, sender):
             self.release(str(sender))
         elif WHO_STOPPED in self.robot.rules.settings.release_allow:
@@ -145,15 +143,18 @@ class StopNode(InterfaceNode):
     def _names(self, patterns: list[str], sender: Registrant) -> bool:
         return names_agent(patterns, type_name(sender.type), sender.id, self.robot.group_of(sender))
 
-    def press(self, by: str) -> None:
-        """Stop, latched. Again changes nothing."""
+    def press(self, by: str, sent_at: float | None = None) -> None:
+        """Stop, latched. Again only makes releases from before it too old. ``sent_at`` None: until it is told."""
         with self._lock:
             before = self.robot.stop.changes
-            if self.robot.stop.press(by, time.time()):
-                self._has_stopped()
-            elif self.robot.stop.changes != before:
-                self.robot.audit.record("stop", who(by), self.topic, BEFORE)
-                self._tell()
+            try:
+                if self.robot.stop.press(by, time.time()):
+                    self._has_stopped()
+                elif self.robot.stop.changes != before:
+                    self.robot.audit.record("stop", who(by), self.topic, BEFORE)
+                    self._tell()
+            finally:
+                self._pressed_at = max(self._pressed_at, now_s() if sent_at is None else sent_at)
 
     def release(self, by: str) -> None:
         """Let commands pass again, whoever stopped; the robot does nothing until one comes."""
@@ -192,7 +193,7 @@ class StopNode(InterfaceNode):
         with self._lock:
             stop = self.robot.stop
             was = stop.stopped
-            before = stop.changes
+            before, presses = stop.changes, stop.presses
             if not stop.adopt(
                 state.changes,
                 state.pressed,
@@ -205,6 +206,8 @@ class StopNode(InterfaceNode):
                 if stop.changes > max(before, state.changes):  # what was pressed here, they do not know
                     self._tell()
                 return
+            if stop.presses != presses:
+                self._pressed_at = now_s()
             if stop.stopped and not was:
                 self._has_stopped()
             elif was and not stop.stopped:

@@ -75,7 +75,7 @@ class NodeStatus(Struct, frozen=True):
 class StopStatus(Struct, frozen=True):
     """The emergency stop: who pressed it last, who has and has not taken that back, how long ago, how often in all.
 
-    ``presses`` counts those who joined in as well, for `release`.
+    ``presses`` counts those who joined in as well, for `release`; None of a robot that does not know that.
     """
 
     by: str = ""
@@ -83,7 +83,7 @@ class StopStatus(Struct, frozen=True):
     seconds: float = 0
     times: Count = 0
     history: list[str] = []
-    presses: Count = 0
+    presses: Count | None = None
 
 
 RELEASE = b"false"
@@ -91,10 +91,10 @@ DIGITS = 12
 """Of a number that somebody says."""
 
 
-def release(presses: int) -> bytes:
+def release(presses: int | None) -> bytes:
     """What the verb ``stop`` is asked by who ends the stop and has seen so many ``presses``: one that came since
-    stays."""
-    return b"%s %d" % (RELEASE, presses)
+    stays. None: of a robot that does not count them, which would take a number for a press."""
+    return RELEASE if presses is None else b"%s %d" % (RELEASE, presses)
 
 
 def released(data: bytes) -> tuple[bool, int | None]:

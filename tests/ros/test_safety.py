@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import random
 import time
 from collections.abc import AsyncIterator
@@ -20,6 +21,7 @@ from bridge.ros.requests import ControlRequest, control
 from bridge.ros.rules import Rules
 from bridge.ros.safety import Control, DeadMan, EmergencyStop
 from bridge.ros.session import RosSession
+from bridge.ros.shared_stop import A_NODE
 from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.guard import Ages
@@ -299,6 +301,13 @@ async def test_a_release_from_before_a_press_is_not_carried_out(nodes: Interface
     assert nodes.robot.stop.stopped
     assert nodes.drops == {"too_old": 1}
     nodes.deliver(press._replace(age_s=0.3))
+    nodes.deliver(release._replace(sender_id=6))
+    assert not nodes.robot.stop.stopped
+    assert nodes.stop is not None
+    nodes.stop._pressed_at = -math.inf  # long ago
+    nodes.stop.press(A_NODE)
+    nodes.deliver(release._replace(sender_id=6, age_s=60.0))
+    assert nodes.robot.stop.stopped, "also what a button on the robot has pressed"
     nodes.deliver(release._replace(sender_id=6))
     assert not nodes.robot.stop.stopped
 

@@ -24,7 +24,7 @@ from bridge.ros.stop import STATES, StopNode
 from bridge.settings import RobotSettings, TopicRule
 from macs_zenoh.agent import Agent
 from macs_zenoh.mesh import now_s
-from macs_zenoh.protocol.messages import ROS, UNITY, Metadata, NodeType
+from macs_zenoh.protocol.messages import OPERATOR, ROS, UNITY, Metadata, NodeType
 from macs_zenoh.protocol.routing import unicast_key
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from tests.support.ros_peer import ROBOT, Peer, adding, reaches
@@ -64,18 +64,22 @@ def fails(*_: object) -> None:
     raise RuntimeError("this one fails")
 
 
-async def test_a_release_on_its_way_does_not_follow_a_stop(robot: RobotAgent, headset: Agent) -> None:
-    """Who asks for a stop overtakes the release that he put before: also while the robot is being stopped."""
+@pytest.mark.parametrize(("sender", "age_s"), [((UNITY, 5), 0.5), ((UNITY, 5), 0.0), ((OPERATOR, 1), 0.0)])
+async def test_a_release_on_its_way_does_not_follow_a_stop(
+    robot: RobotAgent, headset: Agent, sender: tuple[int, int], age_s: float
+) -> None:
+    """Who asks for a stop overtakes the release that he put before: also while the robot is being stopped, and also
+    one that comes then, whoever sent it: he could not know of the stop."""
     stop, guard = robot.nodes.stop, robot._guard
     assert stop is not None
     assert guard is not None
-    about = Metadata(UNITY, 5, 0, "", NodeType.PUBLISHER, stop.key.node_name, "std_msgs/Bool")
+    about = Metadata(*sender, 0, "", NodeType.PUBLISHER, stop.key.node_name, "std_msgs/Bool")
     release = encode_frame(ROS, (ROBOT,), message=encode_message(about.encode(), STATES[False]))
     come: list[threading.Thread] = []
     on_stop = stop._on_stop
 
     def meanwhile(by: str) -> None:
-        arguments = (unicast_key(ROS, ROBOT, UNITY, 5), release, 0.5, now_s())
+        arguments = (unicast_key(ROS, ROBOT, *sender), release, age_s, now_s())
         come.append(threading.Thread(target=guard.first, args=arguments))
         come[0].start()
         time.sleep(0.2)  # it is judged now, and waits for what is done here

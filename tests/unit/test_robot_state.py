@@ -82,3 +82,9 @@ def test_offers_say_how_a_topic_is_sent() -> None:
 def test_what_is_no_release_stops(data: bytes, means: tuple[bool, int | None]) -> None:
     """A number is read only if it is short; whatever is not understood is the safer of the two."""
     assert released(data) == means
+
+
+def test_a_robot_that_counts_no_presses_is_told_the_word_alone() -> None:
+    """One of before takes whatever else is said for a press."""
+    before = msgspec.json.decode(b'{"by": "unity/5", "times": 1}', type=StopStatus)
+    assert release(before.presses) == b"false"
