@@ -70,7 +70,10 @@ class Outgoing:
     LARGE_BYTES = 128 << 10
     """Larger ones are given to Zenoh by a thread: on a slow link that takes long."""
     COMMANDS_BYTES = 32 << 20
-    """So much of large commands may wait for it, as long as it takes Zenoh to drop what does not get on."""
+    """So much of large commands may wait for it, and small ones behind them until it is twice as much."""
+    COMMANDS_S = 0.5
+    """A large one that has waited so long is dropped if others wait behind it: nobody stamps them before they are put,
+    so a robot takes them for new."""
     HERE_BYTES = 8 << 10
     """From so much on, Zenoh is not given what only our own subscriptions take: the copy alone takes it longer than
     all else (64 KiB: 25 of 31 us, measured)."""
@@ -117,7 +120,8 @@ class Outgoing:
         """Keys that have or had a publisher, by who sends."""
         self._on_room: Callbacks[Callable[[], None]] = Callbacks()
         self._sender = Sender(backlog_bytes, loopback.put, lambda: from_thread(self._room))
-        self._commands = Sender(self.COMMANDS_BYTES, loopback.put, lambda: None)
+        self._commands = Sender(self.COMMANDS_BYTES, loopback.put, lambda: None, lambda: from_thread(self._late))
+        self._commands.most_s = self.COMMANDS_S
         """For large commands put on the loop, and what follows them with their keys: Zenoh waits for room for their
         fragments (``fragment_wait_ms``)."""
         self._loop_thread = threading.get_ident()
@@ -229,6 +233,9 @@ class Outgoing:
         """Call ``callback``, from any thread, when Zenoh has all that was put before."""
         self._sender.when_sent(lambda: self._commands.when_sent(callback))
 
+    def _late(self) -> None:
+        self.drops["backlog"] += 1
+
     def _room(self) -> None:
         for callback in self._on_room:
             callback()
@@ -245,7 +252,7 @@ class Outgoing:
 
     def _is_for_thread(self, key: str, payload: Payload) -> bool:
         """Whether a command is left to a thread, since it may take long or would overtake one that does."""
-        large = len(payload) > self.LARGE_BYTES and threading.get_ident() == self._loop_thread
+        large = _is_large(payload) and threading.get_ident() == self._loop_thread
         return large or self._commands.has(key)
 
     def _put_large(self, key: str, publisher: Outlet, payload: Payload) -> None:
@@ -359,14 +366,23 @@ class Outgoing:
 class Sender:
     """A thread that puts what may take long, in order. It starts with the first such payload."""
 
-    def __init__(self, limit_bytes: int, put: Callable[[Outlet, Payload], None], on_room: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        limit_bytes: int,
+        put: Callable[[Outlet, Payload], None],
+        on_room: Callable[[], None],
+        on_late: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.most_s = math.inf
+        """So long a large payload may wait while others wait behind it; then it is not put, and ``on_late`` called."""
+        self._on_late = on_late
         self._put = put
         self.backlogged = False
         self.sent = 0
         self._limit_bytes = limit_bytes
         self._on_room = on_room
         self._bytes = 0
-        self._queue: deque[tuple[Outlet, Payload, str] | Callable[[], None]] = deque()
+        self._queue: deque[tuple[Outlet, Payload, str, float] | Callable[[], None]] = deque()
         """What is to be put, and who is to be told that all before it has been."""
         self._keys: Counter[str] = Counter()
         """How much waits of those that whoever puts has named."""
@@ -389,13 +405,15 @@ class Sender:
         return key in self._keys
 
     def put(self, publisher: Outlet, payload: Payload, key: str = "") -> bool:
-        """Queue it; False when that would be more than the limit (one payload may always wait). ``key``: for `has`."""
+        """Queue it; False when that would be more than the limit (one payload may always wait), or than twice as much
+        of small ones with a ``key``, which is for `has`."""
+        limit = self._limit_bytes * (2 if key and not _is_large(payload) else 1)
         with self._wake:
-            if self._closing or (self._bytes and self._bytes + len(payload) > self._limit_bytes):
+            if self._closing or (self._bytes and self._bytes + len(payload) > limit):
                 return False
             self._bytes += len(payload)
             self.backlogged = self._bytes > self._limit_bytes // 4
-            self._queue.append((publisher, payload, key))
+            self._queue.append((publisher, payload, key, time.monotonic()))
             self._keys[key] += 1
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="macs-sender", daemon=True)
@@ -430,8 +448,11 @@ class Sender:
             if not isinstance(entry, tuple):
                 entry()
                 continue
-            publisher, payload, key = entry
-            self._put(publisher, payload)
+            publisher, payload, key, since = entry
+            if self._queue and _is_large(payload) and time.monotonic() - since > self.most_s:
+                self._on_late()
+            else:
+                self._put(publisher, payload)
             with self._wake:
                 self.sent += 1
                 self._keys[key] -= 1
@@ -443,3 +464,7 @@ class Sender:
                     self.backlogged = False
             if relieved:
                 self._on_room()
+
+
+def _is_large(payload: Payload) -> bool:
+    return len(payload) > Outgoing.LARGE_BYTES

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
 import time
 from collections import Counter
@@ -20,7 +21,7 @@ from bridge.settings import GatewaySettings
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.mesh import Mesh, Sample, Traffic
-from macs_zenoh.mesh.outgoing import Outgoing
+from macs_zenoh.mesh.outgoing import Outgoing, Sender
 from macs_zenoh.protocol.keyexpr import PING, UNICAST
 from macs_zenoh.protocol.limits import CALL_BYTES
 from tests.support.local import patient
@@ -29,6 +30,7 @@ from tests.support.waiting import PATIENCE_S, until
 
 KEY = "macs/to/unity/0/1/unity/2"
 LARGE = Mesh.LARGE_BYTES + 1
+NOBODY: Any = None
 
 
 def keeper(into: list[tuple[int, bytes]]) -> Callable[[list[Sample]], None]:
@@ -66,6 +68,7 @@ async def test_a_large_command_is_put_by_a_thread_and_what_follows_it_comes_behi
     """Zenoh waits for room for each of its fragments, in the loop of everybody: what this program hears of it was not
     put there. Too much at once is dropped and counted."""
     monkeypatch.setattr(Outgoing, "COMMANDS_BYTES", 4 << 20)
+    monkeypatch.setattr(Outgoing, "COMMANDS_S", math.inf)
     here: list[tuple[int, bytes]] = []
     async with await Mesh.open(MeshSettings(connect=[router])) as mesh:
         mesh.subscribe(KEY, keeper(here))
@@ -82,6 +85,34 @@ async def test_a_large_command_is_put_by_a_thread_and_what_follows_it_comes_behi
         await mesh.drain()
         await until(lambda: len(here) + mesh.drops["backlog"] == 80)
         assert mesh.drops["backlog"] > 0
+
+
+def test_what_follows_large_commands_waits_no_longer_than_it_may() -> None:
+    """Large ones that have waited too long are dropped and counted; what is behind them goes on, also where there is
+    no room for more large ones."""
+    put: list[Any] = []
+    begun, goes_on, done = threading.Event(), threading.Event(), threading.Event()
+    late: list[int] = []
+
+    def slow(_: Any, payload: Any) -> None:
+        begun.set()
+        goes_on.wait()
+        put.append(payload)
+
+    sender = Sender(2 * LARGE, slow, lambda: None, lambda: late.append(1))
+    first, second, small = bytes(LARGE), b"2" * LARGE, b"small"
+    assert sender.put(NOBODY, first, KEY)
+    begun.wait()
+    sender.most_s = 0.0
+    assert sender.put(NOBODY, second, KEY)
+    assert not sender.put(NOBODY, first, KEY)
+    assert sender.put(NOBODY, small, KEY)
+    sender.when_sent(done.set)
+    goes_on.set()
+    done.wait()
+    sender.close(60)
+    assert put == [first, small]
+    assert late == [1]
 
 
 @pytest.mark.parametrize("settled", [True, False])
