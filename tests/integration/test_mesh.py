@@ -174,6 +174,7 @@ async def test_who_sends_to_many_gets_publishers_for_some_and_all_of_it_arrives(
 
         session = mesh._outgoing._session
         monkeypatch.setattr(mesh._outgoing, "_session", Counting())
+        monkeypatch.setattr(mesh._outgoing._sender, "_limit_bytes", 256 << 20)  # however slow the link, all may wait
         sent = []
         for sender in (7, 8):
             for again in range(4):
