@@ -88,10 +88,11 @@ class Ever:
 
 
 class Toll:
-    """Slows whoever asks for more work than ``per_s``: a quarter of a second's worth is free at once, beyond that each
-    piece is paid for with time."""
+    """Slows whoever asks for more work than ``per_s``: a second's worth is free at once, beyond that each piece is
+    paid for with time."""
 
-    FREE_S = 0.25
+    FREE_S = 1.0
+    """Who comes back registers all at once, and a stop may be behind that."""
 
     LONGEST_S = 0.25
     """An existing headset freezes when nobody reads from it for long."""
