@@ -113,9 +113,14 @@ def _logging_as_before() -> Iterator[None]:
 
 
 @pytest.fixture
-async def router() -> AsyncIterator[str]:
-    """A Zenoh router in this process; its endpoint."""
-    from tests.support.local import local_router  # most tests need no Zenoh
+async def router(request: pytest.FixtureRequest) -> AsyncIterator[str]:
+    """A Zenoh router in this process, or in one of its own for a test marked ``megabytes``; its endpoint.
 
-    async with local_router() as endpoint:
+    All sessions of a process share the two threads that read their links. A router that waits there for room in one of
+    them may wait for itself, once more is on its way than kernels and queues hold.
+    """
+    from tests.support import local  # most tests need no Zenoh
+
+    apart = request.node.get_closest_marker("megabytes") is not None
+    async with local.router_apart() if apart else local.local_router() as endpoint:
         yield endpoint

@@ -60,6 +60,7 @@ async def test_data_that_is_no_bytes_is_refused_by_name(router: str, data: objec
             await agent.call("unity", 300, "ping", data)  # type: ignore[arg-type]
 
 
+@pytest.mark.megabytes
 async def test_a_drained_agent_has_sent_all(router: str) -> None:
     """After drain, all that was sent before is in Zenoh's hands, large as it may be: nothing waits here. Waited for
     after each piece, more goes through than may wait at one time."""
@@ -78,6 +79,7 @@ async def test_a_drained_agent_has_sent_all(router: str) -> None:
         assert not headset.mesh.drops["backlog"]
 
 
+@pytest.mark.megabytes
 async def test_drain_waits_for_what_was_sent_before(router: str) -> None:
     """While something large is under way, drain has not ended."""
     async with (

@@ -182,6 +182,7 @@ async def test_an_empty_name_is_an_error(meet: Meet) -> None:
         await meet("")
 
 
+@pytest.mark.megabytes
 @pytest.mark.parametrize("how", ["send", "deliver"])
 async def test_ten_megabytes_arrive_whole(meet: Meet, how: str) -> None:
     """10 MB to one and to all arrive byte for byte, with small messages in between; above the limit is refused."""

@@ -305,7 +305,8 @@ async def test_who_registers_and_leaves_again_and_again_declares_once(
         await until(lambda: len(declared) == 1 and not listening())
         assert len(declared) == 1
         await attacker.send(b"".join(toggled(f"/{number}") for number in range(30)))
-        await until(lambda: len(declared) == 31)
+        await until(lambda: len(declared) > 1)  # of some, it has left again before it was their turn
         assert len(listening()) <= 9
         await until(lambda: not listening())
+        assert len(set(declared)) == len(declared)
         attacker.socket.close()

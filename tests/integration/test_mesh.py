@@ -62,6 +62,7 @@ async def test_large_and_small_keep_their_order_here_and_elsewhere(router: str) 
         assert not mesh.drops
 
 
+@pytest.mark.megabytes
 async def test_a_large_command_is_put_by_a_thread_and_what_follows_it_comes_behind(
     router: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,6 +145,7 @@ async def test_who_subscribes_later_gets_large_payloads(
         assert [end for _, end in here] == [i.to_bytes(4, "big") for i in range(number)]
 
 
+@pytest.mark.megabytes
 @pytest.mark.parametrize("size", [64, Outgoing.HERE_BYTES, 2 * Outgoing.LARGE_BYTES])
 async def test_who_sends_to_many_gets_publishers_for_some_and_all_of_it_arrives(
     router: str, size: int, monkeypatch: pytest.MonkeyPatch

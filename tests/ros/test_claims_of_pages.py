@@ -23,7 +23,7 @@ async def test_a_robot_answers_the_verbs_of_the_page(robot: RobotAgent, headset:
     """docs/protocol.md: each verb of the table is served by a robot's agent, another one is not."""
     table = (DOCS / "protocol.md").read_text(encoding="utf-8").partition("| verb |")[2].partition("\n\n")[0]
     verbs = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
-    assert len(verbs) == 8
+    assert len(verbs) == 9
     for verb in verbs:
         with contextlib.suppress(Refused):  # what it says no to, it serves
             await headset.call("ros", ROBOT, verb, b"{}")

@@ -12,6 +12,7 @@ from contextlib import asynccontextmanager
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh
 from tests.support.programs import free_port
+from tests.support.routers import Router, as_macs_router
 
 PATIENT_MS = 30_000
 
@@ -27,3 +28,10 @@ async def local_router() -> AsyncIterator[str]:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     async with await Mesh.open(MeshSettings(mode="router", listen=[endpoint], block_limit_ms=PATIENT_MS)):
         yield endpoint
+
+
+@asynccontextmanager
+async def router_apart() -> AsyncIterator[str]:
+    """A router in a process of its own; its endpoint."""
+    async with Router(overrides=as_macs_router(MeshSettings(block_limit_ms=PATIENT_MS))) as router:
+        yield router.endpoint
