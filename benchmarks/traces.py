@@ -16,12 +16,17 @@ OFF, SPARSE = 0.99, 0.98
 """What is left of the throughput at least: while nobody asks, and with one in a hundred traced."""
 
 
-def _rate(plan: Plan, where: str, sender: Program, receiver: Program, size: int) -> float:
-    """Messages a second."""
+def _rate(
+    plan: Plan, where: str, sender: Program, receiver: Program, size: int, used: list[float] | None = None
+) -> float:
+    """Messages a second. ``used`` gets the processor time of both ends, in us for each message."""
     count = plan.count(size)
     receiver.ask("expect", count=count)
+    before = sender.used_s + receiver.used_s
     began = sender.ask("put", size=size, count=count)["began"]
     got = receiver.ask("receive", timeout_s=QUIET_S)
+    if used is not None:
+        used.append((sender.used_s + receiver.used_s - before) / count * 1e6)
     return count / (got["ended"] - began) if plan.arrived(where, count, got["received"]) else 0.0
 
 
@@ -41,13 +46,22 @@ def traces(stage: Stage, plan: Plan) -> Iterator[Figure]:
         if end.ask("end")["wanted"]:
             raise ProgramFailed("a trace does not end")
     for label, size in SIZES.items():
-        runs = {name: partial(_rate, plan, f"{name}, {label}", *pair, size) for name, pair in pairs.items()}
+        used: dict[str, list[float]] = {name: [] for name in pairs}
+        runs = {
+            name: partial(_rate, plan, f"{name}, {label}", *pair, size, used[name]) for name, pair in pairs.items()
+        }
         rates = in_turn(plan.rounds, runs)
         told = partial(Figure, baseline=rates["never"], against="never traced", unit="msg/s", column=label)
         yield told("the same once more", rates["never again"])
         yield told("a trace has ended", rates["ended"], at_least=OFF)
         yield told("one in 100 traced", rates["one in 100"], at_least=SPARSE)
         yield told("all traced", rates["all"])
+        costs = partial(
+            Figure, baseline=used["never"], against="never traced", unit="us of processor a message", column=label
+        )
+        yield costs("processor: the same once more", used["never again"])
+        yield costs("processor: a trace has ended", used["ended"], at_most=1 / OFF)
+        yield costs("processor: one in 100 traced", used["one in 100"], at_most=1 / SPARSE)
         took = pairs["never"][0].ask("look")["took"]
         each = [1 / rate for rate in rates["never"] if rate]
         yield Figure(
