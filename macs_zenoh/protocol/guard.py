@@ -93,7 +93,7 @@ class Ages:
     """How long samples have waited on their way, by stamps of clocks that nobody has compared with ours.
 
     The difference between arrival and stamp is the way's length and that of the clocks; the smallest of the last
-    minute is a sample that did not wait. What another has more is the time that it waited.
+    minutes is a sample that did not wait. What another has more is the time that it waited.
 
     Whoever sends can write the stamp himself, and name any clock. So the smallest is each sender's own: what somebody
     forges makes nobody else's commands old or young, and the clocks that he makes up displace his own. Only who is new
@@ -109,7 +109,10 @@ class Ages:
     WITNESSES = 9
     """With so many senders of a clock a new one is compared."""
     NEW_S = 1.0
-    HALF_S = 30.0
+    HALF_S = 150.0
+    """Twice as long at most a queue may stand in which everything waits, as somebody floods, before it is taken for
+    the way's length. Clocks that are put forward make the difference smaller, and stamps never go back, so only their
+    drift speaks against more: 30 ms at 100 ppm."""
     FORGET_S = 600.0
     """Two clocks drift apart: what was found so long ago says little, and only of what comes first (`NEW_S`)."""
     STANDS_S = 1e-6

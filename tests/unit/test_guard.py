@@ -70,6 +70,16 @@ def test_ages_need_no_common_clock(offset: float) -> None:
         assert age == pytest.approx(waited, abs=0.02)
 
 
+def test_a_queue_in_which_all_wait_for_minutes_is_not_taken_for_the_way() -> None:
+    """Somebody floods, and whatever else comes has waited behind that: it is as old as that all the time."""
+    ages, offset = Ages(), 5.0
+    for number in range(1000):
+        now = number / 5
+        waited = 0.25 if now >= 50 else 0.0
+        age = ages.age("unity/300", "router", offset + now - 0.02 - waited, now)
+        assert age == pytest.approx(waited)
+
+
 def test_a_clock_that_was_put_forward_makes_nothing_old() -> None:
     """A hybrid clock stands still until time has come up to it; then it goes on."""
     ages = Ages()
