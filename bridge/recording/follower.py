@@ -38,6 +38,8 @@ LARGE_DEPTH = 10
 LARGE = ("Image", "PointCloud", "CompressedVideo", "OccupancyGrid", "Map")
 AGAIN_S = 2.0
 """Pause between attempts where a robot does not say what it has."""
+LOOK_S = 10.0
+"""What a robot has is asked again so often: what it says of a change may get lost, or come before anybody listens."""
 PATIENCE_S = 20.0
 """How long a registration may take."""
 OnNote = Callable[[dict[str, object]], None]
@@ -76,6 +78,8 @@ class RobotFollower:
         self._nodes = Nodes(agent, self._layout, patient=True)
         self._following: dict[str, asyncio.Task[None]] = {}
         self._stop_topic = ""
+        self._has_told = False
+        """Whether it has said what it offers."""
         key = STREAM.of(type=ROS, id=robot, node=OFFERS_STREAM)
         self._stream = agent.mesh.subscribe(key, self._heard)
         self._asking = asyncio.get_running_loop().create_task(self._ask())
@@ -124,7 +128,7 @@ class RobotFollower:
 
     def forget_offers(self) -> None:
         """It has left: whatever comes under its id has to tell what it offers."""
-        self.offered = Offered()
+        self.offered, self._has_told = Offered(), False
         self._asking.cancel()
         self._asking = asyncio.get_running_loop().create_task(self._ask())
 
@@ -135,10 +139,10 @@ class RobotFollower:
             try:
                 answer = await self._agent.call(ROS, self.robot, "offers", timeout_s=PATIENCE_S)
                 self._take(decode_data(Offered, answer, ANSWER_BYTES))
-                return
+                self._has_told = True
             except MacsError as error:
                 log.debug("ros/%d does not say what it offers: %s", self.robot, error)
-            await asyncio.sleep(AGAIN_S)
+            await asyncio.sleep(LOOK_S if self._has_told else AGAIN_S)
 
     def _heard(self, batch: Iterator[Sample]) -> None:
         for _, payload in batch:
@@ -177,7 +181,7 @@ class RobotFollower:
             self._not_recorded(topic, str(error))
             await asyncio.sleep(AGAIN_S)
             self._following.pop(topic, None)
-            if not self._asking.done() or topic in {*self.offered.publishers, *self.offered.subscribers}:
+            if not self._has_told or topic in {*self.offered.publishers, *self.offered.subscribers}:
                 self._follow(topic, of_type, qos, on_message)
             return
         self.refused.pop(topic, None)
