@@ -375,7 +375,7 @@ async def test_who_left_the_plan_may_nothing(tmp_path: Path) -> None:
         ):
             await until(lambda: ("ros", 7) in online(headset))
             thief.put_unasked("macs/to/unity/1/256/ros/7", b"forged")
-            assert await thief.tokens("macs/live/**") == ["macs/live/ros/0/7/3/a1"]  # its own session knows that
+            assert set(await thief.tokens("macs/live/**")) <= {"macs/live/ros/0/7/3/a1"}  # its own session knows that
             headset.send(b"command", to="ros", ids=[7])
             headset.broadcast(b"to all")
             assert [(await asyncio.wait_for(robot.receive(), PATIENCE_S)).data for _ in range(2)] == [
