@@ -120,8 +120,9 @@ class Outgoing:
         """Keys that have or had a publisher, by who sends."""
         self._on_room: Callbacks[Callable[[], None]] = Callbacks()
         self._sender = Sender(backlog_bytes, loopback.put, lambda: from_thread(self._room))
-        self._commands = Sender(self.COMMANDS_BYTES, loopback.put, lambda: None, lambda: from_thread(self._late))
-        self._commands.most_s = self.COMMANDS_S
+        self._commands = Sender(
+            self.COMMANDS_BYTES, loopback.put, lambda: None, lambda: from_thread(self._late), self.COMMANDS_S
+        )
         """For large commands put on the loop, and what follows them with their keys: Zenoh waits for room for their
         fragments (``fragment_wait_ms``)."""
         self._loop_thread = threading.get_ident()
@@ -364,7 +365,11 @@ class Outgoing:
 
 
 class Sender:
-    """A thread that puts what may take long, in order. It starts with the first such payload."""
+    """A thread that puts what may take long, in order. It starts with the first such payload.
+
+    So long as ``most_s`` a large payload may wait while others wait behind it; then it is not put, and ``on_late``
+    called.
+    """
 
     def __init__(
         self,
@@ -372,9 +377,9 @@ class Sender:
         put: Callable[[Outlet, Payload], None],
         on_room: Callable[[], None],
         on_late: Callable[[], None] = lambda: None,
+        most_s: float = math.inf,
     ) -> None:
-        self.most_s = math.inf
-        """So long a large payload may wait while others wait behind it; then it is not put, and ``on_late`` called."""
+        self._most_s = most_s
         self._on_late = on_late
         self._put = put
         self.backlogged = False
@@ -449,7 +454,7 @@ class Sender:
                 entry()
                 continue
             publisher, payload, key, since = entry
-            if self._queue and _is_large(payload) and time.monotonic() - since > self.most_s:
+            if self._queue and _is_large(payload) and time.monotonic() - since > self._most_s:
                 self._on_late()
             else:
                 self._put(publisher, payload)

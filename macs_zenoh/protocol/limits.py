@@ -68,7 +68,7 @@ UNFINISHED_FREE_BYTES = 128 << 10
 """So much of a frame that has begun is not counted, so that usual frames cost nothing more."""
 
 REQUESTS_PER_S = 1000
-"""Management messages of one TCP agent, 250 at once; one that sends more is read from more slowly."""
+"""Management messages of one TCP agent, which may come at once; one that sends more is read from more slowly."""
 
 REGISTRATION_REQUESTS = 5
 """So many of these a registration counts as: it is asked of robots, which make something of it in ROS, and declared on

@@ -100,11 +100,10 @@ def test_what_follows_large_commands_waits_no_longer_than_it_may() -> None:
         goes_on.wait()
         put.append(payload)
 
-    sender = Sender(2 * LARGE, slow, lambda: None, lambda: late.append(1))
+    sender = Sender(2 * LARGE, slow, lambda: None, lambda: late.append(1), most_s=0.0)
     first, second, small = bytes(LARGE), b"2" * LARGE, b"small"
     assert sender.put(NOBODY, first, KEY)
     begun.wait()
-    sender.most_s = 0.0
     assert sender.put(NOBODY, second, KEY)
     assert not sender.put(NOBODY, first, KEY)
     assert sender.put(NOBODY, small, KEY)
