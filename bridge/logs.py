@@ -38,6 +38,14 @@ class PlainFormatter(logging.Formatter):
 
     def __init__(self, prefix: str = "", *, dates: bool = False) -> None:
         super().__init__(prefix + LOG_FORMAT, datefmt=DATE if dates else TIME)
+        self._second, self._time = -1, ""
+        """The last one that a line was written in, and how."""
+
+    def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:  # noqa: N802 - logging's name
+        second = int(record.created)
+        if second != self._second:
+            self._second, self._time = second, super().formatTime(record, datefmt)
+        return self._time
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
         record.message = plain(record.message[:LONGEST])

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from .anew import AT_ONCE, Anew
 from .deadline import Deadline
-from .mesh import Mesh, Subscription, Token
+from .mesh import GatheredTokens, Mesh, Subscription, Token
 from .mesh.followed import CONFIRM_S
 from .protocol.directory import AgentInfo, Change, Directory
 from .protocol.keyexpr import PRESENCE
@@ -39,6 +39,7 @@ class Presence:
     ) -> None:
         self.directory = Directory(mine=mesh.zid)
         self._mesh = mesh
+        self._gathered = GatheredTokens(mesh.declare_token)
         self._on_changes = on_changes
         self._on_contested = on_contested
         self._changes: list[Change] = []
@@ -108,6 +109,7 @@ class Presence:
 
     def close(self) -> None:
         """Follow no more."""
+        self._gathered.close()
         if self._watching is not None:
             self._watching.close()
         for handle in (self._handling, self._looking, self._confirming):
@@ -116,14 +118,20 @@ class Presence:
         self._sweep.cancel()
         self._anew.close()
 
-    def declare(self, agent_type: int, agent_id: int, group: int, epoch: int = 0, *, asleep: int = 0) -> Token:
+    def declare(
+        self, agent_type: int, agent_id: int, group: int, epoch: int = 0, *, asleep: int = 0, gather: bool = False
+    ) -> Token:
         """Be online under this id, until the token is closed. Subscribe the inbox before: who is seen is sent to.
 
         ``epoch`` is another one than that of who had the id in this session before, ``asleep`` for each time that its
-        connection has ended.
+        connection has ended. ``gather``: together with others that come within moments, or with `declare_now`.
         """
-        agent = AgentInfo(agent_type, agent_id, group, self._mesh.zid, epoch, asleep)
-        return self._mesh.declare_token(agent.presence)
+        key = AgentInfo(agent_type, agent_id, group, self._mesh.zid, epoch, asleep).presence
+        return self._gathered.declare(key) if gather else self._mesh.declare_token(key)
+
+    def declare_now(self) -> None:
+        """Let all be online whose tokens are being gathered."""
+        self._gathered.declare_now()
 
     def elsewhere(self, agent_type: int) -> list[AgentInfo]:
         """The online agents of a type whose token is not only ours."""

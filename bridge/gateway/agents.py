@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, KeysView
 
 from macs_zenoh.mesh import Token
+from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.ids import Epochs
 from macs_zenoh.protocol.messages import UNITY
 from macs_zenoh.protocol.registrations import AgentKey
@@ -108,6 +109,12 @@ class Agents:
         if connection in self._tokens and connection.peer.agent_type == agent_type:
             return connection  # type: ignore[no-any-return]
         return None
+
+    def is_here(self, agent: AgentInfo, zid: str) -> bool:
+        """Whether it is one of ours, whose session that is: when its presence changes twice in a moment, it can seem
+        to be gone."""
+        connection = self.find(agent.type, agent.id) if agent.zid == zid else None
+        return connection is not None and self.epoch(connection) == agent.epoch
 
     def members(self, agent_type: int, group: int) -> list[Connection]:
         """Our online agents of a type in a group."""

@@ -31,7 +31,7 @@ from .door import OPEN_TO_ALL, Entrance
 from .memory import Memory
 from .owner import Owner
 from .shares import TURN_S, Share
-from .tcp import is_gone, tune, waiting_bytes
+from .tcp import is_gone, waiting_bytes
 from .writer import BUFFER_BYTES, ENDED, NOBODY, Writer
 
 log = logging.getLogger("macs.gateway")
@@ -86,6 +86,8 @@ class Connection(asyncio.BufferedProtocol):
         self._not_let_in = False
         self.asleep = False
         """Whether its socket is gone, and the agent may come back over another."""
+        self.unseen = False
+        """Whether others may not see its agent yet, which has said nothing but what it is."""
         self.seen_asleep = 0
         """The so many-th sleep in which others see it; 0 while they see it awake."""
         self._successor: Connection | None = None
@@ -169,7 +171,6 @@ class Connection(asyncio.BufferedProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         transport = cast(asyncio.Transport, transport)  # uvloop's is one without saying so
         self._transport = transport
-        tune(transport.get_extra_info("socket"))
         peer_name = transport.get_extra_info("peername")
         self.host = of_peer(str(peer_name[0])) if peer_name else "?"
         self.address = joined(self.host, peer_name[1]) if peer_name else "?"

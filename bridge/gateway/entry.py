@@ -152,6 +152,11 @@ class Entry:
 
     def _wait(self, connection: Connection) -> None:
         self._coming.pop(connection, None)
+        if not self._waiting and self._greeting is None:  # nobody is before it
+            agent_id = self._leases.take_id(self._is_taken)
+            if agent_id is not None:
+                self._on_id(connection, agent_id)
+                return
         self._waiting.enter(connection)
         self.greet_waiting()
 

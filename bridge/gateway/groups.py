@@ -43,7 +43,8 @@ class Groups:
             self._subscriptions.add(GROUP.every(type=kind, group=group), self._delivery.group)
         # the token last: whoever sees the agent can reach it
         epoch, asleep = self._agents.epoch(connection), connection.seen_asleep
-        token = self._presence.declare(kind, agent_id, group, epoch, asleep=asleep)
+        token = self._presence.declare(kind, agent_id, group, epoch, asleep=asleep, gather=True)
+        connection.unseen = True
         before, emptied = self._agents.join(connection, token)
         self.emptied(emptied)
         loop = asyncio.get_running_loop()
@@ -52,6 +53,11 @@ class Groups:
             loop.call_later(OVERLAP_S, before.close)
         self._delivery.forget()
         self._roll.changed()
+
+    def show(self, connection: Connection) -> None:
+        """What an agent says comes behind its presence, however many have just come with it."""
+        connection.unseen = False
+        self._presence.declare_now()
 
     def change(self, connection: Connection) -> None:
         """An agent is in another group. Of many changes others see the first at once, and then the last."""
@@ -65,6 +71,15 @@ class Groups:
         if self._agents.group_of(connection) != connection.peer.group:
             self.enter(connection)
             log.debug("%s is in group %d", connection, connection.peer.group)
+
+    def leave(self, connection: Connection) -> bool:
+        """An agent has left; whether it was online. Who was told so is told that it is no more: it is not left out for
+        having been there for a moment only."""
+        if connection.unseen:
+            self.show(connection)
+        was_online, emptied = self._agents.leave(connection)
+        self.emptied(emptied)
+        return was_online
 
     def emptied(self, group: Group | None) -> None:
         """Nobody of ours is in this group any more."""

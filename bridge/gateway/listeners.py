@@ -19,6 +19,7 @@ from macs_zenoh.protocol.addresses import is_local, joined, reachable
 from .connection import Connection
 from .door import Door, Entrance, Entrances
 from .listener import BACKLOG, Listener, descriptors
+from .tcp import tune
 
 if TYPE_CHECKING:
     from . import Gateway
@@ -149,6 +150,8 @@ class Listeners:
             raise MissingExtra("a web port", "aiohttp", "web") from error
         sockets = bound(self.web_host, port, shared=self._settings.reuse_port)
         number: int = sockets[0].getsockname()[1]
+        for listening in sockets:
+            tune(listening)
         self._web = WebPort(
             self._settings,
             self._entrances.web,
@@ -197,6 +200,7 @@ class Listeners:
             return self._connect(entrance)
 
         for listening in sockets:
+            tune(listening)
             try:
                 if self._few or context is not None:
                     self._open.append(

@@ -28,6 +28,8 @@ class Record:
 
     def agent(self, event: str, connection: Connection, what: str = "", result: str = "done") -> None:
         """An agent did something, or something was done to it."""
+        if self._audit is NO_AUDIT:
+            return
         by = who(str(AgentId(*connection.key)), connection.address, connection.peer.grant.name)
         self._audit.record(event, by, what, result)
 

@@ -27,7 +27,7 @@ from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.addresses import joined
 from macs_zenoh.protocol.credit import Credit, Credits
 from macs_zenoh.protocol.decoders import FrameDecoder
-from macs_zenoh.protocol.directory import AgentInfo, Change
+from macs_zenoh.protocol.directory import Change
 from macs_zenoh.protocol.keyexpr import BROADCAST, STREAM, UNICAST
 from macs_zenoh.protocol.limits import REGISTRATION_REQUESTS
 from macs_zenoh.protocol.messages import ROS, UNITY, AccessRefused
@@ -67,6 +67,7 @@ from .door import Door, Entrance, entrances
 from .entry import Entry
 from .forwarding import Forwarding
 from .groups import Groups
+from .join_log import JoinLog
 from .judged import JudgedFrames
 from .leases import Leases
 from .listeners import Listeners
@@ -98,6 +99,7 @@ class Gateway:
     def __init__(self, mesh: Mesh, settings: GatewaySettings, managers: Managers = NO_MANAGERS) -> None:
         self.mesh = mesh
         self._managing = Managing(managers)
+        self._join_log = JoinLog()
         self._all_closed = asyncio.Event()
         self.settings = settings
         self.port = 0
@@ -274,6 +276,7 @@ class Gateway:
         self._forwarding.close()
         self._leases.close()
         self._declarations.close()
+        self._join_log.close()
         self._presence.close()
         self._subscriptions.close()
         await asyncio.to_thread(self._record.close)
@@ -354,10 +357,9 @@ class Gateway:
         self._received_bytes += connection.received_bytes
         self._sent_bytes += connection.sent_bytes
         self._delivery.forget()
-        was_online, empty_group = self.agents.leave(connection)
+        was_online = self._groups.leave(connection)
         self._leases.give_back(connection.agent_id)
         self._credits.leave(connection.host, connection.peer.credit, time.monotonic())
-        self._groups.emptied(empty_group)
         if was_online:
             self._declarations.undeclare(connection.key)
         self._registry.leave(connection, was_online=was_online)
@@ -397,6 +399,8 @@ class Gateway:
         """The agent sent a frame to others."""
         if self.mesh.tracing.marks:
             self.mesh.tracing.note((SOCKET, time.time_ns()))
+        if connection.unseen:
+            self._groups.show(connection)
         self._forwarding.forward(connection, sent)
 
     def received(self, connection: Connection) -> None:
@@ -410,6 +414,8 @@ class Gateway:
 
     def handle(self, connection: Connection, event: Event) -> None:
         """One thing a TCP agent did."""
+        if connection.unseen and not isinstance(event, Joined):
+            self._groups.show(connection)
         if isinstance(event, Streamed):
             self._forwarding.stream(connection, event)
             return
@@ -458,9 +464,8 @@ class Gateway:
         self._groups.enter(connection)
         self._sleepers.joined(connection)
         self._renumbering.joined(connection)
-        by = f" with token {connection.peer.grant.name}" if connection.peer.grant.name else ""
         self._record.agent("joined", connection, f"group {event.group}" if event.group else "")
-        log.info("%s is online%s%s", connection, f" in group {event.group}" if event.group else "", by)
+        self._join_log.joined(connection)
 
     def _admit(self, connection: Connection) -> bool:
         """Give an agent that is no headset an id that it may have; it is not told, and does not mind. False: there is
@@ -503,14 +508,9 @@ class Gateway:
 
     # -- presence ------------------------------------------------------------------------------------------------
 
-    def _is_here(self, agent: AgentInfo) -> bool:
-        """Whether it is one of ours: when its presence changes twice in a moment, it can seem to be gone."""
-        connection = self.agents.find(agent.type, agent.id) if agent.zid == self.mesh.zid else None
-        return connection is not None and self.agents.epoch(connection) == agent.epoch
-
     def _tell(self, changes: list[Change]) -> None:
         self._roll.changed()
-        gone = [change.agent for change in changes if not (change.online or self._is_here(change.agent))]
+        gone = [each.agent for each in changes if not (each.online or self.agents.is_here(each.agent, self.mesh.zid))]
         self._departures.tell(gone, [change.agent.key for change in changes if change.online])
         for change in changes:
             try:

@@ -8,12 +8,14 @@ switch less is what a single message feels, and one queue of ours keeps the orde
 
 `session` is the mesh, `opening` how its session of Zenoh is opened; `outgoing` what is put, `arrivals` what comes,
 `calls` what is asked and served, `reliable` what is asked for again; `tracing` what is noted of messages on their way,
-`link_log` what the log says of links; `declared` the words that all of them use, `zenoh_config` Zenoh's configuration,
+`link_log` what the log says of links; `declared` the words that all of them use, `gathered` tokens that are
+declared together, `zenoh_config` Zenoh's configuration,
 `threads` how Zenoh and Python share a processor. `ros_network` is a session on which our programs are ROS nodes.
 """
 
 from .arrivals import now_s
 from .declared import Aged, AtOnce, Handler, OnBatch, OnMiss, Payload, Sample, Subscription, Token, Traffic
+from .gathered import GatheredTokens
 from .session import Mesh
 from .tracing import Tracing
 from .zenoh_config import configuration
@@ -21,6 +23,7 @@ from .zenoh_config import configuration
 __all__ = [
     "Aged",
     "AtOnce",
+    "GatheredTokens",
     "Handler",
     "Mesh",
     "OnBatch",

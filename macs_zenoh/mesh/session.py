@@ -76,6 +76,7 @@ class Mesh:
         self.zid = own if self.id_is_chosen else published(own)
         """As whom others know this session. One that was chosen is no secret."""
         self._session = session = watched(session)
+        self._liveliness = session.liveliness()
         self._loop = asyncio.get_running_loop()
         self._loop_thread = threading.get_ident()
         end_on_panics(self._loop)
@@ -462,13 +463,13 @@ class Mesh:
 
     def declare_token(self, key: str) -> Token:
         """Be there: ``key`` exists on the mesh until the token is closed or this process is gone."""
-        return Token(self._session.liveliness().declare_token(key))
+        return Token(self._liveliness.declare_token(key))
 
     def watch_tokens(self, key: str, on_change: Callable[[str, bool], None]) -> Subscription:
         """Call ``on_change(key, alive)`` for every token that exists, comes or goes."""
         news = TokenNews(self._loop, self._from_thread, on_change)
         return Subscription(
-            self._session.liveliness().declare_subscriber(
+            self._liveliness.declare_subscriber(
                 key, zenoh.handlers.Callback(news.receive, indirect=False), history=True
             )
         )
@@ -486,9 +487,7 @@ class Mesh:
         def on_end() -> None:
             self._from_thread(ended.set)
 
-        self._session.liveliness().get(
-            key, zenoh.handlers.Callback(on_reply, on_end, indirect=False), timeout=timeout_s
-        )
+        self._liveliness.get(key, zenoh.handlers.Callback(on_reply, on_end, indirect=False), timeout=timeout_s)
         await ended.wait()
         return sorted(found)
 

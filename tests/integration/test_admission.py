@@ -12,18 +12,19 @@ from contextlib import asynccontextmanager
 
 import pytest
 
+import macs_zenoh
 from bridge.gateway import Gateway, leases
 from bridge.gateway.admission import Churn
 from bridge.gateway.leases import Leases
 from bridge.headset import frames
-from macs_zenoh.mesh import Mesh
+from macs_zenoh.mesh import Mesh, gathered
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol import ping
 from macs_zenoh.protocol.decoders import MessageDecoder
 from macs_zenoh.protocol.keyexpr import LEASE, PING
 from macs_zenoh.protocol.messages import ROS, UNITY, Configuration, Welcome, decode_data, encode_management
 from macs_zenoh.protocol.wire import encode_frame, split_message
-from tests.support.given import StartGateway
+from tests.support.given import Connect, StartGateway
 from tests.support.local import patient
 from tests.support.programs import Program, free_port
 from tests.support.waiting import PATIENCE_S, until
@@ -84,6 +85,40 @@ async def test_a_burst_is_admitted() -> None:
             async with crowd(gateway.port, 600) as headsets:
                 ids = [agent.id for agent in [*robots, *headsets]]
                 assert len(set(ids)) == 610
+
+
+async def test_who_speaks_or_leaves_is_seen(
+    start_gateway: StartGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of those who come together the presence waits for each other's, but not behind anything that one of them says,
+    nor behind its leaving: who was told of one is told that it is gone."""
+    monkeypatch.setattr(gathered, "GATHER_S", 60.0)
+    gateway = await start_gateway()
+    await connect(gateway)
+    async with macs_zenoh.join("ros", id=1, settings=gateway.mesh.settings) as robot:
+        seen: list[str] = []
+        robot.on_presence(lambda agent, online: seen.append(f"{agent.key} {online}") if agent.id > 1 else None)
+        second = await connect(gateway)
+        await until(lambda: len(list(gateway.agents.online())) == 2)
+        assert gateway.directory.ids(UNITY) == [1]
+        assert (await second.online()).unity_agent_ids == [1, 2]
+        await until(lambda: gateway.directory.ids(UNITY) == [1, 2])
+        third = await connect(gateway)
+        await until(lambda: len(list(gateway.agents.online())) == 3)
+        await third.close()
+        await until(lambda: len(seen) == 3)
+        assert seen == ["unity/2 True", "unity/3 True", "unity/3 False"]
+
+
+async def test_sockets_are_tuned(start_gateway: StartGateway, connect: Connect) -> None:
+    """Small messages do not wait, and dead hosts are noticed: each connection has that of its listening socket."""
+    gateway = await start_gateway()
+    await connect(gateway)
+    (connection,) = gateway.agents.connections()
+    accepted = connection._transport.get_extra_info("socket")
+    wanted = {socket.TCP_NODELAY: 1, socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 3, socket.TCP_KEEPCNT: 3}
+    assert {name: accepted.getsockopt(socket.IPPROTO_TCP, name) for name in wanted} == wanted
+    assert accepted.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
 
 
 async def test_an_empty_answer_is_not_believed(start_gateway: StartGateway, monkeypatch: pytest.MonkeyPatch) -> None:

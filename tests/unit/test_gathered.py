@@ -1,0 +1,64 @@
+"""`macs_zenoh.mesh.gathered`: when a token is declared that others come with."""
+
+from __future__ import annotations
+
+import pytest
+
+from macs_zenoh.mesh import GatheredTokens, Token, gathered
+from tests.support.waiting import until
+
+
+class Declared:
+    """In Zenoh's place: notes what is declared and undeclared."""
+
+    def __init__(self) -> None:
+        self.now: list[str] = []
+
+    def declare(self, key: str) -> Token:
+        """A token that is there at once."""
+        self.now.append(key)
+        return Token(_There(self.now, key))
+
+
+class _There:
+    def __init__(self, now: list[str], key: str) -> None:
+        self._now, self._key = now, key
+
+    def undeclare(self) -> None:
+        self._now.remove(self._key)
+
+
+async def test_the_first_is_declared_at_once_and_others_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who comes alone does not wait; those behind it are declared in their order, all at one time."""
+    zenoh = Declared()
+    tokens = GatheredTokens(zenoh.declare)
+    kept = [tokens.declare("a")]
+    assert zenoh.now == ["a"]
+    kept += [tokens.declare(key) for key in "bcd"]
+    assert (zenoh.now, len(tokens)) == (["a"], 3)
+    await until(lambda: zenoh.now == ["a", "b", "c", "d"])
+    assert len(tokens) == 0
+    for token in kept:
+        token.close()
+    assert zenoh.now == []
+    monkeypatch.setattr(gathered, "GATHER_S", 60.0)
+    await until(lambda: tokens._gathering is None)  # for a while nobody has come
+    kept.append(tokens.declare("e"))
+    assert zenoh.now == ["e"]
+    tokens.close()
+
+
+async def test_who_is_gone_before_is_never_declared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A token that is closed while it waits; the same key afterwards is another one, and there."""
+    monkeypatch.setattr(gathered, "GATHER_S", 60.0)
+    zenoh = Declared()
+    tokens = GatheredTokens(zenoh.declare)
+    first = tokens.declare("a")
+    tokens.declare("b").close()
+    second = tokens.declare("b")
+    tokens.declare_now()
+    assert zenoh.now == ["a", "b"]
+    second.close()
+    first.close()
+    assert zenoh.now == []
+    tokens.close()
