@@ -9,6 +9,8 @@ from tests.support.browser import needs_node
 
 PARTS = (
     "axes",
+    "turns",
+    "due",
     "hold",
     "freshness",
     "kept",

@@ -54,6 +54,56 @@ const parts = {
     assert.equal(wallTime(1000, 1250, 5e12), 5e12 - 250, "made 250 ms ago");
   },
 
+  async turns() {
+    const { shownNow } = await load("xr/turns.js");
+    const [quick, slow] = [0.014, 0.033];
+    assert.deepEqual(shownNow([], quick), []);
+    assert.deepEqual(shownNow([["a", "a"]], quick), ["a"], "one camera waits for nobody");
+    assert.deepEqual(shownNow([["a", "a"], ["b", "b"]], quick), ["a"], "one frame uploads one of two");
+    assert.deepEqual(shownNow([["b", "b"]], quick), ["b"], "and the next frame the other one");
+    assert.deepEqual(shownNow([["a", "a"], ["b", "b"]], slow), ["a", "b"], "the next frame would be late");
+    assert.deepEqual(shownNow([["left", "a"], ["b", "b"], ["right", "a"]], quick), ["left", "right"], "two eyes of one panel");
+    const six = ["a", "b", "c", "d", "e", "f"].map((each) => [each, each]);
+    assert.deepEqual(shownNow(six, quick), ["a", "b", "c"], "six cameras at 30 Hz need more than one a frame");
+    assert.deepEqual(shownNow([["gone", undefined]], quick), ["gone"], "what nobody looks at is closed");
+  },
+
+  async due() {
+    const { Driver } = await load("shared/driver.js");
+    mock.timers.enable({ apis: ["setTimeout", "Date"], now: 1000 });
+    performance.now = () => Date.now();
+    const sent = [];
+    const publish = (_message, { madeAt }) => sent.push({ at: Date.now(), age: Date.now() - madeAt });
+    const node = { robots: new Set([1]), groups: new Set(), lastMadeAt: -Infinity, publish };
+    const headset = Object.assign(new EventTarget(), { clock: new EventTarget(), waitingBytes: 0, isFresh: () => true });
+    headset.advertise = () => node;
+    const driver = new Driver({ headset, bars: () => "", changed() {}, say() {} });
+    driver.limits = { forward: 1, turn: 1, hz: 30 };
+    const to = { topic: "/cmd_vel", type: "geometry_msgs/msg/Twist", robots: [1], groups: [], members: [1] };
+    driver.aim(to, async () => ({ write: () => new Uint8Array(1) }));
+    await Promise.resolve();
+    await Promise.resolve();
+    driver.input(null, Date.now());
+    const driven = (ms, everyMs) => {
+      sent.length = 0;
+      for (let at = 0; at < ms; at++) {
+        mock.timers.tick(1);
+        if (at % everyMs === 0) driver.input({ source: "right", forward: 1, turn: 0 }, Date.now());
+      }
+      return sent.map(({ age }) => age);
+    };
+    const quick = driven(1400, 14);
+    assert.ok(quick.every((age) => age === 0), `what hands do goes out in the frame that read it: ${quick}`);
+    assert.ok(quick.length >= 40 && quick.length <= 44, `at thirty a second, ${quick.length} in 1.4 s`);
+    driven(400, 40);
+    const same = driven(1400, 40);
+    assert.ok(same.filter((age) => age === 0).length === 35 && same.length <= 42, `each of slower frames: ${same}`);
+    const slow = driven(1400, 150);
+    assert.ok(slow.length > 30, `who reads hands seldom says again what they did: ${slow}`);
+    const first = slow.filter((age, at) => at === 0 || age < slow[at - 1]);
+    assert.ok(first.length >= 9 && first.every((age) => age <= 34), `and what they do now when the next is due: ${slow}`);
+  },
+
   async hold() {
     const { Hold, STILL_MS } = await load("shared/hold.js");
     const sample = (source = "right", forward = 1) => ({ source, forward, turn: 0 });

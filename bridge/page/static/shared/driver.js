@@ -15,6 +15,8 @@ const AGAIN_MS = 500;
 /** A robot that has just come back may not have the topic yet, and on a busy machine not soon: it is told again after these. */
 const LATE_ZEROS_MS = [1000, 3000, 7000, 15_000];
 const LEAST_TICK_MS = 5;
+/** Hands that are read more seldom are not waited for. */
+const MOST_EVERY_MS = 50;
 /** A gateway without a router says so once a second of what is sent. So long after it has, what is sent does go. */
 const ROUTED_MS = 1600;
 const NO_ROUTE = "no_route";
@@ -25,7 +27,9 @@ export class Driver {
   #madeAt = 0;
   /** When a zero was said last: what hands did before it counts no more. */
   #endedAt = -Infinity;
-  #sentAt = -Infinity;
+  /** When the next command is due, and about how often hands are read, in ms. */
+  #dueAt = -Infinity;
+  #everyMs = 0;
   /** When nothing waited here last. */
   #clearAt = 0;
   #askedAt = -Infinity;
@@ -117,12 +121,13 @@ export class Driver {
       this.release("what hands do was told too late");
       return false;
     }
+    this.#everyMs = made > this.#madeAt && made - this.#madeAt <= MOST_EVERY_MS ? made - this.#madeAt : 0;
     this.#madeAt = made;
     this.judge();
     const was = this.held;
     const began = this.#hold.input(sample, made);
     if (was && !this.held) this.#ended();
-    const due = this.held && performance.now() - this.#sentAt >= 1000 / this.limits.hz - 2;
+    const due = this.held && this.#isDue(performance.now());
     if (began) {
       this.#acted.clear();
       this.changed();
@@ -162,9 +167,16 @@ export class Driver {
     if (why !== before) this.changed();
   }
 
+  /** Whether a command is due, or will be before hands are read again: what they do now is sent now, not when it is older. */
+  #isDue(now) {
+    return now >= this.#dueAt - Math.max(2, this.#everyMs / 2);
+  }
+
+  /** Where hands are read again at about that time, that is sent; what they did last is said once more where they are not. */
   #untilNext(now) {
-    const next = 1000 / this.limits.hz - (now - this.#sentAt);
-    return Math.max(LEAST_TICK_MS, Math.min(next, this.barsIn(now)));
+    const read = this.#madeAt + this.#everyMs;
+    const next = read <= this.#dueAt + this.#everyMs / 2 ? Math.max(this.#dueAt, read + this.#everyMs / 4) : this.#dueAt;
+    return Math.max(LEAST_TICK_MS, Math.min(next - now, this.barsIn(now)));
   }
 
   #tick() {
@@ -173,7 +185,7 @@ export class Driver {
     const due = this.#hold.due(now);
     if (was && due === null) this.#ended();
     const mayGo = due !== null && !this.bars(now);
-    if (mayGo && now - this.#sentAt >= 1000 / this.limits.hz - 2) this.#send(due, now);
+    if (mayGo && this.#isDue(now)) this.#send(due, now);
     this.judge();
   }
 
@@ -181,7 +193,8 @@ export class Driver {
     const { type, shape, node, robots, groups } = this.#aimed;
     if (node.lastMadeAt > this.#madeAt) return; // a zero, say, is younger: what is held still is read again soon
     const [x, z] = [forward * this.limits.forward, turn * this.limits.turn];
-    this.#sentAt = now;
+    const period = 1000 / this.limits.hz;
+    this.#dueAt = Math.max(this.#dueAt, now - period / 2) + period;
     const message = type.write(shape({ x }, { z }, wallTime(this.#madeAt)));
     if (!this.isFresh(now) || !node.publish(message, { robots, groups, madeAt: this.#madeAt })) {
       this.release("the connection is not fresh");

@@ -127,7 +127,9 @@ class Scene {
     const sources = immersive ? this.input.read(frame, space, this.immersion.session.inputSources) : this.looking.sources();
     if (this.#stopping.read(this.input.stops(sources))) this.stop();
     this.#follows(immersive ? space : null);
-    this.#undrawn = this.#draw(sources, dt);
+    // what hands do goes out before anything is drawn, which takes a while; unless the frame before was not drawn
+    const failed = this.#tried(() => this.#point(sources, dt));
+    this.#undrawn = failed || this.#undrawn;
     this.#attend();
     const there = !this.#absent;
     const sample = there ? this.input.drive(sources, this.stage.head().facing) : null;
@@ -137,26 +139,36 @@ class Scene {
     this.sample = sample;
     // of who is not there it is not known whether he holds on: that he has let go has to be seen
     if (there) this.#send(sample, poses, began);
+    this.#undrawn = failed || this.#tried(() => this.#draw(sources, dt));
+    this.#attend();
     this.frames += 1;
     this.frameMs.push(performance.now() - began);
     if (this.frameMs.length > 600) this.frameMs.splice(0, 300);
   }
 
-  /** Draw all; why nothing was drawn, or "". Only what was drawn was shown. */
-  #draw(sources, dt) {
+  /** Do what a frame needs to be drawn; why nothing is drawn, or "". */
+  #tried(act) {
     try {
-      this.pointing.targets = this.room.targets;
-      this.pointing.update(sources, dt);
-      this.looking.free(sources, this.pointing.panelUnder("mouse"));
-      this.hands.show(sources, this.pointing.distances, this.telling.state.source);
-      this.links.showPictures(this.room, this.wishes);
-      this.stage.render();
-      if (this.stage.lost) return "nothing is drawn: the browser took the graphics away";
-      this.links.acknowledge();
-      return "";
+      act();
+      return this.stage.lost ? "nothing is drawn: the browser took the graphics away" : "";
     } catch (error) {
       return `nothing is drawn: ${error.message}`;
     }
+  }
+
+  /** What rays meet, and which hand has a panel and so does not drive. */
+  #point(sources, dt) {
+    this.pointing.targets = this.room.targets;
+    this.pointing.update(sources, dt);
+    this.looking.free(sources, this.pointing.panelUnder("mouse"));
+  }
+
+  /** Draw all. Only what was drawn was shown. */
+  #draw(sources, dt) {
+    this.hands.show(sources, this.pointing.distances, this.telling.state.source);
+    this.links.showPictures(this.room, this.wishes, dt);
+    this.stage.render();
+    if (!this.stage.lost) this.links.acknowledge();
   }
 
   /** The origin of all poses may move, as when who wears the headset centres his view: what is held then is held elsewhere. */

@@ -1,6 +1,7 @@
 /** The two workers, and what goes to them and comes from them. Events: `presence`, `access`, `value`, `state`, `stop`, `event`, `link`. */
 
 import { readKept, writeKept } from "../shared/kept-stop.js";
+import { shownNow } from "./turns.js";
 
 /** The worker of commands says so soon that it has heard of a press. */
 const ECHO_MS = 200;
@@ -99,9 +100,11 @@ export class Links extends EventTarget {
     this.sight.postMessage({ op: "poke" });
   }
 
-  /** Give each panel its newest picture. */
-  showPictures(room, wishes) {
-    for (const [key, { bitmap, at, stamp }] of this.#pictures) {
+  /** Give panels their newest pictures, as `shownNow` says, in a frame that is so long after the one before. */
+  showPictures(room, wishes, frameS) {
+    const panelOf = (key) => wishes.find((each) => each.key === key)?.panel;
+    for (const key of shownNow([...this.#pictures.keys()].map((each) => [each, panelOf(each)]), frameS)) {
+      const { bitmap, at, stamp } = this.#pictures.get(key);
       this.#pictures.delete(key);
       this.#given.set(key, { at, stamp });
       const wish = wishes.find((each) => each.key === key);
