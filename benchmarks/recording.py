@@ -2,6 +2,10 @@
 
 What a recording takes is the router's and the processor's as well as its own: so the same run has a plain Zenoh
 subscriber in its place that hears the same and writes the bytes to a file, which no recording can cost less than.
+
+Without a recording the data of one robot goes through the router, since nobody looks at the others, and beside it
+that of all. ``recording_of_seen`` has headsets that look at the others all the time: what is left between the two is
+the way from the router to the recorder, and the recorder.
 """
 
 from __future__ import annotations
@@ -39,25 +43,31 @@ ALONE, RECORDED, SAVED = "without", "macs record", "a plain subscriber"
 class Site:
     """Robots, of which a headset looks at the first, and whoever listens besides."""
 
-    def __init__(self, stage: Stage, folder: Path) -> None:
+    def __init__(self, stage: Stage, folder: Path, *, seen: bool = False) -> None:
         self._folder = folder
+        self._seen = seen
         self._port = stage.router()
         gateway = stage.gateway(self._port)
         self.robots = [stage.worker("recorded_robot", self._port, number)[0] for number in range(1, ROBOTS + 1)]
         self.small, _ = stage.worker("robot_ends", "headset", gateway, 1)
         self.large, _ = stage.worker("robot_ends", "headset", gateway, 1)
         self.plain, _ = stage.worker("raw", "zenoh", self._port)
+        others = range(2, ROBOTS + 1) if seen else ()
+        self._viewers = [stage.worker("robot_ends", "headset", gateway, 1)[0] for _ in others]
         time.sleep(1.0)
+        for robot, viewer in zip(others, self._viewers, strict=True):
+            viewer.ask("register", topic="/image", kind=1, buffer=10, robot=robot)
+            viewer.ask("register", topic="/small", kind=1, buffer=1000, robot=robot)
         self.large.ask("register", topic="/image", kind=1, buffer=10)
         self.small.ask("register", topic="/small", kind=1, buffer=1000)
-        self._until(self.robots[:1], 1)
+        self._until(self.robots if seen else self.robots[:1], 1)
         for robot in self.robots:
             robot.ask("keep")
         self.used: Counter[str] = Counter()
 
     def beside(self, what: str, seconds: float, plan: Plan) -> dict[str, float]:
         """The headset's p99 for both topics, in ms, while somebody else listens or nobody does."""
-        robots = self.robots[:1] if what == ALONE else self.robots
+        robots = self.robots[:1] if what == ALONE and not self._seen else self.robots
         path = self._folder / "recorded"
         listener = self._listen(what, path)
         began = self._used_by(what, listener)
@@ -92,7 +102,7 @@ class Site:
         arguments = [sys.executable, "-m", "bridge", "record", "-e", endpoint, "-o", file]
         process = subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.PIPE)
         self._until(self.robots[:1], 2)
-        self._until(self.robots[1:], 1)
+        self._until(self.robots[1:], 2 if self._seen else 1)
         time.sleep(0.5)
         return process
 
@@ -107,6 +117,8 @@ class Site:
         counts = {"/image": int(IMAGE_HZ * seconds), "/small": int(SMALL_HZ * seconds)}
         self.small.tell("collect", count=counts["/small"], quiet_s=QUIET_S)
         self.large.tell("collect", count=counts["/image"], quiet_s=QUIET_S)
+        for viewer in self._viewers:
+            viewer.tell("look", quiet_s=QUIET_S)
         for robot in robots:
             robot.ask("publish", topic="/image", size=IMAGE, hz=IMAGE_HZ, count=counts["/image"])
             robot.ask("publish", topic="/small", size=SMALL, hz=SMALL_HZ, count=counts["/small"])
@@ -114,6 +126,8 @@ class Site:
             robot.tell("published")
             robot.answer(seconds)
         small, large = self.small.answer(), self.large.answer()
+        for viewer in self._viewers:
+            viewer.answer()
         plan.delivered += small["got"] + large["got"]
         return {"small": small["p99_ms"], "small, p50": small["p50_ms"], "image": large["p99_ms"]}
 
@@ -139,11 +153,20 @@ class Site:
 
 def recording(stage: Stage, plan: Plan) -> Iterator[Figure]:
     """A headset's p99 beside a recording of 3 robots with 0.9 MB at 30 Hz and 2 000 small messages a second each."""
+    return _recording(stage, plan, seen=False)
+
+
+def recording_of_seen(stage: Stage, plan: Plan) -> Iterator[Figure]:
+    """The same where headsets look at all three robots, with a recording and without."""
+    return _recording(stage, plan, seen=True)
+
+
+def _recording(stage: Stage, plan: Plan, *, seen: bool) -> Iterator[Figure]:
     seconds = SECONDS * plan.scale
     folder = Path(tempfile.mkdtemp(prefix="macs-recording-"))
     values: dict[str, list[dict[str, float]]] = {ALONE: [], RECORDED: [], SAVED: []}
     try:
-        site = Site(stage, folder)
+        site = Site(stage, folder, seen=seen)
         for _ in range(plan.rounds):
             for what, found in values.items():
                 found.append(site.beside(what, seconds, plan))
@@ -154,10 +177,11 @@ def recording(stage: Stage, plan: Plan) -> Iterator[Figure]:
         return [each[name] for each in values[what]]
 
     measured: dict[str, Any] = {"small": "2 000/s", "small, p50": "2 000/s", "image": "0.9 MB"}
+    where = "of robots that others see" if seen else ""
     for name, said in measured.items():
         kind = "p50" if "p50" in name else "p99"
         bound = BESIDE if kind == "p99" else None
-        title = f"headset's {kind}, {said}, beside"
+        title = " ".join(f"headset's {kind}, {said}, {where} beside".split())
         yield Figure(f"{title} a recording", of(RECORDED, name), of(ALONE, name), ALONE, "ms", at_most=bound)
         yield Figure(f"{title} a plain subscriber", of(SAVED, name), of(ALONE, name), ALONE, "ms")
         yield Figure(f"{title} a recording", of(RECORDED, name), of(SAVED, name), SAVED, "ms")
@@ -165,4 +189,4 @@ def recording(stage: Stage, plan: Plan) -> Iterator[Figure]:
     yield Figure("a recording's processor", [used[0]], [used[1]], SAVED, "% of a core")
 
 
-CASES: dict[str, Case] = {"recording": recording}
+CASES: dict[str, Case] = {"recording": recording, "recording_of_seen": recording_of_seen}

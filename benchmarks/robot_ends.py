@@ -134,11 +134,11 @@ class HeadsetEnd:
         for headset in self._headsets:
             headset.beat()
 
-    def register(self, topic: str, kind: int, buffer: int) -> dict[str, Any]:
-        """Every headset registers on robot 1."""
+    def register(self, topic: str, kind: int, buffer: int, robot: int = 1) -> dict[str, Any]:
+        """Every headset registers on a robot."""
         spec = NodeSpec(NodeType(kind), topic, TYPE, buffer)
         for headset in self._headsets:
-            headset.socket.sendall(frames.registration(headset.id, spec, [1], []))
+            headset.socket.sendall(frames.registration(headset.id, spec, [robot], []))
         return {}
 
     def publish(self, topic: str, size: int, hz: float, count: int) -> dict[str, Any]:
@@ -171,6 +171,16 @@ class HeadsetEnd:
             self.beat()
         return self._worst(arrivals)
 
+    def look(self, quiet_s: float) -> dict[str, Any]:
+        """Take what comes, and look at none of it, until nothing has come for a while."""
+        last, taken = time.monotonic(), 0
+        while time.monotonic() - last < quiet_s:
+            for ready in select.select([headset.socket for headset in self._headsets], [], [], 0.1)[0]:
+                taken += ready.recv_into(self._buffer)
+                last = time.monotonic()
+            self.beat()
+        return {"bytes": taken}
+
     def _receive(self, ready: socket.socket) -> tuple[bytes, float]:
         """What a socket has, and when it was received."""
         size = ready.recv_into(self._buffer)
@@ -195,7 +205,7 @@ def main() -> None:
         works, idle = {name: getattr(end, name) for name in ("subscribe", "advertise", "publish", "collect")}, None
     else:
         end = HeadsetEnd(int(sys.argv[2]), int(sys.argv[3]))
-        works, idle = {name: getattr(end, name) for name in ("register", "publish", "collect")}, end.beat
+        works, idle = {name: getattr(end, name) for name in ("register", "publish", "collect", "look")}, end.beat
     serve({}, works, idle or (lambda: None))
 
 
