@@ -31,21 +31,29 @@ PREFIX = b"\x00\x01\x00\x00" + bytes(8)
 STAMP = struct.Struct("<dI")
 AT = len(PREFIX) + 4
 
+LEAD_S = 0.3
+"""So long a headset has commanded before what it sends counts. Whoever drives on after a pause of a second may have
+been cut off: of what comes together then a gateway passes on the newest, and any stall here brings some together."""
+UNCOUNTED = 1 << 31
+"""The number of what does not count."""
+
 
 def stamped(size: int) -> bytearray:
     """CDR of a message with ``size`` bytes of data."""
     return bytearray(PREFIX + struct.pack("<I", size) + bytes(size))
 
 
-def pace(count: int, hz: float, send: Any, message: bytearray, at: int = AT) -> None:
-    """Stamp a message ``at`` its data and send it, at a rate; a late one does not delay those that follow."""
-    began = time.monotonic()
-    for number in range(count):
+def pace(count: int, hz: float, send: Any, message: bytearray, at: int = AT, lead: int = 0) -> float:
+    """Stamp a message ``at`` its data and send it, at a rate; a late one does not delay those that follow. ``lead`` go
+    before them, uncounted. Returns when the first of the others was due."""
+    began = time.monotonic() + lead / hz
+    for number in range(-lead, count):
         wait_s = began + number / hz - time.monotonic()
         if wait_s > 0:
             time.sleep(wait_s)
-        STAMP.pack_into(message, at, time.monotonic(), number)
+        STAMP.pack_into(message, at, time.monotonic(), number if number >= 0 else UNCOUNTED)
         send(message)
+    return began
 
 
 class Arrivals:
@@ -61,9 +69,10 @@ class Arrivals:
 
     def note(self, cdr: Any, now: float) -> None:
         """Note one message that came then."""
-        sent, _ = STAMP.unpack_from(cdr, AT)
-        self.latencies.append(now - sent)
+        sent, number = STAMP.unpack_from(cdr, AT)
         self.last = now
+        if number != UNCOUNTED:
+            self.latencies.append(now - sent)
 
     def report(self) -> dict[str, Any]:
         """How many, and their latencies in ms; then begin anew."""
@@ -147,8 +156,8 @@ class HeadsetEnd:
         spec = NodeSpec(NodeType.PUBLISHER, topic, TYPE)
         cdr = stamped(size)
         frame = bytearray(frames.node_data(headset.id, spec, cdr, [1]))
-        began = time.monotonic()
-        pace(count, hz, headset.socket.sendall, frame, at=len(frame) - len(cdr) + AT)
+        at = len(frame) - len(cdr) + AT
+        began = pace(count, hz, headset.socket.sendall, frame, at, lead=round(LEAD_S * hz))
         return {"took_s": time.monotonic() - began}
 
     def collect(self, count: int, quiet_s: float) -> dict[str, Any]:
