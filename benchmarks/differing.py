@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from .cases import RawZenoh, rate, size_text
@@ -73,14 +73,19 @@ def differing(stage: Stage, plan: Plan) -> Iterator[Figure]:
     router = stage.router()
     near, far = stage.gateway(router), stage.gateway(router)
     relays = [stage.relay() for _ in range(RELAYS)]
+    gateway = next(program for program in stage.programs if program.name == "gateway")
+    plain_relays = [program for program in stage.programs if program.name == "relay"]
     paths = {"one gateway": (near, near), "two gateways": (near, far)}
     zenoh = RawZenoh.start(stage, router, direct=False)
     for receivers, each, sizes in ((1, False, SIZES), (2, True, SIZES), (10, False, (64, 64 * KIB, MIB))):
         plain = [connect(stage, "relay", port, port, receivers) for port in relays]
         lines = [connect(stage, path, *ports, receivers) for path, ports in paths.items()]
         for size in sizes:
+            used: dict[str, list[float]] = {"relay": [], "one gateway": []}
             runs = {"relay": in_rotation([run_of(plan, line, size, each=each) for line in plain])}
             runs |= {line.path: run_of(plan, line, size, each=each) for line in lines}
+            runs["relay"] = _costed(runs["relay"], plain_relays, used["relay"])
+            runs["one gateway"] = _costed(runs["one gateway"], [gateway], used["one gateway"])
             if receivers == 1:
                 runs["raw Zenoh"] = zenoh.run(plan, size, plan.count(size))
             values = in_turn(plan.rounds, runs)
@@ -91,6 +96,10 @@ def differing(stage: Stage, plan: Plan) -> Iterator[Figure]:
                 yield rate(name, size, rates, baseline, "plain relay", at_least=bound)
                 if raw is not None:
                     yield rate(name, size, rates, raw, "raw Zenoh")
+                if path in used:
+                    each_us = 1e6 / plan.count(size, 1 if each else receivers)
+                    costs, least = ([one * each_us for one in used[which]] for which in (path, "relay"))
+                    yield Figure(f"{name}, processor", costs, least, "plain relay", "us each")
         for line in (*plain, *lines):
             line.sender.stop()
             line.receiver.stop()
@@ -100,6 +109,18 @@ def differing(stage: Stage, plan: Plan) -> Iterator[Figure]:
         values = in_turn(plan.rounds, runs)
         name = f"differing, robot program to headset, {size_text(size)}"
         yield rate(name, size, values["robot"], values["headset"], "headset to headset")
+
+
+def _costed(run: Run, programs: Sequence[Program], used: list[float]) -> Run:
+    """The same, and how many seconds of a processor these took: what does not depend on who else is at the machine."""
+
+    def costed() -> float:
+        before = sum(program.used_s for program in programs)
+        value = run()
+        used.append(sum(program.used_s for program in programs) - before)
+        return value
+
+    return costed
 
 
 def robot_line(stage: Stage, port: int) -> Line:
