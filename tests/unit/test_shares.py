@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
+from bridge.gateway import shares
 from bridge.gateway.shares import SHARE, TURN_S, Rounds, Share
 from macs_zenoh.protocol.ping import PING_BYTES_PER_S, PINGS_PER_S, PingGate
 from macs_zenoh.protocol.rate_limit import FLOODED, NOW, Pace
@@ -42,6 +43,28 @@ def test_what_passes_while_the_thread_waits_is_nobodys() -> None:
     for _ in range(50):
         clock[0] += TURN_S / 1000
         assert not rounds.spend("10.0.0.1", share, 10 * TURN_S)
+
+
+def test_little_work_is_counted_and_seldom_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who does little a thousand times waits as often as if each was timed, and a clock is looked at for few."""
+    clock, looks = [100.0], [0]
+
+    def look() -> float:
+        looks[0] += 1
+        return clock[0]
+
+    def waits() -> int:
+        rounds, share, little_s, count = Rounds(look), Share(), TURN_S / 100, 0
+        for _ in range(1000):
+            clock[0] += little_s
+            count += rounds.spend("10.0.0.1", share, little_s) > 0
+        return count
+
+    seldom = waits()
+    assert looks[0] < 100
+    monkeypatch.setattr(shares, "LITTLE_S", 0.0)
+    assert waits() == pytest.approx(seldom, abs=1)
+    assert looks[0] > 1000
 
 
 async def went_on(entered: list[tuple[str, float]]) -> list[tuple[str, int]]:
