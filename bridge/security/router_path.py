@@ -231,7 +231,7 @@ class RouterPath:
             nonlocal done
             payload = PROBE + f" {number}".encode()
             async with limit:
-                answered = await _answered(self._saying[question.asker], question.key, payload)
+                answered = await self._answered(question, payload)
             asked = self._asked.get(payload, set())
             if question.impostor is not None:
                 seen = question.impostor in asked
@@ -243,13 +243,21 @@ class RouterPath:
 
         await asyncio.gather(*(ask(number, question) for number, question in enumerate(questions)))
 
+    async def _answered(self, question: Question, payload: bytes) -> bool:
+        """Ask it: once more, with as much time as a session has to come in, where an answer is permitted and does not
+        come. A machine or a link may be busy; that something is refused is said of a site only when it is."""
+        asker = self._saying[question.asker]
+        if await _answered(asker, question.key, payload, ANSWER_S):
+            return True
+        return question.permitted and await _answered(asker, question.key, payload, self._timeout_s)
 
-async def _answered(mesh: Mesh, key: str, payload: bytes) -> bool:
+
+async def _answered(mesh: Mesh, key: str, payload: bytes, timeout_s: float) -> bool:
     """Whether anybody answers, be it with a refusal: our programs refuse what has no frame, and do nothing."""
     if key.startswith("@"):
-        return bool(await mesh.ask_all(key, timeout_s=ANSWER_S))
+        return bool(await mesh.ask_all(key, timeout_s=timeout_s))
     try:
-        await mesh.query(key, payload, timeout_s=ANSWER_S)
+        await mesh.query(key, payload, timeout_s=timeout_s)
     except Refused:
         return True
     except Unreachable:

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import macs_zenoh
+from bridge.security import router_path
 from bridge.security.check import check
 from macs_zenoh import awareness
 from macs_zenoh.errors import Unreachable
@@ -53,6 +54,18 @@ async def test_gateways_without_blocks_and_a_namespace(tmp_path: Path) -> None:
         "\nrobots: [{name: r, id: 7, awareness_name: drone7}, {name: s, id: 300, awareness_name: drone8}]\n"
         "gateways: [{name: hall}, {name: lab}]\noperators: [{name: anna}, {name: berta, id: 5}]\n"
         "permissions: [{who: all, may: all, whom: all}]\nnamespace: site1\n",
+    )
+    async with Router(found.file()):
+        assert await found.wrong() == []
+
+
+async def test_an_answer_that_takes_longer_is_no_refusal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is permitted and not answered in time is asked once more, with patience: a busy machine refuses nobody."""
+    monkeypatch.setattr(router_path, "ANSWER_S", 0.001)
+    found = made(
+        tmp_path / "pki",
+        "\nrobots: [{name: r, id: 7}]\ngateways: [{name: hall, blocks: [1]}]\n"
+        "permissions: [{who: hall, may: all, whom: r}]\n",
     )
     async with Router(found.file()):
         assert await found.wrong() == []
