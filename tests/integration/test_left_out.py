@@ -72,12 +72,13 @@ async def test_room_is_used_whenever_it_is_made(router: str, stranger: Mesh, mon
         true = stranger.declare_token(robot.presence)
         await until(lambda: presence.directory.get(ROS, 7) == robot)
         for time in (1, 2):
+            before = mesh.drops["too_many_claims"]  # counted again in each answer that leaves somebody out
             tokens = [
                 stranger.declare_token(AgentInfo(ROS, 7, 0, f"0{time}{number:02x}").presence)
                 for number in range(Directory.PER_AGENT)
             ]
             await until(lambda: len(presence.directory.claimants(ROS, 7)) == Directory.PER_AGENT)
-            await until(lambda time=time: mesh.drops["too_many_claims"] == time)
+            await until(lambda before=before: mesh.drops["too_many_claims"] > before)
             for token in tokens:
                 token.close()
             await until(lambda: presence.directory.get(ROS, 7) == robot)

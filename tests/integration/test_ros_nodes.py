@@ -47,8 +47,11 @@ async def test_topics_in_order_and_what_is_held_for_late_ones(router: str) -> No
     ):
         held = talker.publisher("map", TEXT, qos=LATCHED)
         assert held.topic == "/robot1/map"
+        early = listener.subscribe("/robot1/map", TEXT, qos=LATCHED)
         for number in range(5):
             held.publish({"data": str(number)})
+        for number in range(5):  # they have passed the router, and none of them is on its way to who comes later
+            assert (await asyncio.wait_for(early.receive(), PATIENCE_S)).value["data"] == str(number)
         late = listener.subscribe("/robot1/map", TEXT, qos=LATCHED)
         got = [(await asyncio.wait_for(late.receive(), PATIENCE_S)).value["data"] for _ in range(3)]
         assert got == ["2", "3", "4"]

@@ -17,7 +17,7 @@ from bridge.tokens import store
 from macs_zenoh.protocol.rights import Rights
 from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
 from tests.page.conftest import HELD, Site, StartSite, driven, released, says, still
-from tests.page.driving import GAMEPAD, NO_GAMEPAD, heard_at, held, hold, key, pointer
+from tests.page.driving import GAMEPAD, NO_GAMEPAD, drives, heard_at, held, hold, key, pointer
 from tests.support.browser import AXE, OFFLINE, SCREENSHOTS, Watched, needs_browser
 from tests.support.thorough import some
 from tests.support.waiting import until
@@ -109,9 +109,7 @@ async def test_it_stops_however_it_is_let_go(site: Site) -> None:
     async with heard_at(site) as heard:
         for name, script in LETTING_GO.items():
             page = await site.with_robot()
-            heard.speeds.clear()
-            await hold(page)
-            await until(lambda: len(heard.speeds) > 5 and heard.last > 0)
+            await drives(page, heard)
             began = time.monotonic()
             if script:
                 await page.value(script)
@@ -125,9 +123,7 @@ async def test_it_stops_however_it_is_let_go(site: Site) -> None:
             assert set(heard.speeds[after:]) <= {0.0}, name
             await page.page.context.close()
         page = await site.with_robot()
-        heard.speeds.clear()
-        await hold(page)
-        await until(lambda: len(heard.speeds) > 5 and heard.last > 0)
+        await drives(page, heard)
         began = time.monotonic()
         await page.page.close(run_before_unload=False)
         await until(lambda: heard.last == 0.0)
@@ -142,9 +138,7 @@ async def test_a_network_that_stands_still_gets_no_more_commands(site: Site) -> 
     async with heard_at(site) as heard:
         page = await site.with_robot()
         for _ in range(6):  # a page that stood still has let go for that
-            heard.speeds.clear()
-            await hold(page)
-            await until(lambda: len(heard.speeds) > 5 and heard.last > 0)
+            await drives(page, heard)
             site.gateway.send_signal(signal.SIGSTOP)
             try:
                 await until(partial(page.value, f"!{HELD}"))
