@@ -7,7 +7,7 @@ comes first, so that nobody waits for it at the end; modules of a moment are in 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from xdist.scheduler import LoadScopeScheduling
@@ -25,6 +25,9 @@ LONG = (
     "tests/ros/test_graph_verbs.py",
 )
 """Files with tests that take a minute, or half of it."""
+
+ONE_WORKER = ("tests/integration/test_wheel.py",)
+"""Files whose tests wait for the same thing to be made: one worker does, and none for another."""
 
 QUICK = "tests/unit/"
 
@@ -47,6 +50,12 @@ def page_groups(names: Iterable[str]) -> dict[str, str]:
         sizes[group] += count
         groups[path] = f"pages {group}"
     return groups
+
+
+def scope_of(name: str, groups: Mapping[str, str]) -> str:
+    """What a test is handed out with: its group, its file, or nothing but itself."""
+    path = path_of(name)
+    return path if path.startswith((QUICK, *ONE_WORKER)) else groups.get(path, name)
 
 
 def order(names: Sequence[str]) -> list[int]:
@@ -80,5 +89,4 @@ class Sharing(LoadScopeScheduling):  # type: ignore[misc]
         super().schedule()
 
     def _split_scope(self, nodeid: str) -> str:
-        path = path_of(nodeid)
-        return path if path.startswith(QUICK) else self._groups.get(path, nodeid)
+        return scope_of(nodeid, self._groups)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.support.sharing import BROWSERS, order, page_groups, path_of
+from tests.support.sharing import BROWSERS, ONE_WORKER, order, page_groups, path_of, scope_of
 
 PAGES = [f"tests/page/test_{letter}.py::test_{number}" for letter in "abcde" for number in range(5)]
 QUICK = [f"tests/unit/test_{letter}.py::test_{number}" for letter in "abcd" for number in range(3)]
@@ -17,6 +17,15 @@ def test_each_page_has_one_group_and_groups_are_alike() -> None:
     sizes = [sum(groups[path_of(name)] == group for name in PAGES) for group in set(groups.values())]
     assert len(sizes) == BROWSERS
     assert max(sizes) - min(sizes) <= 5
+
+
+def test_what_waits_for_the_same_is_handed_out_together() -> None:
+    """A page's group, a quick file, and a file whose tests wait for one thing that is made; others go one by one."""
+    groups = page_groups(PAGES)
+    assert {scope_of(name, groups) for name in PAGES} == set(groups.values())
+    assert scope_of(QUICK[0], groups) == path_of(QUICK[0])
+    assert {scope_of(f"{ONE_WORKER[0]}::test_{letter}", groups) for letter in "ab"} == {ONE_WORKER[0]}
+    assert scope_of(OTHERS[0], groups) == OTHERS[0]
 
 
 def test_what_is_long_comes_first() -> None:
