@@ -38,7 +38,10 @@ TOPIC = NodeSpec(NodeType.SUBSCRIBER, "/image", "sensor_msgs/Image", 10_000)
 IMAGE = TOPIC.name.encode()
 
 
-@pytest.fixture(params=[asyncio.DefaultEventLoopPolicy, uvloop.EventLoopPolicy], ids=["asyncio", "uvloop"])
+@pytest.fixture(
+    params=[pytest.param(asyncio.DefaultEventLoopPolicy, marks=pytest.mark.soak), uvloop.EventLoopPolicy],
+    ids=["asyncio", "uvloop"],
+)
 def event_loop_policy(request: pytest.FixtureRequest) -> asyncio.AbstractEventLoopPolicy:
     """Both are used: uvloop wherever it is installed."""
     policy: asyncio.AbstractEventLoopPolicy = request.param()

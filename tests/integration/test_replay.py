@@ -304,8 +304,15 @@ def _welcomes(message: bytes) -> tuple[dict[str, object], list[str]]:
     return {**metadata, "requestId": 0}, list(data)
 
 
-@pytest.mark.parametrize("gateways", [1, 2], ids=["one gateway", "two gateways"])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("name", "gateways"),
+    [
+        # each once in any run, on one gateway or on two; on both in that of all tests
+        pytest.param(name, gateways, marks=[] if number % 2 == gateways - 1 else [pytest.mark.soak])
+        for number, name in enumerate(NAMES)
+        for gateways in (1, 2)
+    ],
+)
 async def test_a_recorded_session(name: str, gateways: int, start_gateway: StartGateway) -> None:
     """Everybody hears what the recording shows, except where a rule says otherwise."""
     the_scene = scene(name)
