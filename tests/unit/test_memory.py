@@ -12,9 +12,10 @@ from bridge.cli import running
 
 @pytest.fixture
 def thawed() -> Iterator[None]:
-    """Whatever a test froze is collected again."""
-    yield
+    """Nothing is frozen before, and afterwards what a test run has frozen is again."""
     gc.unfreeze()
+    yield
+    gc.freeze()
 
 
 def test_who_is_ready_is_not_gone_through_again(thawed: None, capsys: pytest.CaptureFixture[str]) -> None:
