@@ -86,6 +86,18 @@ def drops(gateway: Gateway, headset: Socket) -> dict[str, int]:
     return dict(gateway.agents.find(2, headset.id).all_drops())
 
 
+class Paced(Pace):
+    """By a clock of the test's."""
+
+    def __init__(self, clock: list[float]) -> None:
+        super().__init__(0, 0, 0.0)
+        self._clock, self.seen = clock, 0
+
+    def command(self, kind: Hashable, count: int, now: float, size: int = 0) -> Passing:
+        self.seen += 1
+        return super().command(kind, count, self._clock[0])
+
+
 @pytest.fixture
 def together(monkeypatch: pytest.MonkeyPatch) -> None:
     """What comes at once does for the gateway, though a busy machine takes time between two of it."""
@@ -97,17 +109,22 @@ async def test_a_headset_whose_network_stood_still_does_not_make_up_for_it(
 ) -> None:
     """It drove at 20 Hz, nothing came for more than a second, then all at once: the newest command of each topic goes
     on, and the stop that was among them."""
-    gateway = await start_gateway()
+    gateway, clock = await start_gateway(), [0.0]
     async with socket(gateway) as headset:
         await ready(gateway, headset)
-        await drive_and_pause(headset)
+        paced = gateway.agents.find(2, headset.id).pace = Paced(clock)
+        for number in range(10):
+            clock[0] += 0.05
+            headset.writer.write(frame(number))
+            await until(lambda number=number: paced.seen > number)
+        clock[0] += 1.1
         arm = ("nd__arm", MOVE[1])
         waited = [frame(100 + number) + frame(200 + number, arm) for number in range(20)]
         headset.writer.write(b"".join([*waited[:10], frame(1, STOP), *waited[10:]]))
         await until(lambda: taken(robot)[-1:] == [119] and taken(robot, arm)[-1:] == [219] and taken(robot, STOP))
         assert taken(robot) == [*range(10), 119]
         assert taken(robot, arm) == [219]
-        await asyncio.sleep(0.2)
+        clock[0] += 0.2
         headset.writer.write(frame(1000))
         await until(lambda: taken(robot)[-1] == 1000)
         assert drops(gateway, headset)["too_old"] == 38
@@ -118,37 +135,28 @@ async def test_what_waited_behind_several_topics_or_a_bool_is_not_made_up_for(
 ) -> None:
     """Two topics in each cycle, then a stall; what waited comes in pieces, a message of std_msgs/Bool first. The
     newest of each goes on, once nothing newer has come for a moment."""
-    gateway = await start_gateway()
+    gateway, clock = await start_gateway(), [0.0]
     async with socket(gateway) as headset:
         await ready(gateway, headset)
+        paced = gateway.agents.find(2, headset.id).pace = Paced(clock)
         arm = ("nd__arm", MOVE[1])
         for number in range(10):
+            clock[0] += 0.05
             headset.writer.write(frame(number) + frame(number, arm))
-            await asyncio.sleep(0.05)
-        await asyncio.sleep(1.1)
+            await until(lambda number=number: paced.seen == 2 * number + 2)
+        clock[0] += 1.1
         headset.writer.write(frame(1, ("nd__light", "std_msgs/Bool")))
         for piece in range(10):
+            seen = paced.seen
             headset.writer.write(
                 b"".join(frame(100 + piece * 2 + n) + frame(500 + piece * 2 + n, arm) for n in range(2))
             )
-            await headset.writer.drain()
-            await asyncio.sleep(0.005)
+            await until(lambda seen=seen: paced.seen >= seen + 4)
+            clock[0] += 0.005
         await until(lambda: taken(robot)[-1:] == [119] and taken(robot, arm)[-1:] == [519])
         assert taken(robot)[10:] == [119]
         assert taken(robot, arm)[10:] == [519]
         assert drops(gateway, headset) == {"too_old": 2 * 19}
-
-
-class Paced(Pace):
-    """By a clock of the test's."""
-
-    def __init__(self, clock: list[float]) -> None:
-        super().__init__(0, 0, 0.0)
-        self._clock, self.seen = clock, 0
-
-    def command(self, kind: Hashable, count: int, now: float, size: int = 0) -> Passing:
-        self.seen += 1
-        return super().command(kind, count, self._clock[0])
 
 
 class OnePaused(Pace):
