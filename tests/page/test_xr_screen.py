@@ -67,6 +67,37 @@ async def test_what_is_not_drawn_is_not_shown(gate: Gate) -> None:
         )  # and the next one is asked for
 
 
+ORDER = """(() => {
+  const said = (window.said = []);
+  const { links, stage, input } = macsXr;
+  const noted = (object, name, word) => {
+    const act = object[name];
+    object[name] = (...what) => (said.push(word), act.apply(object, what));
+  };
+  noted(input, 'stops', 'frame'); // the first thing in each
+  noted(links, 'input', 'hands');
+  noted(stage, 'render', 'drawn');
+})()"""
+FAILS = "macsXr.stage.render = () => { throw new Error('it fails') }, 0"
+
+
+async def test_what_hands_do_goes_out_before_the_frame_is_drawn(gate: Gate) -> None:
+    """Nobody waits for the drawing to drive; and when a frame was not drawn, the next one says nothing of hands."""
+    headset = await headset_at(gate)
+    await until(lambda: headset.value("Boolean(window.macsXr)"))
+    await headset.frame(3)
+    await headset.value(ORDER)
+    await until(lambda: headset.value("said.filter((each) => each === 'hands').length > 3"))
+    frames = " ".join(await headset.value("said")).split("frame")
+    told = {tuple(frame.split()) for frame in frames[1:-1] if "hands" in frame}
+    assert told == {("hands", "drawn")}
+    await headset.value(FAILS)
+    await headset.frame(2)
+    await headset.value("said.length = 0")
+    await headset.frame(30)
+    assert "hands" not in await headset.value("said")
+
+
 UNHEARD = "document.querySelector('#stop-status').textContent.startsWith('THE STOP HAS NOT GONE OUT')"
 
 
