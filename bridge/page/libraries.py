@@ -24,7 +24,7 @@ VENDOR = HERE / "static" / "vendor"
 STAMP = VENDOR / "made-of.txt"
 BUNDLES = ("libraries.js", "three.js")
 SOURCES = ("package.json", "package-lock.json", *BUNDLES)
-ONLY_TESTS = ("axe-core", "iwer")
+ONLY_TESTS = ("axe-core", "iwer", "@mcap/core", "@mcap/support")
 NPM_S = 300.0
 PATIENCE = ("--fetch-retries=1", "--fetch-retry-mintimeout=1000", "--fetch-timeout=60000")
 """Who has no network is told soon."""

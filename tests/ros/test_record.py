@@ -39,6 +39,7 @@ from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.messages import StreamData, decode_management
 from macs_zenoh.protocol.robot_state import RobotStatus
 from macs_zenoh.protocol.wire import parse_frames
+from tests.support.lichtblick import THERE, lichtblick
 from tests.support.programs import Program, ended, macs
 from tests.support.ros_peer import Peer, say_hello
 from tests.support.routers import Router
@@ -155,8 +156,8 @@ async def publish_each(peer: Peer, names: list[str]) -> dict[str, bytes]:
 
 
 async def test_every_type_is_recorded_as_it_was_published(site: Site, peer: Peer) -> None:
-    """One message of every standard type and of a type of one's own: mcap-ros2-support, rosbags and rclpy read it out
-    of the file, byte for byte what was published, and no schema is empty."""
+    """One message of every standard type and of a type of one's own: mcap-ros2-support, rosbags, rclpy and what
+    Lichtblick reads files with read it, byte for byte what was published, and no schema is empty."""
     names = [*STANDARD, OWN]
     assert len(names) > 100
     published = await publish_each(peer, names)
@@ -175,6 +176,9 @@ async def test_every_type_is_recorded_as_it_was_published(site: Site, peer: Peer
     assert [name for name in names if not _same(found[f"/7{topic_of(name)}"], published[name])] == []
     _read_by_mcap(path, topics)
     _read_by_rosbags(path, topics)
+    if THERE:
+        channels = lichtblick(path)["channels"]
+        assert {topic: channels[topic]["type"] for topic in topics} == dict(zip(topics, names, strict=True))
     code, _, errors = await ended("bag", "to-rosbag2", str(path), "-o", str(site.folder / "bag"))
     assert code == 0, errors
     with AnyReader([site.folder / "bag"]) as reader:

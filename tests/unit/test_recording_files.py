@@ -34,7 +34,8 @@ from bridge.recording.streams import (
 from bridge.replay.timeline import Timeline
 from macs_zenoh.errors import ConfigError
 from macs_zenoh.protocol.robot_state import TopicQos
-from tests.support.bags import BEGIN, STRING, S, cdr, texts, write
+from tests.support.bags import BEGIN, STRING, S, cdr, fill, string_channel, texts, write
+from tests.support.lichtblick import lichtblick, needs_lichtblick
 from tests.support.programs import ROOT
 from tests.support.thorough import some
 
@@ -436,3 +437,22 @@ def test_a_message_that_is_too_short_is_told(tmp_path: Path) -> None:
     with pytest.raises(BadBag, match="cut off"):
         list(timeline)
     timeline.close()
+
+
+@needs_lichtblick
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_lichtblick_opens_it(tmp_path: Path, compression: str) -> None:
+    """By its index, each message decoded by its schema, however it is compressed; also what was repaired."""
+    found = lichtblick(write(tmp_path / "a.mcap", 1000, compression=compression))
+    assert found["profile"] == "ros2"
+    assert found["statistics"]["messageCount"] == 1000
+    channel = found["channels"]["/7/chatter"]
+    assert (channel["type"], channel["count"]) == ("std_msgs/msg/String", 1000)
+    assert (channel["first"], channel["last"]) == ({"data": "message 0"}, {"data": "message 999"})
+    cut = tmp_path / "cut.mcap"
+    file = McapFile(cut, compression=compression)
+    fill(file, string_channel(), 1000)
+    file.flush()
+    file.abandon()
+    repairing.repair(cut, tmp_path / "whole.mcap")
+    assert lichtblick(tmp_path / "whole.mcap")["channels"]["/7/chatter"]["count"] == 1000

@@ -14,9 +14,9 @@ LOCK = Path(libraries.__file__).parent / "npm" / "package-lock.json"
 
 
 def test_the_emulator_is_only_for_tests() -> None:
-    """Neither it nor what it needs is fetched for a wheel, and no file of the scene names it."""
+    """Neither it nor what it needs, nor what opens recordings, is fetched for a wheel; no file of a scene names it."""
     packages = json.loads(LOCK.read_text(encoding="utf-8"))["packages"]
-    for name in ("iwer", "gl-matrix", "webxr-layers-polyfill"):
+    for name in ("iwer", "gl-matrix", "webxr-layers-polyfill", "@mcap/core", "@mcap/support"):
         assert packages[f"node_modules/{name}"]["dev"] is True
     assert "dev" not in packages["node_modules/three"]
     for path in (files.FOLDER / "xr").rglob("*"):
