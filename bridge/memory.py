@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
-import sys
-from contextlib import suppress
 
 LARGE_BYTES = 4 << 20
 """So much and more is mapped by itself. What is smaller comes from the heap, which is faster."""
-SPARE_BYTES = 32 << 20
-"""The heap keeps so much at its end."""
+SPARE_BYTES = 16 << 20
+"""A heap keeps so much at its end; each of the threads that read from the mesh has one."""
 
 SELDOM, YOUNG, OLD = 10_000, 2, 50
 """So many objects more than before have Python look for circles among the young ones, by itself 700; after so many
 such looks among those that have stayed, by itself 10; and after so many of these among all, by itself 10. What has
 stayed is what came since: with 10 one such look held up a gateway for 26 ms, measured while a thousand joined."""
-
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 
 def give_back() -> None:
@@ -26,12 +21,9 @@ def give_back() -> None:
     By itself it raises both with the largest piece that was ever freed, to 32 and 64 MiB: after a few frames of
     31 MiB a program kept 60 to 80 MiB that nobody used.
     """
-    if sys.platform != "linux":
-        return
-    with suppress(OSError, AttributeError):  # musl has no mallopt
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(_M_MMAP_THRESHOLD, LARGE_BYTES)
-        mallopt(_M_TRIM_THRESHOLD, SPARE_BYTES)
+    from macs_zenoh.mesh.copies import hold_heap
+
+    hold_heap(LARGE_BYTES, SPARE_BYTES)
 
 
 def settle() -> None:

@@ -15,6 +15,7 @@ import zenoh
 from macs_zenoh.losses import Losses
 from macs_zenoh.protocol.guard import Gate
 
+from .copies import copied
 from .declared import Aged, AtOnce, OnAged, OnBatch, OnNumbered, Payload, Sample
 from .loopback import Loopback
 from .threads import keep_attached
@@ -179,7 +180,7 @@ class Arrivals:
             if (self.looped if looped else len(queue)) >= limit and not self._has_room(sample, queue, looped):
                 return False
             if elsewhere:
-                payload = sample.payload.to_bytes()
+                payload = copied(sample.payload)
             key = str(sample.key_expr)
             info = sample.source_info if on_numbered is not None else None
             if at_once is not None and elsewhere and info is None and self._taken_at_once(at_once, key, payload):
@@ -240,7 +241,7 @@ class Arrivals:
                     if size <= self.AT_ONCE_BYTES:
                         self._try(gate.rescue, key, encoded.to_bytes(), now)
                     return
-                payload = encoded.to_bytes()
+                payload = copied(encoded)
                 if stamp := sample.timestamp:
                     age_s = gate.age(key, stamp.get_id(), stamp.get_time_as_ntp64().as_secs_f64(), now)
                 if size <= self.AT_ONCE_BYTES:

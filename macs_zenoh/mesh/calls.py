@@ -18,6 +18,7 @@ from macs_zenoh.protocol.guard import Admits
 from macs_zenoh.protocol.limits import ASKED_BYTES, CALL_BYTES, REASON_CHARACTERS, REQUEST_BYTES
 
 from .arrivals import Arrivals, now_s
+from .copies import copied
 from .declared import Handler, Payload, Subscription, Traffic
 from .outgoing import Outgoing
 from .panics import end_if_panic
@@ -165,7 +166,7 @@ class Calls:
                 try:
                     if problem is not None:
                         raise problem
-                    payload = query.payload.to_bytes() if query.payload is not None else b""
+                    payload = copied(query.payload) if query.payload is not None else b""
                     reply = await handler(name, payload)
                     if reply is not None:
                         query.reply(query.key_expr, reply)
@@ -236,7 +237,7 @@ class Calls:
 def _tried(first: Callable[[str, bytes], None], query: zenoh.Query) -> Refused | None:
     """Why what had to be done at once was not."""
     try:
-        first(str(query.key_expr), query.payload.to_bytes() if query.payload is not None else b"")
+        first(str(query.key_expr), copied(query.payload) if query.payload is not None else b"")
     except Refused as refusal:
         return refusal
     except MacsError as error:

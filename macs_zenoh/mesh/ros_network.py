@@ -41,6 +41,7 @@ from macs_zenoh.protocol.rmw_zenoh.keyexpr import (
 )
 from macs_zenoh.protocol.rmw_zenoh.qos import SERVICES, Durability, History, Qos, Reliability
 
+from .copies import copied
 from .declared import Subscription
 from .followed import Followed, OnToken
 from .heartbeat import Heartbeat
@@ -363,7 +364,7 @@ class RosSubscription:
         if attached is None:
             drops.note("bad_attachment", topic, "a message whose attachment is none of rmw_zenoh's")
             return
-        cdr = sample.payload.to_bytes()
+        cdr = copied(sample.payload)
         if not looks_like_cdr(cdr):
             drops.note("bad_cdr", topic, "a message that begins with no CDR header")
             return
@@ -391,7 +392,7 @@ class RosService:
     def _asked(self, query: zenoh.Query) -> None:
         keep_attached()
         attached = parse_attachment(query.attachment.to_bytes()) if query.attachment is not None else None
-        cdr = query.payload.to_bytes() if query.payload is not None else b""
+        cdr = copied(query.payload) if query.payload is not None else b""
         drops, name = self._network.drops, self.endpoint.topic
         if attached is None:
             drops.note("bad_attachment", name, "a request whose attachment is none of rmw_zenoh's")

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import gc
+import platform
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -24,3 +27,53 @@ def test_who_is_ready_is_not_gone_through_again(thawed: None, capsys: pytest.Cap
     running.say_ready("somebody")
     assert gc.get_freeze_count() > 1000
     assert capsys.readouterr().out == "ready: somebody\n"
+
+
+COPIES = """
+import resource
+from bridge import memory
+from macs_zenoh.mesh.copies import copied
+
+SIZE = 24 << 20
+
+
+class Payload:
+    def __len__(self):
+        return SIZE
+
+    def to_bytes(self):
+        before = faults()
+        made = b"x" * SIZE
+        self.faults = faults() - before
+        return made
+
+
+def faults():
+    return resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
+
+
+def kept():
+    return int(open("/proc/self/status").read().split("VmRSS:")[1].split()[0]) << 10
+
+
+memory.give_back()
+payload, before = Payload(), kept()
+payload.to_bytes()
+alone = payload.faults
+each = []
+for _ in range(3):
+    assert len(copied(payload)) == SIZE
+    each.append(payload.faults)
+del payload
+print(alone, max(each), kept() - before, memory.SPARE_BYTES)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux" or platform.libc_ver()[0] != "glibc", reason="glibc's heap on Linux")
+def test_who_copies_a_large_payload_waits_for_no_page() -> None:
+    """The kernel has made the pages of a large copy before it begins, and what it took is given back."""
+    printed = subprocess.run([sys.executable, "-c", COPIES], capture_output=True, text=True, check=True).stdout
+    alone, most, kept, spare = map(int, printed.split())
+    assert alone > 5000  # so that there is something to spare
+    assert most < 200
+    assert kept <= spare + (4 << 20)
