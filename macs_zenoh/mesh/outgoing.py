@@ -8,6 +8,7 @@ import threading
 import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import zenoh
@@ -119,10 +120,9 @@ class Outgoing:
         self._declared = Ever(each=self.OF_SENDER, total=self.IN_ALL)
         """Keys that have or had a publisher, by who sends."""
         self._on_room: Callbacks[Callable[[], None]] = Callbacks()
-        self._sender = Sender(backlog_bytes, loopback.put, lambda: from_thread(self._room))
-        self._commands = Sender(
-            self.COMMANDS_BYTES, loopback.put, lambda: None, lambda: from_thread(self._late), self.COMMANDS_S
-        )
+        self._sender = Sender(backlog_bytes, loopback.put, lambda: from_thread(self._room), drops)
+        late = partial(from_thread, self._late)
+        self._commands = Sender(self.COMMANDS_BYTES, loopback.put, lambda: None, drops, late, self.COMMANDS_S)
         """For large commands put on the loop, and what follows them with their keys: Zenoh waits for room for their
         fragments (``fragment_wait_ms``)."""
         self._loop_thread = threading.get_ident()
@@ -368,7 +368,7 @@ class Sender:
     """A thread that puts what may take long, in order. It starts with the first such payload.
 
     So long as ``most_s`` a large payload may wait while others wait behind it; then it is not put, and ``on_late``
-    called.
+    called. One that cannot be put, for a reason that nobody thought of, costs itself (``failed`` in ``drops``).
     """
 
     def __init__(
@@ -376,9 +376,11 @@ class Sender:
         limit_bytes: int,
         put: Callable[[Outlet, Payload], None],
         on_room: Callable[[], None],
+        drops: Losses,
         on_late: Callable[[], None] = lambda: None,
         most_s: float = math.inf,
     ) -> None:
+        self._drops = drops
         self._most_s = most_s
         self._on_late = on_late
         self._put = put
@@ -450,14 +452,14 @@ class Sender:
                         return
                     self._wake.wait()
                 entry = self._queue.popleft()
+            try:
+                self._handle(entry)
+            except Exception:  # noqa: BLE001 - it is logged
+                text = "what a thread was to put, or to tell, failed"
+                self._drops.once("failed", text, level=logging.ERROR, exc_info=True)
             if not isinstance(entry, tuple):
-                entry()
                 continue
-            publisher, payload, key, since = entry
-            if self._queue and _is_large(payload) and time.monotonic() - since > self._most_s:
-                self._on_late()
-            else:
-                self._put(publisher, payload)
+            _, payload, key, _ = entry
             with self._wake:
                 self.sent += 1
                 self._keys[key] -= 1
@@ -469,6 +471,16 @@ class Sender:
                     self.backlogged = False
             if relieved:
                 self._on_room()
+
+    def _handle(self, entry: tuple[Outlet, Payload, str, float] | Callable[[], None]) -> None:
+        if not isinstance(entry, tuple):
+            entry()
+            return
+        publisher, payload, _, since = entry
+        if self._queue and _is_large(payload) and time.monotonic() - since > self._most_s:
+            self._on_late()
+        else:
+            self._put(publisher, payload)
 
 
 def _is_large(payload: Payload) -> bool:

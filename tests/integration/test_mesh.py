@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import threading
 import time
@@ -20,6 +21,7 @@ from bridge.headset.client import Headset
 from bridge.settings import GatewaySettings
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError, Refused
+from macs_zenoh.losses import Losses
 from macs_zenoh.mesh import Mesh, Sample, Traffic
 from macs_zenoh.mesh.outgoing import Outgoing, Sender
 from macs_zenoh.protocol.keyexpr import PING, UNICAST
@@ -100,7 +102,9 @@ def test_what_follows_large_commands_waits_no_longer_than_it_may() -> None:
         goes_on.wait()
         put.append(payload)
 
-    sender = Sender(2 * LARGE, slow, lambda: None, lambda: late.append(1), most_s=0.0)
+    sender = Sender(
+        2 * LARGE, slow, lambda: None, Losses(logging.getLogger("macs.mesh")), lambda: late.append(1), most_s=0.0
+    )
     first, second, small = bytes(LARGE), b"2" * LARGE, b"small"
     assert sender.put(NOBODY, first, KEY)
     begun.wait()
@@ -113,6 +117,35 @@ def test_what_follows_large_commands_waits_no_longer_than_it_may() -> None:
     sender.close(60)
     assert put == [first, small]
     assert late == [1]
+
+
+def test_what_cannot_be_put_costs_itself() -> None:
+    """A fault nobody thought of, in what is put or told, is counted; all behind it goes on, and its key is free."""
+    put: list[Any] = []
+    goes_on, done = threading.Event(), threading.Event()
+
+    def picky(_: Any, payload: Any) -> None:
+        goes_on.wait()
+        if payload == b"bad":
+            raise RuntimeError("of nobody's making")
+        put.append(payload)
+
+    def fails() -> None:
+        raise RuntimeError("who is told fails")
+
+    drops = Losses(logging.getLogger("macs.mesh"))
+    sender = Sender(2 * LARGE, picky, lambda: None, drops)
+    for payload in (b"bad", b"good"):
+        assert sender.put(NOBODY, payload, KEY)
+        sender.when_sent(fails)
+    sender.when_sent(done.set)
+    goes_on.set()
+    assert done.wait(PATIENCE_S)
+    sender.close(PATIENCE_S)
+    assert put == [b"good"]
+    assert sender.idle
+    assert not sender.has(KEY)
+    assert drops["failed"] == 3
 
 
 @pytest.mark.parametrize("settled", [True, False])
