@@ -6,8 +6,8 @@ import gc
 
 LARGE_BYTES = 4 << 20
 """So much and more is mapped by itself. What is smaller comes from the heap, which is faster."""
-SPARE_BYTES = 16 << 20
-"""A heap keeps so much at its end; each of the threads that read from the mesh has one."""
+SPARE_BYTES = 32 << 20
+"""A heap keeps so much at its end, until `CALM_S` after the last large sample."""
 
 SELDOM, YOUNG, OLD = 10_000, 2, 50
 """So many objects more than before have Python look for circles among the young ones, by itself 700; after so many

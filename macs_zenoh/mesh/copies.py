@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Protocol
@@ -22,6 +23,8 @@ MOST_BYTES = 32 << 20
 BESIDES = 64 << 10
 """So much larger is the place than what is copied to it: it has a head, and ends with a page."""
 PAGE = 4096
+CALM_S = 0.5
+"""So long after the last large copy its place is given back: whoever frees one would do so with Python's lock."""
 
 
 class Copied(Protocol):
@@ -46,7 +49,12 @@ class _Heap:
         self._free.argtypes = (ctypes.c_void_p,)
         self._advise = without.madvise
         self._advise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
+        self._trim = without.malloc_trim
+        self._trim.argtypes = (ctypes.c_size_t,)
         self._lock = threading.Lock()
+        self._used_at = 0.0
+        self._gives_back = False
+        """Whether a thread waits until it is calm."""
         self._hold()
 
     @contextmanager
@@ -59,6 +67,20 @@ class _Heap:
                 yield
             finally:
                 self._hold()
+                self._used_at = time.monotonic()
+                if not self._gives_back:
+                    self._gives_back = True
+                    threading.Thread(target=self._give_back, name="macs-heap", daemon=True).start()
+
+    def _give_back(self) -> None:
+        """Once nothing large has come for a while, let the kernel have what is free."""
+        while True:
+            time.sleep(CALM_S)
+            with self._lock:
+                if time.monotonic() >= self._used_at + CALM_S:
+                    self._gives_back = False
+                    break
+        self._trim(0)
 
     def _hold(self) -> None:
         self._set(_M_MMAP_THRESHOLD, self.mapped_bytes)

@@ -30,7 +30,7 @@ def test_who_is_ready_is_not_gone_through_again(thawed: None, capsys: pytest.Cap
 
 
 COPIES = """
-import resource
+import resource, time
 from bridge import memory
 from macs_zenoh.mesh.copies import copied
 
@@ -64,8 +64,10 @@ each = []
 for _ in range(3):
     assert len(copied(payload)) == SIZE
     each.append(payload.faults)
-del payload
-print(alone, max(each), kept() - before, memory.SPARE_BYTES)
+deadline = time.monotonic() + 60
+while kept() - before > 4 << 20 and time.monotonic() < deadline:
+    time.sleep(0.01)
+print(alone, max(each), kept() - before)
 """
 
 
@@ -73,7 +75,7 @@ print(alone, max(each), kept() - before, memory.SPARE_BYTES)
 def test_who_copies_a_large_payload_waits_for_no_page() -> None:
     """The kernel has made the pages of a large copy before it begins, and what it took is given back."""
     printed = subprocess.run([sys.executable, "-c", COPIES], capture_output=True, text=True, check=True).stdout
-    alone, most, kept, spare = map(int, printed.split())
+    alone, most, kept = map(int, printed.split())
     assert alone > 5000  # so that there is something to spare
     assert most < 200
-    assert kept <= spare + (4 << 20)
+    assert kept <= 4 << 20
