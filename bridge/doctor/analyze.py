@@ -87,6 +87,8 @@ def _routers(facts: Facts) -> Iterator[Finding]:
             )
             if not endpoint.routers:
                 yield found("admin_hidden", where)
+            if endpoint.drops_commands is False:
+                yield found("commands_wait", where)
             if median_ms(endpoint.path) > SLOW_MS:
                 yield found("slow", where, round_trip=round_trip(endpoint.path))
             yield from _way(endpoint.path, where)

@@ -93,6 +93,14 @@ CHECKS: dict[str, Check] = {
         "{round_trip} there and back: that late is every command",
         "use a nearer router; robot and operator may be on different ones that are linked",
     ),
+    "commands_wait": Check(
+        "routers",
+        WARNING,
+        "what is put with the priority of commands may wait there where a link is full: a program that does so holds "
+        "up everybody's commands and stops",
+        "use `macs router`, or give it the rule of qos/network in config/router.json5; where `macs security generate` "
+        "wrote its file, generate again",
+    ),
     "large_dropped": Check(
         "routers",
         NOTE,

@@ -123,6 +123,8 @@ class Endpoint(msgspec.Struct, kw_only=True):
     """Zenoh id of the router; empty without a session."""
     path: NetworkPath = msgspec.field(default_factory=NetworkPath)
     rights: Rights = msgspec.field(default_factory=Rights)
+    drops_commands: bool | None = None
+    """Where a link is full the router drops what has the priority of commands, also if it says that it waits."""
     routers: list[RouterInfo] = []
     """What the admin space shows from here; empty where it is off or hidden."""
     meets: list[str] = []

@@ -241,6 +241,7 @@ class Probe:
     async def _measure(self, place: Place) -> None:
         if place.facts.rights.pings:
             place.facts.path.clock = await self._measurements.router_clock(place)
+            place.facts.drops_commands = await self._measurements.drops_commands(place)
             if not self._quick:
                 await self._measurements.echo(place.first, place.second.zid, place.facts.path)
 

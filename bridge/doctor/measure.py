@@ -54,6 +54,19 @@ class Measurements:
         watching.close()
         return best
 
+    async def drops_commands(self, place: Place) -> bool | None:
+        """Whether the router drops, where a link is full, what has the priority of commands and says that it waits; it
+        shows by how such a sample arrives. None: none does."""
+        came: list[bool] = []
+        key = PING.of(zid=place.second.zid)
+        watching = place.second.watch_dropping(key, came.append)
+        for _ in range(PINGS):
+            place.first.put(key, b"", Traffic.INSISTING)
+            if await until(lambda: bool(came), place.waited_s):
+                break
+        watching.close()
+        return came[0] if came else None
+
     async def echo(self, mesh: Mesh, zid: str, path: NetworkPath) -> None:
         """Ever larger echoes, until one takes long or does not come back."""
         for size in ECHO_BYTES:

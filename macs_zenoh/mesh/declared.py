@@ -36,6 +36,8 @@ class Traffic(Enum):
     """Topic data: dropped when a link is full."""
     PROBE = (zenoh.Priority.BACKGROUND, zenoh.CongestionControl.BLOCK, False)
     """Measurements: after everything else."""
+    INSISTING = (zenoh.Priority.REAL_TIME, zenoh.CongestionControl.BLOCK, True)
+    """What no program of ours should send: to try whether a router lets it wait."""
 
     __hash__ = object.__hash__  # Enum's own is a Python call, and each put needs it
 

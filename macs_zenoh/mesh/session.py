@@ -391,6 +391,14 @@ class Mesh:
 
         return Subscription(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
+    def watch_dropping(self, key: str, on_sample: Callable[[bool], None]) -> Subscription:
+        """Call ``on_sample`` for every sample, with whether it may be dropped where a link is full."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            self._from_thread(on_sample, sample.congestion_control == zenoh.CongestionControl.DROP)
+
+        return Subscription(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+
     # -- calls ---------------------------------------------------------------------------------------------------
 
     async def query(self, key: str, payload: Payload, *, timeout_s: float, traffic: Traffic = Traffic.CALL) -> bytes:

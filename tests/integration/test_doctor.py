@@ -18,7 +18,8 @@ from macs_zenoh.protocol.keyexpr import LEASE, NAME, PRESENCE
 from tests.integration.test_access_rules import RULES, USERS, credentials
 from tests.support.certificates import Authority
 from tests.support.programs import ROOT, Program, ended, free_port
-from tests.support.routers import Router
+from tests.support.routers import Router as Plain
+from tests.support.routers import as_macs_router
 
 POLICY = """\
 routers: [{name: site, addresses: [127.0.0.1]}]
@@ -27,6 +28,16 @@ gateways: [{name: hall, blocks: [1]}]
 operators: [{name: anna}]
 permissions: [{who: all, may: all, whom: all}]
 """
+
+
+RULE = [line for line in as_macs_router(MeshSettings()) if line.startswith("qos/")]
+
+
+class Router(Plain):
+    """A router with the rule that ours have for messages."""
+
+    def __init__(self, config: Path | None = None, *, overrides: Sequence[str] = (), **how: Any) -> None:
+        super().__init__(config, overrides=[*RULE, *overrides], **how)
 
 
 class Report:
@@ -87,6 +98,16 @@ async def test_a_healthy_mesh_has_nothing_wrong() -> None:
         assert program["pong"]["zenoh"]
         assert len(program["path"]["round_trips_ms"]) == 5
     assert facts["probe_bytes"] > 0
+
+
+@pytest.mark.parametrize("rule", [[], RULE], ids=["without", "with"])
+async def test_a_router_in_which_commands_may_wait_is_found(rule: list[str]) -> None:
+    """Whether a router drops what has the priority of commands, though its sender would wait, is tried, not read."""
+    async with Plain(overrides=rule or ["qos/network:[]"]) as router:
+        report = await doctor("-e", router.endpoint, "--quick")
+    assert report.has("commands_wait") == (not rule)
+    [endpoint] = report.document["facts"]["endpoints"]
+    assert endpoint["drops_commands"] is bool(rule)
 
 
 async def test_quick_sends_nothing_large() -> None:

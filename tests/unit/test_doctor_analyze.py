@@ -154,6 +154,11 @@ def _(facts: Facts) -> None:
     facts.endpoints[0].path.round_trips_ms = [210.0, 205.0, 300.0]
 
 
+@makes("commands_wait", WARNING)
+def _(facts: Facts) -> None:
+    facts.endpoints[0].drops_commands = False
+
+
 @makes("large_dropped", NOTE)
 def _(facts: Facts) -> None:  # 4 x 252 KiB in 0.4 s
     facts.endpoints[0].path.echoes = [Echo(size_bytes=4096, took_s=0.1), Echo(size_bytes=262144, took_s=0.5)]
