@@ -10,9 +10,14 @@ from typing import Any
 import msgspec
 import zenoh
 
-from macs_zenoh.config import MeshSettings
+from macs_zenoh.config import MeshSettings, TrafficRule
 from macs_zenoh.errors import ConfigError
 from macs_zenoh.protocol import endpoints
+from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST
+from macs_zenoh.protocol.messages import ROS
+
+COMMANDS = "real_time"
+"""The priority of commands, unless a rule says otherwise."""
 
 
 def configuration(settings: MeshSettings) -> dict[str, Any]:
@@ -22,6 +27,23 @@ def configuration(settings: MeshSettings) -> dict[str, Any]:
     """
     whole: dict[str, Any] = msgspec.json.decode(str(zenoh_config(settings)))
     return whole
+
+
+def lowered(rules: Iterable[TrafficRule]) -> list[TrafficRule]:
+    """Those that give commands to robots another priority than the first: whoever waits for room at that one holds them
+    up, which routers prevent at the first alone."""
+    found: list[TrafficRule] = []
+    for space in (UNICAST.every(type=ROS), GROUP.every(type=ROS), BROADCAST.every()):
+        keys = zenoh.KeyExpr(space)
+        for rule in rules:
+            match = zenoh.KeyExpr(rule.match)
+            if rule.priority is None or not match.intersects(keys):
+                continue
+            if rule.priority != COMMANDS:
+                found.append(rule)
+            elif match.includes(keys):
+                break
+    return list({id(rule): rule for rule in found}.values())
 
 
 def zenoh_config(settings: MeshSettings) -> zenoh.Config:

@@ -10,6 +10,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -369,6 +370,26 @@ async def priorities(
     finally:
         await asyncio.to_thread(session.close)
     return found
+
+
+@pytest.mark.parametrize(
+    ("rules", "warned"),
+    [
+        ([("macs/to/ros/0/7/**", "data")], ["macs/to/ros/0/7/**"]),
+        ([("macs/from/**", "data_low"), ("**", "interactive_high")], ["**"]),
+        ([("macs/to/ros/**", "real_time"), ("macs/to/**", "data")], []),
+        ([("macs/from/**", "real_time"), ("macs/to/unity/**", "data"), ("macs/call/**", "data")], []),
+    ],
+)
+async def test_a_rule_that_lowers_commands_is_warned_of(
+    router: str, rules: list[tuple[str, Any]], warned: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Routers let nobody wait at the priority that commands have by default, and at no other."""
+    traffic = [TrafficRule(match=match, priority=priority) for match, priority in rules]
+    async with await Mesh.open(MeshSettings(connect=[router]), traffic=traffic):
+        pass
+    said = [record.message for record in caplog.records if "gives commands the priority" in record.message]
+    assert [message.split()[2] for message in said] == warned
 
 
 async def test_a_rule_gives_a_priority_and_leaves_the_rest(router: str) -> None:
