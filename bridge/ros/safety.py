@@ -160,7 +160,8 @@ class EmergencyStop:
     """Seconds since the epoch."""
     times: int = 0
     presses: int = 0
-    """How often somebody stopped it who had not before: whoever releases it says up to which he knows."""
+    """How often somebody stopped it who had not before, or not within `COPIES_S`: whoever releases it says up to which
+    he knows."""
     changes: int = 0
     """The number of the last change, here or elsewhere."""
     history: list[str] = field(default_factory=list)
@@ -170,10 +171,14 @@ class EmergencyStop:
     """Who stopped it here and has not taken that back, and the number of that change."""
     heard: dict[str, int] = field(default_factory=dict)
     """By session: up to which number its presses are known in what `pressed` says now."""
+    counted: dict[str, float] = field(default_factory=dict)
+    """When each of those who stopped it here was counted last."""
 
     HISTORY = 20
     PRESSED = 64
     """More are not remembered: the robot is stopped, and their releases do not count."""
+    COPIES_S = 1.0
+    """One press comes as data and as a call, and is said again for so long: that counts once."""
     HEARD = 64
     """Sessions that are remembered."""
 
@@ -184,6 +189,12 @@ class EmergencyStop:
             self.changes += 1
             self.own[by] = self.changes
             self._become([*self.pressed, by], by, now)
+            self.counted[by] = now
+        elif by in self.pressed and abs(now - self.counted.get(by, -math.inf)) > self.COPIES_S:
+            self.changes += 1  # who has released it elsewhere did not know this one
+            self.own[by] = self.changes
+            self.presses += 1
+            self.counted[by] = now
         return not was
 
     def take_back(self, by: str, now: float) -> bool:
@@ -247,6 +258,7 @@ class EmergencyStop:
         self.presses += any(agent not in self.pressed for agent in pressed)
         was, self.pressed, self.stopped = self.stopped, pressed, bool(pressed)
         self.own = {agent: number for agent, number in self.own.items() if agent in pressed}
+        self.counted = {agent: at for agent, at in self.counted.items() if agent in pressed}
         if was == self.stopped:
             return
         self.by, self.since = by, now

@@ -35,7 +35,7 @@ from .panics import call, end_on_panics, last_words, watched
 from .reliable import Recovered
 from .token_news import TokenNews
 from .tracing import Tracing
-from .zenoh_config import check_files, first_line, id_is_chosen, insert, lowered, zenoh_config
+from .zenoh_config import check_files, first_line, id_is_chosen, insert, warn_of_lowered, zenoh_config
 
 log = logging.getLogger("macs.mesh")
 
@@ -70,11 +70,7 @@ class Mesh:
         self.settings = settings
         self.drops = Losses(log)
         self.policer = Policer(traffic, self.drops)
-        for rule in lowered(traffic):
-            text = (
-                "traffic rule %s gives commands the priority %s: who waits for room at that one holds them up"
-            )
-            log.warning(text, rule.match, rule.priority)
+        warn_of_lowered(traffic)
         own = str(session.zid())
         self.id_is_chosen = id_is_chosen(settings)
         """Whether its Zenoh id is in its settings, and no other one is wanted."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,6 +17,8 @@ from macs_zenoh.protocol import endpoints
 from macs_zenoh.protocol.keyexpr import BROADCAST, GROUP, UNICAST
 from macs_zenoh.protocol.messages import ROS
 
+log = logging.getLogger("macs.mesh")
+
 COMMANDS = "real_time"
 """The priority of commands, unless a rule says otherwise."""
 
@@ -29,9 +32,15 @@ def configuration(settings: MeshSettings) -> dict[str, Any]:
     return whole
 
 
-def lowered(rules: Iterable[TrafficRule]) -> list[TrafficRule]:
-    """Those that give commands to robots another priority than the first: whoever waits for room at that one holds them
-    up, which routers prevent at the first alone."""
+def warn_of_lowered(rules: Iterable[TrafficRule]) -> None:
+    """Log those that give commands to robots another priority than the first: whoever waits for room at that one holds
+    them up, which routers prevent at the first alone."""
+    for rule in _lowered(rules):
+        text = "traffic rule %s gives commands the priority %s: who waits for room at that one holds them up"
+        log.warning(text, rule.match, rule.priority)
+
+
+def _lowered(rules: Iterable[TrafficRule]) -> list[TrafficRule]:
     found: list[TrafficRule] = []
     for space in (UNICAST.every(type=ROS), GROUP.every(type=ROS), BROADCAST.every()):
         keys = zenoh.KeyExpr(space)

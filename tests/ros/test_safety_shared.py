@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -27,6 +27,20 @@ from tests.support.waiting import PATIENCE_S, until
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 # -- pure ------------------------------------------------------------------------------------------------------------
+
+
+def test_who_presses_again_is_counted_again() -> None:
+    """A press by who has pressed already is one that a release may not have seen; copies of a press are none."""
+    stop = EmergencyStop()
+    counts = []
+    for at in (0.0, 0.3, 1.5, 1.6, 2.9):
+        stop.press("unity/1", at)
+        counts.append(stop.presses)
+    assert counts == [1, 1, 2, 2, 3]
+    stop.take_back("unity/1", 3.0)
+    stop.press("unity/1", 3.1)
+    assert stop.presses == 4
+
 
 AGENTS = 3
 STEPS = st.lists(
@@ -174,17 +188,18 @@ CUT_OFF = st.lists(
 )
 
 
+@example([("press", 1, 1), ("hear", 0, 1), ("release", 0, 0), ("press", 1, 1)])
 @given(CUT_OFF)
 def test_agents_that_lose_what_others_said_agree_in_the_end(steps: list[tuple[str, int, int]]) -> None:
     """As soon as each hears what the others say now; and nobody's press is lost that no releasing agent knew."""
     stops = [EmergencyStop() for _ in range(AGENTS)]
     since_release = ""
-    for step, number, who in steps:
-        stop = stops[number]
+    for at, (step, number, who) in enumerate(steps):
+        stop, now = stops[number], 2.0 * at
         if step == "hear":
-            stop.adopt(**said(stops[who % AGENTS]), now=0.0) if who % AGENTS != number else None
+            stop.adopt(**said(stops[who % AGENTS]), now=now) if who % AGENTS != number else None
         elif step != "lose":
-            {"press": stop.press, "release": stop.release, "take back": stop.take_back}[step](f"unity/{who}", 0.0)
+            {"press": stop.press, "release": stop.release, "take back": stop.take_back}[step](f"unity/{who}", now)
             since_release = f"unity/{who}" if step == "press" and stop.own.get(f"unity/{who}") == stop.changes else ""
     hear_all(*stops)
     assert len({(stop.stopped, tuple(sorted(stop.pressed))) for stop in stops}) == 1
