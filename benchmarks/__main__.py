@@ -64,7 +64,7 @@ def main() -> int:
                         figures.append(figure)
                 except ProgramFailed as error:
                     failed.append(f"{name}: {error}")
-                warnings += stage.warnings()
+            warnings += stage.warnings()  # they say what they lost in all when they end
             print(f"{name}: {time.monotonic() - began:.0f} s", file=sys.stderr)
         load.append(_load())
         for profile in sorted(Path(profiles).glob("*.prof")):
