@@ -107,7 +107,7 @@ async def test_how_late_and_how_dear(site: Site, tmp_path: Path) -> None:
     cameras from their stamp to the scene; the main thread's work per frame, as Chromium traces it."""
     peer, drives, poses = Peer(site.domain), Late(), Late()
     lines = [f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"]
-    settings = {"head": "/xr/head", "poseHz": 90, "hz": 90, "driveTopic": DRIVEN, "cameras": []}
+    settings = {"head": "/xr/head", "poseHz": 90, "hz": 30, "driveTopic": DRIVEN, "cameras": []}
     try:
         await drives.listen(peer, TwistStamped, DRIVEN)
         await poses.listen(peer, PoseStamped, "/xr/head")
