@@ -105,6 +105,21 @@ async def test_the_check_finds_rules_that_were_loosened(by_itself: bool, tmp_pat
     assert overlooked == [], wrong
 
 
+async def test_what_is_heard_late_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who was asked what he may not be has heard it, also when it took longer than an answer has: a busy machine hides
+    no hole."""
+    monkeypatch.setattr(router_path, "ANSWER_S", 0.001)
+    found = made(tmp_path / "pki")
+    text = found.file().read_text()
+    for name in ("robot-7 asks", "hall-2 answers", "hall-2 is asked"):
+        text = with_key(text, name, "macs/call/**")
+    found.file().write_text(text)
+    async with Router(found.file()):
+        wrong = [one.what for one in await found.wrong() if one.seen and not one.permitted]
+    for what in ("a robot calls", "a gateway answers for a robot"):
+        assert any(one.startswith(LOOSENED[what][2]) for one in wrong), wrong
+
+
 def with_key(text: str, rule: str, key: str) -> str:
     head, mark, tail = text.partition(f'id: "{rule}",')
     assert mark, rule
