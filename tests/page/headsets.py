@@ -187,7 +187,8 @@ class Headset:
 async def headset_at(
     site: Site | Gate, settings: dict[str, Any] | None = None, *, wanted: bool = False, size: str = SMALL
 ) -> Headset:
-    """A headset that has opened the scene, with these settings, and of this size; ``wanted``: where a token is."""
+    """A headset that has opened the scene, with these settings, and of this size, `UNDRAWN` for who looks at no pixel;
+    ``wanted``: where a token is."""
     context = await (await site.chromium(*WEBGL)).new_context(viewport={"width": 640, "height": 420})
     await context.add_init_script(path=IWER)
     await context.add_init_script(script=size)

@@ -20,7 +20,7 @@ pytest.importorskip("rclpy")
 
 from tests.page.conftest import HELD, ROBOT, Act, Site
 from tests.page.driving import Heard, drives, heard_at, within
-from tests.page.headsets import WEBGL, by_grip, headset_at, needs_headset
+from tests.page.headsets import UNDRAWN, WEBGL, by_grip, headset_at, needs_headset
 from tests.support.browser import OFFLINE, Watched, browser, needs_browser
 from tests.support.waiting import until
 
@@ -58,7 +58,7 @@ async def at_the_pad(site: Site) -> Place:
 
 
 async def in_the_scene(site: Site) -> Place:
-    headset = await headset_at(site, settings={"cameras": []})
+    headset = await headset_at(site, settings={"cameras": []}, size=UNDRAWN)
     await headset.ready(pictures=False)
     await headset.enter()
     take, let_go = by_grip(headset)

@@ -16,7 +16,7 @@ pytest.importorskip("rclpy")
 
 from tests.page.conftest import Site
 from tests.page.driving import heard_at
-from tests.page.headsets import PATIENT_ROBOT, PICTURES, Pictures, by_grip, headset_at, needs_headset
+from tests.page.headsets import PATIENT_ROBOT, PICTURES, UNDRAWN, Pictures, by_grip, headset_at, needs_headset
 from tests.support.browser import needs_browser
 from tests.support.waiting import until
 
@@ -85,7 +85,7 @@ async def test_who_wears_it_no_more_has_let_go(site: Site) -> None:
     """Taken off, its menu opened, hung, the robot given up, XR left: each ends with a zero, and nothing drives that
     was not taken hold of anew."""
     async with heard_at(site) as heard:
-        headset = await headset_at(site, settings={"cameras": []})
+        headset = await headset_at(site, settings={"cameras": []}, size=UNDRAWN)
         await headset.ready(pictures=False)
         await headset.enter()
         take, let_go = by_grip(headset)
@@ -115,7 +115,7 @@ async def test_who_wears_it_no_more_has_let_go(site: Site) -> None:
 async def test_a_page_that_nobody_sees_has_let_go(site: Site) -> None:
     """The same on a screen: driven by keys, and the page is hidden, or the window loses the focus."""
     async with heard_at(site) as heard:
-        headset = await headset_at(site, settings={"cameras": []})
+        headset = await headset_at(site, settings={"cameras": []}, size=UNDRAWN)
         await headset.ready(pictures=False)
         keys = headset.page.keyboard
         for name, away, back in (
@@ -137,7 +137,7 @@ async def test_a_page_that_nobody_sees_has_let_go(site: Site) -> None:
 async def test_a_gateway_that_stands_still_gets_no_more(site: Site) -> None:
     """Nothing goes into a network that does not answer, and when it does, the robot is told to stand."""
     async with heard_at(site) as heard:
-        headset = await headset_at(site, settings={"cameras": []})
+        headset = await headset_at(site, settings={"cameras": []}, size=UNDRAWN)
         await headset.ready(pictures=False)
         await headset.enter()
         take, let_go = by_grip(headset)

@@ -18,7 +18,7 @@ from sensor_msgs.msg import Joy
 
 from tests.page.conftest import ROBOT, Site
 from tests.page.driving import Heard, heard_at
-from tests.page.headsets import PATIENT_ROBOT, Headset, about_up, headset_at, needs_headset
+from tests.page.headsets import PATIENT_ROBOT, UNDRAWN, Headset, about_up, headset_at, needs_headset
 from tests.support.browser import needs_browser
 from tests.support.ros_peer import Peer
 from tests.support.waiting import until
@@ -133,7 +133,7 @@ async def test_poses_come_in_ros_axes(site: Site) -> None:
         rights = await peer.subscription(PoseStamped, "/xr/right", 100)
         hands = await peer.subscription(PoseArray, "/xr/right/hand", 100)
         joys = await peer.subscription(Joy, "/xr/joy", 100)
-        headset = await headset_at(site, settings=POSES)
+        headset = await headset_at(site, settings=POSES, size=UNDRAWN)
         await headset.ready()
         await headset.enter()
         print(await headset.value("JSON.stringify([macsXr.telling.last, macsXr.telling.state, [...macsXr.wanted]])"))

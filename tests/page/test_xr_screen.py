@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("rclpy")  # the kit has a camera, which is a ROS node
 
 from tests.page.conftest import Gate
-from tests.page.headsets import headset_at, needs_headset
+from tests.page.headsets import UNDRAWN, headset_at, needs_headset
 from tests.support.browser import needs_browser
 from tests.support.waiting import until
 
@@ -27,7 +27,7 @@ const before = macsXr.frames;
 
 async def test_the_settings_leave_the_stop(gate: Gate) -> None:
     """While they are open nobody drives, and the stop is pressed by its button and by Escape, which closes them."""
-    headset = await headset_at(gate)
+    headset = await headset_at(gate, size=UNDRAWN)
     await until(lambda: headset.value("Boolean(window.macsXr)"))
     page, opened = headset.page, "document.querySelector('#settings').open"
     for stop in (partial(page.click, "#stop", timeout=5000), partial(page.press, "#setting-forward", "Escape")):
@@ -46,7 +46,7 @@ async def test_the_settings_leave_the_stop(gate: Gate) -> None:
 async def test_what_is_not_drawn_is_not_shown(gate: Gate) -> None:
     """The browser takes the graphics away, or drawing fails: nobody drives, no picture counts as shown, and it is so
     until it is drawn again."""
-    headset = await headset_at(gate)
+    headset = await headset_at(gate, size=UNDRAWN)
     headset.watched.allowed.append(re.compile("Context Lost|fails"))
     await until(lambda: headset.value("Boolean(window.macsXr)"))
     ways = {
@@ -83,7 +83,7 @@ FAILS = "macsXr.stage.render = () => { throw new Error('it fails') }, 0"
 
 async def test_what_hands_do_goes_out_before_the_frame_is_drawn(gate: Gate) -> None:
     """Nobody waits for the drawing to drive; and when a frame was not drawn, the next one says nothing of hands."""
-    headset = await headset_at(gate)
+    headset = await headset_at(gate, size=UNDRAWN)
     await until(lambda: headset.value("Boolean(window.macsXr)"))
     await headset.frame(3)
     await headset.value(ORDER)
@@ -104,7 +104,7 @@ UNHEARD = "document.querySelector('#stop-status').textContent.startsWith('THE ST
 async def test_a_press_that_nobody_hears_of_is_kept_and_said(gate: Gate) -> None:
     """The worker of commands is gone: the press is written down at once, an alarm says so, and the
     page that is loaded then goes on with it."""
-    headset = await headset_at(gate)
+    headset = await headset_at(gate, size=UNDRAWN)
     await until(lambda: headset.value("Boolean(window.macsXr)"))
     await until(lambda: headset.state("connected"))
     await headset.value("macsXr.links.commands.terminate()")

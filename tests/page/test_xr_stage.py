@@ -8,7 +8,7 @@ pytest.importorskip("rclpy")  # the kit has a camera, which is a ROS node
 
 from bridge.page.routes import POLICY
 from tests.page.conftest import Gate
-from tests.page.headsets import headset_at, needs_headset
+from tests.page.headsets import UNDRAWN, headset_at, needs_headset
 from tests.support.browser import AXE, needs_browser
 from tests.support.waiting import until
 
@@ -150,7 +150,7 @@ async def test_the_world_is_drawn_on_the_table(gate: Gate) -> None:
 
 async def test_who_may_is_asked_and_nothing_is_from_elsewhere(gate: Gate) -> None:
     """Where a token is wanted the scene asks for it, and offers what it permits; its policy is the page's."""
-    headset = await headset_at(gate, wanted=True)
+    headset = await headset_at(gate, wanted=True, size=UNDRAWN)
     await headset.page.fill("#token", gate.secret)
     await headset.page.click("button[type=submit]")
     await headset.page.wait_for_selector("#scene")
