@@ -93,7 +93,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()  # what is there stays, and no collection looks at it again
-    gc.enable()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop() -> None:
+    gc.enable()  # also in who hands tests out to workers, and collects none
 
 
 @pytest.hookimpl(optionalhook=True)
