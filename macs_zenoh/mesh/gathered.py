@@ -7,9 +7,12 @@ everybody who watches: 170 us of this process, against 60 where twenty are decla
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable
 
 from .declared import Token
+
+log = logging.getLogger("macs.mesh")
 
 GATHER_S = 0.01
 """So long after one was declared others wait, for those that come behind them."""
@@ -40,8 +43,12 @@ class GatheredTokens:
         """Declare those that wait."""
         waiting, self._waiting = self._waiting, []
         for token, key in waiting:
-            if token.is_open:
+            if not token.is_open:
+                continue
+            try:
                 token.become(self._declare(key))
+            except Exception:  # one that cannot be declared must not cost others theirs, nor what one of them says
+                log.exception("%s cannot be declared", key)
 
     def close(self) -> None:
         """Declare nothing any more."""

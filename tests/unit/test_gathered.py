@@ -62,3 +62,26 @@ async def test_who_is_gone_before_is_never_declared(monkeypatch: pytest.MonkeyPa
     first.close()
     assert zenoh.now == []
     tokens.close()
+
+
+async def test_one_that_cannot_be_declared_costs_itself(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is logged, and those behind it are there."""
+    monkeypatch.setattr(gathered, "GATHER_S", 60.0)
+    zenoh = Declared()
+
+    def declare(key: str) -> Token:
+        if key == "b":
+            raise RuntimeError("no")
+        return zenoh.declare(key)
+
+    tokens = GatheredTokens(declare)
+    kept = [tokens.declare(key) for key in "abc"]
+    tokens.declare_now()
+    assert zenoh.now == ["a", "c"]
+    assert "b cannot be declared" in caplog.text
+    for token in kept:
+        token.close()
+    assert zenoh.now == []
+    tokens.close()
