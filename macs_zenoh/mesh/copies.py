@@ -23,7 +23,10 @@ MOST_BYTES = 32 << 20
 BESIDES = 64 << 10
 """So much larger is the place than what is copied to it: it has a head, and ends with a page."""
 PAGE = 4096
-CALM_S = 0.5
+KEPT_BYTES = 128 << 10
+"""Of a piece of each thread's heap that is freed to have the C library give back that heap's end: `malloc_trim` gives
+back what is free in between, and the end of the main heap alone."""
+CALM_S = 0.2
 """So long after the last large copy its place is given back: whoever frees one would do so with Python's lock."""
 
 
@@ -49,8 +52,12 @@ class _Heap:
         self._free.argtypes = (ctypes.c_void_p,)
         self._advise = without.madvise
         self._advise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
+        self._give = without.free
+        self._give.argtypes = (ctypes.c_void_p,)
         self._trim = without.malloc_trim
         self._trim.argtypes = (ctypes.c_size_t,)
+        self._kept: dict[int, int] = {}
+        """Such pieces by thread."""
         self._lock = threading.Lock()
         self._used_at = 0.0
         self._gives_back = False
@@ -62,6 +69,7 @@ class _Heap:
         """Within it, this thread's next piece of so many bytes is ready to be written to."""
         with self._lock:
             try:
+                self._keep()
                 if self._set(_M_MMAP_THRESHOLD, MOST_BYTES) and self._set(_M_TRIM_THRESHOLD, 4 * MOST_BYTES):
                     self._make_ready(size + BESIDES)
                 yield
@@ -74,13 +82,23 @@ class _Heap:
 
     def _give_back(self) -> None:
         """Once nothing large has come for a while, let the kernel have what is free."""
-        while True:
+        while self._gives_back:
             time.sleep(CALM_S)
             with self._lock:
-                if time.monotonic() >= self._used_at + CALM_S:
-                    self._gives_back = False
-                    break
-        self._trim(0)
+                if time.monotonic() < self._used_at + CALM_S:
+                    continue
+                kept, self._kept = self._kept, {}
+                self._set(_M_TRIM_THRESHOLD, KEPT_BYTES)
+                for piece in kept.values():
+                    self._give(piece)
+                self._trim(0)
+                self._hold()
+                self._gives_back = False
+
+    def _keep(self) -> None:
+        thread = threading.get_ident()
+        if thread not in self._kept and (piece := self._take(KEPT_BYTES)):
+            self._kept[thread] = piece
 
     def _hold(self) -> None:
         self._set(_M_MMAP_THRESHOLD, self.mapped_bytes)
