@@ -11,6 +11,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from bridge.recording.bag import Bag
@@ -28,6 +29,9 @@ from macs_zenoh.protocol.robot_state import RobotStatus
 from macs_zenoh.topics import TopicPublisher
 
 log = logging.getLogger("macs.replay")
+
+JUDGED_S = 2.0
+"""So long the robot's answer is waited for at the end; existing robot programs give none."""
 
 LATE_S = 0.2
 """A command that is later than this is left out: the program was stopped, or had other work."""
@@ -131,6 +135,12 @@ class Commands:
             self.sent += 1
         except Closed:
             log.debug("a command came after the end")
+
+    async def judged(self, agent: Agent) -> None:
+        """Wait until the robot has seen to the last command: it answers what is asked behind it. To deregister at once
+        could end the node before, and a refusal would come when nobody listens."""
+        with suppress(MacsError):
+            await agent.call(ROS, self.robot, "status", timeout_s=JUDGED_S)
 
     def _refused(self, _robot: int, reason: str) -> None:
         self.refused[reason] = self.refused.get(reason, 0) + 1

@@ -233,6 +233,7 @@ async def _commands(
 
             player = await _played(order.timeline(commands.wants), play, commands.ended, LATE_S)
             await agent.drain()
+            await commands.judged(agent)
         finally:
             commands.close()
     return Played(commands.sent, player.late(0.99), commands.refused, left_out=player.left_out + commands.late)

@@ -275,9 +275,14 @@ async def test_commands_go_only_to_a_robot_that_was_named_twice(
         )
         assert code == 0, errors
         assert "10 messages" in out
-        speeds = [(await get(driven)).linear.x]
-        while speeds[-1] != 9.0:
-            speeds.append((await get(driven)).linear.x)
+        speeds: list[float] = []
+
+        def are_all() -> bool:
+            while not driven.empty():
+                speeds.append(driven.get_nowait().linear.x)
+            return speeds[-1:] == [9.0]
+
+        await until(are_all)
         assert speeds == [float(number) for number in range(10)][-len(speeds) :]
         assert len(speeds) > 7  # the first may come before ROS has found the subscription
 
