@@ -102,6 +102,11 @@ const parts = {
     assert.ok(slow.length > 30, `who reads hands seldom says again what they did: ${slow}`);
     const first = slow.filter((age, at) => at === 0 || age < slow[at - 1]);
     assert.ok(first.length >= 9 && first.every((age) => age <= 34), `and what they do now when the next is due: ${slow}`);
+    driver.limits = { ...driver.limits, hz: 5 };
+    driven(500, 14);
+    while (!driven(14, 14).length); // one has just been sent: the next is due in 0.2 s
+    driver.limits = { ...driver.limits, hz: 90 };
+    assert.ok(driven(28, 14).length, "who is set to send more often does so at once");
   },
 
   async hold() {

@@ -169,7 +169,13 @@ export class Driver {
 
   /** Whether a command is due, or will be before hands are read again: what they do now is sent now, not when it is older. */
   #isDue(now) {
+    if (this.#dueAt > now + 1.5 * this.#period) this.#dueAt = now; // they have just been set to be more frequent
     return now >= this.#dueAt - Math.max(2, this.#everyMs / 2);
+  }
+
+  /** Of commands, in ms. */
+  get #period() {
+    return 1000 / this.limits.hz;
   }
 
   /** Where hands are read again at about that time, that is sent; what they did last is said once more where they are not. */
@@ -193,8 +199,7 @@ export class Driver {
     const { type, shape, node, robots, groups } = this.#aimed;
     if (node.lastMadeAt > this.#madeAt) return; // a zero, say, is younger: what is held still is read again soon
     const [x, z] = [forward * this.limits.forward, turn * this.limits.turn];
-    const period = 1000 / this.limits.hz;
-    this.#dueAt = Math.max(this.#dueAt, now - period / 2) + period;
+    this.#dueAt = Math.max(this.#dueAt, now - this.#period / 2) + this.#period;
     const message = type.write(shape({ x }, { z }, wallTime(this.#madeAt)));
     if (!this.isFresh(now) || !node.publish(message, { robots, groups, madeAt: this.#madeAt })) {
       this.release("the connection is not fresh");
