@@ -76,9 +76,16 @@ class _Heap:
             finally:
                 self._hold()
                 self._used_at = time.monotonic()
-                if not self._gives_back:
-                    self._gives_back = True
-                    threading.Thread(target=self._give_back, name="macs-heap", daemon=True).start()
+                self._give_back_later()
+
+    def _give_back_later(self) -> None:
+        if self._gives_back:
+            return
+        self._gives_back = True
+        try:
+            threading.Thread(target=self._give_back, name="macs-heap", daemon=True).start()
+        except RuntimeError:  # there may be no more threads, or the interpreter ends: the next large copy tries again
+            self._gives_back = False
 
     def _give_back(self) -> None:
         """Once nothing large has come for a while, let the kernel have what is free."""

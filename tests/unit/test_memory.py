@@ -90,3 +90,40 @@ def test_who_copies_a_large_payload_waits_for_no_page() -> None:
     assert alone > 5000  # so that there is something to spare
     assert most < 200
     assert kept <= 4 << 20
+
+
+NO_THREAD = """
+import threading
+from bridge import memory
+from macs_zenoh.mesh.copies import copied
+
+
+class Payload(bytearray):
+    def to_bytes(self):
+        return bytes(self)
+
+
+def none(thread):
+    raise RuntimeError("can't start new thread")
+
+
+def waiting():
+    return [each.name for each in threading.enumerate()].count("macs-heap")
+
+
+memory.give_back()
+payload, start = Payload(20 << 20), threading.Thread.start
+threading.Thread.start = none
+print(len(copied(payload)), waiting())
+threading.Thread.start = start
+print(len(copied(payload)), waiting())
+"""
+
+
+def test_a_large_payload_comes_where_there_is_no_thread_to_be_had() -> None:
+    """It is copied all the same, and what it took is given back behind a later one."""
+    printed = subprocess.run([sys.executable, "-c", NO_THREAD], capture_output=True, text=True, check=True).stdout
+    assert printed.splitlines()[0].split() == [str(20 << 20), "0"]
+    assert printed.splitlines()[1].split()[0] == str(20 << 20)
+    if platform.libc_ver()[0] == "glibc":
+        assert printed.splitlines()[1].split()[1] == "1"
