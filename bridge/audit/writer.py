@@ -165,8 +165,9 @@ class AuditFile:
         """Write notes as lines, as many as the file may take; how many. Raises OSError, and none is written then."""
         try:
             self._look()
-            if self._size >= self._max_bytes:
+            while self._size >= self._max_bytes:
                 self._rotate()
+                self._look()  # who waited for the old file may have begun the new one, or have filled it
             link, lines, count = self._go_on(batch, lost)
             data = b"".join(lines)
             before = self._size
@@ -253,13 +254,12 @@ class AuditFile:
             self._link = last_link(_tail_of(older[-1]))
 
     def _rotate(self) -> None:
-        """Begin a new file; the chain goes on in it."""
+        """Begin a new file; the chain goes on in it. Without a lock, then."""
         older = self.older()
         number = int(older[-1].suffix[1:]) + 1 if older else 1
         os.fdatasync(self._fd)
         self._path.rename(self._path.with_name(f"{self._path.name}.{number:06}"))
         self._open()
-        fcntl.flock(self._fd, fcntl.LOCK_EX)
         self._size = 0
         for old in self.older()[: -self._keep]:
             old.unlink(missing_ok=True)

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -180,6 +181,34 @@ async def test_several_programs_write_one_record(tmp_path: Path) -> None:
     assert code == 0, said["findings"][:5]
     assert (said["lines"], kinds(said)) == (3 * 502, [])
     assert {line["program"] for line in lines_of(path)} == {"p0", "p1", "p2"}
+
+
+@pytest.mark.parametrize("meanwhile", [1, 40])
+async def test_who_begins_a_file_goes_on_from_what_others_wrote_in_it(tmp_path: Path, meanwhile: int) -> None:
+    """Another program has waited for the old file: it is the first to write in the new one, and may fill that."""
+    path, begun = tmp_path / "audit.jsonl", 0
+    one, other = (AuditFile(path, program, max_bytes=4096) for program in ("one", "other"))
+    begin = one._open
+
+    def begin_late() -> None:
+        nonlocal begun
+        begin()
+        begun += 1
+        if begun == 1:
+            for number in range(meanwhile):
+                other.record("joined", who(f"unity/{number}"), "x" * 100)
+            while other._notes:
+                time.sleep(0.001)
+
+    one._open = begin_late  # type: ignore[method-assign]
+    for number in range(60):
+        one.record("joined", who(f"unity/{number}"), "y" * 100)
+    await until(lambda: not one._notes and not other._notes)
+    one.close()
+    other.close()
+    assert begun
+    code, said = await verified(path)
+    assert (code, said["lines"]) == (0, 60 + meanwhile + 4), said["findings"][:5]
 
 
 async def test_only_so_many_files_are_kept(tmp_path: Path) -> None:
