@@ -16,7 +16,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from bridge.security.headset_ways import own_addresses, own_names, ways
-from tests.support.browser import SCREENSHOTS, browser, needs_browser
+from tests.support.browser import SCREENSHOTS, browser, chromium, needs_browser
 from tests.support.programs import Program, ended, free_port, macs
 from tests.support.routers import Router
 
@@ -83,6 +83,7 @@ def answer(context: ssl.SSLContext, host: str, port: int) -> bytes:
 
 
 @needs_browser
+@pytest.mark.skipif(chromium(whole=True) is None, reason="the warning is the browser's own: apt-get install chromium")
 async def test_chromium_takes_them_for_secure(tmp_path: Path) -> None:
     """Each address that is said to be secure is, where the authority is trusted, and WebXR is there. One without TLS
     is not. Who does not trust it sees the browser's warning, of which a picture is kept, and a
@@ -106,7 +107,7 @@ async def test_chromium_takes_them_for_secure(tmp_path: Path) -> None:
             page = await chromium.new_page()
             await page.goto(f"http://localhost:{plain_port}/xr")
             assert await page.evaluate("[isSecureContext, 'xr' in navigator]") == [True, True]
-        async with browser(here) as chromium:
+        async with browser(here, whole=True) as chromium:
             page = await chromium.new_page()
             with pytest.raises(Exception, match="ERR_CERT_AUTHORITY_INVALID"):
                 await page.goto(f"https://{HOSTS[1]}:{port}/xr")

@@ -23,8 +23,9 @@ SCREENSHOTS = ROOT / "build" / "screenshots"
 
 OFFLINE = re.compile(r"net::ERR_|WebSocket connection to .* failed|Failed to load resource")
 """What a browser says by itself of a gateway that is away."""
-CHROMIUM = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-"""The first is the same without windows, and takes little more than half of the processor's time."""
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
+SHELL = "chromium-headless-shell"
+"""The same without windows and what a browser says by itself, for little more than half of the processor's time."""
 ARGUMENTS = ("--no-sandbox", "--disable-background-networking", "--disable-component-update", "--no-first-run")
 
 
@@ -38,9 +39,9 @@ def node() -> list[str] | None:
     return None if found is None else [found, "--experimental-websocket"]
 
 
-def chromium() -> str | None:
-    """Where Chromium is."""
-    return next((found for name in CHROMIUM if (found := shutil.which(name))), None)
+def chromium(*, whole: bool = False) -> str | None:
+    """Where Chromium is; the `whole` of it, or what is enough for a page."""
+    return next((found for name in (CHROMIUM if whole else (SHELL, *CHROMIUM)) if (found := shutil.which(name))), None)
 
 
 def missing() -> str:
@@ -90,12 +91,12 @@ class Watched:
 
 
 @asynccontextmanager
-async def browser(*arguments: str) -> AsyncIterator[Browser]:
-    """A Chromium with nothing in its cache, started with these arguments as well."""
+async def browser(*arguments: str, whole: bool = False) -> AsyncIterator[Browser]:
+    """A Chromium with nothing in its cache, started with these arguments as well; `whole`: with its own pages too."""
     from playwright.async_api import async_playwright
 
     async with async_playwright() as playwright:
-        opened = await playwright.chromium.launch(executable_path=chromium(), args=[*ARGUMENTS, *arguments])
+        opened = await playwright.chromium.launch(executable_path=chromium(whole=whole), args=[*ARGUMENTS, *arguments])
         try:
             yield opened
         finally:
