@@ -24,7 +24,7 @@ from macs_zenoh.protocol.tcp_agent import Sent, Streamed
 
 from .afar import Afar
 from .agents import Agents
-from .backpressure import Backpressure
+from .backpressure import ROBOT_HOLD_S, Backpressure
 from .connection import Connection
 from .judged import JudgedFrames, Read
 from .latest import Latest
@@ -80,6 +80,9 @@ class Forwarding:
         """Who is not read from for having flooded, and until when."""
         self._backpressure = Backpressure()
         mesh.on_room(self._backpressure.release)
+        self._streams = Backpressure()
+        """Of robot programs whose large topic data waits."""
+        mesh.streams.on_room(self._streams.release)
 
     def enter(self, connection: Connection) -> None:
         """A connection has an id."""
@@ -169,6 +172,8 @@ class Forwarding:
             return
         if self._slowed and connection in self._slowed:
             self.afar.has_read(connection)
+        if self._mesh.streams.backlogged and connection.peer.agent_type == ROS:
+            self._streams.hold(connection, self._mesh.streams.sent, ROBOT_HOLD_S)
         if self._mesh.backlogged:
             self._backpressure.hold(connection, self._mesh.backlog_sent)
 
@@ -211,7 +216,10 @@ class Forwarding:
         mesh = self._mesh
         before = mesh.looped
         for key in keys:
-            mesh.put(key, payload, traffic)
+            if traffic is STREAM:
+                mesh.streams.put(key, payload)
+            else:
+                mesh.put(key, payload, traffic)
         copies = mesh.looped - before
         if copies:
             if read is not None:

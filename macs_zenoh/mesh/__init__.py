@@ -6,11 +6,12 @@ a caller passes in (callbacks, handlers) runs on the loop that opened the mesh, 
 Zenoh calls back in its own threads, instead of through a queue and a thread of each subscription's own: one thread
 switch less is what a single message feels, and one queue of ours keeps the order between subscriptions.
 
-`session` is the mesh, `opening` how its session of Zenoh is opened; `outgoing` what is put, `arrivals` what comes,
-`calls` what is asked and served, `reliable` what is asked for again; `tracing` what is noted of messages on their way,
-`link_log` what the log says of links; `declared` the words that all of them use, `gathered` tokens that are
-declared together, `zenoh_config` Zenoh's configuration,
-`threads` how Zenoh and Python share a processor. `ros_network` is a session on which our programs are ROS nodes.
+`session` is the mesh, `opening` how its session of Zenoh is opened; `outgoing` what is put, `sender` what of it is
+left to a thread, `streams` topic data of others; `arrivals` what comes, `copies` what is large of it; `calls` what is
+asked and served, `reliable` what is asked for again; `tracing` what is noted of messages on their way, `link_log` what
+the log says of links; `declared` the words that all of them use, `gathered` tokens that are declared together,
+`zenoh_config` Zenoh's configuration, `threads` how Zenoh and Python share a processor. `ros_network` is a session on
+which our programs are ROS nodes.
 """
 
 from .arrivals import now_s

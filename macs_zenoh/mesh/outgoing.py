@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections import Counter, OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -25,6 +25,8 @@ from .declared import Outlet, Payload, Traffic
 from .heartbeat import Counted, Heartbeats
 from .loopback import Loopback
 from .panics import call, unwatched
+from .sender import LARGE_BYTES, Sender, is_large
+from .streams import Streams
 from .tracing import Marked, Tracing
 
 log = logging.getLogger("macs.mesh")
@@ -68,8 +70,7 @@ class Outgoing:
     """Everything that one session puts. ``drops`` is the mesh's; ``linked`` is kept by it."""
 
     PUBLISHERS = 4096
-    LARGE_BYTES = 128 << 10
-    """Larger ones are given to Zenoh by a thread: on a slow link that takes long."""
+    LARGE_BYTES = LARGE_BYTES
     COMMANDS_BYTES = 32 << 20
     """So much of large commands may wait for it, and small ones behind them until it is twice as much."""
     COMMANDS_S = 0.5
@@ -125,6 +126,7 @@ class Outgoing:
         self._commands = Sender(self.COMMANDS_BYTES, loopback.put, lambda: None, drops, late, self.COMMANDS_S)
         """For large commands put on the loop, and what follows them with their keys: Zenoh waits for room for their
         fragments (``fragment_wait_ms``)."""
+        self.streams = Streams(self, loopback, drops, from_thread)
         self._loop_thread = threading.get_ident()
         self._heartbeats = Heartbeats(self.HEARTBEAT_S)
 
@@ -137,6 +139,7 @@ class Outgoing:
         """Send what is queued, for at most so long."""
         self._sender.close(timeout_s)
         self._commands.close(timeout_s)
+        self.streams.close(timeout_s)
         self._heartbeats.close(timeout_s)
 
     def undeclare(self) -> None:
@@ -166,6 +169,21 @@ class Outgoing:
             self._loopback.put(publisher, payload)
         else:  # one publisher numbers them all
             self._put_later(publisher, payload)
+
+    def put_by(self, sender: Sender, key: str, payload: Payload, traffic: Traffic) -> bool:
+        """Give it to our own subscriptions now, and leave it to a sender if others listen. False: it keeps messages
+        for those that miss some, and one publisher numbers them."""
+        _, shape, kept = self._outlets[traffic].get(key) or self._declare(key, traffic)
+        if kept:
+            return False
+        if shape is None or self._passes(shape, len(payload)):
+            if not self.linked:
+                self.drops["no_route"] += 1
+            apart = self._apart.get(key) or self._declare_apart(key, len(payload), traffic)
+            self._loopback.put_here(apart.here, payload)
+            if self._may_listen(apart) and not sender.put(apart.away, payload, key):
+                self.drops["backlog"] += 1
+        return True
 
     def put_unasked(self, key: str, payload: Payload) -> None:
         """`Mesh.put_unasked`."""
@@ -232,7 +250,7 @@ class Outgoing:
 
     def when_sent(self, callback: Callable[[], None]) -> None:
         """Call ``callback``, from any thread, when Zenoh has all that was put before."""
-        self._sender.when_sent(lambda: self._commands.when_sent(callback))
+        self._sender.when_sent(lambda: self._commands.when_sent(lambda: self.streams.when_sent(callback)))
 
     def _late(self) -> None:
         self.drops["backlog"] += 1
@@ -253,19 +271,24 @@ class Outgoing:
 
     def _is_for_thread(self, key: str, payload: Payload) -> bool:
         """Whether a command is left to a thread, since it may take long or would overtake one that does."""
-        large = _is_large(payload) and threading.get_ident() == self._loop_thread
+        large = is_large(payload) and threading.get_ident() == self._loop_thread
         return large or self._commands.has(key)
 
     def _put_large(self, key: str, publisher: Outlet, payload: Payload) -> None:
         """Our own subscriptions get the payload as it is, now; Zenoh copies it for others, if any listen."""
-        apart = self._apart.get(key) or self._declare_apart(key, len(payload))
-        if time.monotonic() > apart.settled_at and not apart.away.matching_status.matching:  # type: ignore[attr-defined]
+        apart = self._apart.get(key) or self._declare_apart(key, len(payload), CALL)
+        if not self._may_listen(apart):
             self._loopback.put_here(apart.here, payload)
         elif self._is_quick(payload):
             self._loopback.put(publisher, payload)
         else:
             self._loopback.put_here(apart.here, payload)
             self._put_later(apart.away, payload)
+
+    @staticmethod
+    def _may_listen(apart: _Apart) -> bool:
+        """Whether others may listen."""
+        return time.monotonic() <= apart.settled_at or apart.away.matching_status.matching  # type: ignore[attr-defined]
 
     def _put_later(self, publisher: Outlet, payload: Payload) -> None:
         if not self._sender.put(publisher, payload):
@@ -343,14 +366,14 @@ class Outgoing:
         self._heartbeats.add(counted)
         return counted
 
-    def _declare_apart(self, key: str, size: int) -> _Apart:
+    def _declare_apart(self, key: str, size: int, traffic: Traffic) -> _Apart:
         places = (zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE)
         with self._outlets_lock:
-            fresh = size <= self.LARGE_BYTES and self._is_fresh(key, Traffic.CALL, apart=True)
+            fresh = size <= self.LARGE_BYTES and self._is_fresh(key, traffic, apart=True)
             if fresh or not self._declared.may(sender_of(key), key):
-                bare = [self._bare(key, Traffic.CALL, place) for place in places]
+                bare = [self._bare(key, traffic, place) for place in places]
                 return _Apart(bare[0], bare[1], math.inf)
-        priority, congestion, express = self.way(key, Traffic.CALL)
+        priority, congestion, express = self.way(key, traffic)
         here, away = (
             self._session.declare_publisher(
                 key, priority=priority, congestion_control=congestion, express=express, allowed_destination=where
@@ -362,126 +385,3 @@ class Outgoing:
             if len(self._apart) > self.PUBLISHERS:
                 self._apart.popitem(last=False)
         return apart
-
-
-class Sender:
-    """A thread that puts what may take long, in order. It starts with the first such payload.
-
-    So long as ``most_s`` a large payload may wait while others wait behind it; then it is not put, and ``on_late``
-    called. One that cannot be put, for a reason that nobody thought of, costs itself (``failed`` in ``drops``).
-    """
-
-    def __init__(
-        self,
-        limit_bytes: int,
-        put: Callable[[Outlet, Payload], None],
-        on_room: Callable[[], None],
-        drops: Losses,
-        on_late: Callable[[], None] = lambda: None,
-        most_s: float = math.inf,
-    ) -> None:
-        self._drops = drops
-        self._most_s = most_s
-        self._on_late = on_late
-        self._put = put
-        self.backlogged = False
-        self.sent = 0
-        self._limit_bytes = limit_bytes
-        self._on_room = on_room
-        self._bytes = 0
-        self._queue: deque[tuple[Outlet, Payload, str, float] | Callable[[], None]] = deque()
-        """What is to be put, and who is to be told that all before it has been."""
-        self._keys: Counter[str] = Counter()
-        """How much waits of those that whoever puts has named."""
-        self._wake = threading.Condition()
-        self._thread: threading.Thread | None = None
-        self._closing = False
-
-    @property
-    def bytes(self) -> int:
-        """How much waits."""
-        return self._bytes
-
-    @property
-    def idle(self) -> bool:
-        """Nothing is waiting or being sent."""
-        return self._bytes == 0
-
-    def has(self, key: str) -> bool:
-        """Whether anything with this key is waiting or being sent."""
-        return key in self._keys
-
-    def put(self, publisher: Outlet, payload: Payload, key: str = "") -> bool:
-        """Queue it; False when that would be more than the limit (one payload may always wait), or than twice as much
-        of small ones with a ``key``, which is for `has`."""
-        limit = self._limit_bytes * (2 if key and not _is_large(payload) else 1)
-        with self._wake:
-            if self._closing or (self._bytes and self._bytes + len(payload) > limit):
-                return False
-            self._bytes += len(payload)
-            self.backlogged = self._bytes > self._limit_bytes // 4
-            self._queue.append((publisher, payload, key, time.monotonic()))
-            self._keys[key] += 1
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="macs-sender", daemon=True)
-                self._thread.start()
-            self._wake.notify()
-        return True
-
-    def when_sent(self, callback: Callable[[], None]) -> None:
-        """Call ``callback``, in any thread, when all that is queued now has been put."""
-        with self._wake:
-            if not self.idle:
-                self._queue.append(callback)
-                return
-        callback()
-
-    def close(self, timeout_s: float) -> None:
-        """Send what is queued, for at most ``timeout_s``, and end."""
-        with self._wake:
-            self._closing = True
-            self._wake.notify()
-        if self._thread is not None:
-            self._thread.join(timeout_s)
-
-    def _run(self) -> None:
-        while True:
-            with self._wake:
-                while not self._queue:
-                    if self._closing:
-                        return
-                    self._wake.wait()
-                entry = self._queue.popleft()
-            try:
-                self._handle(entry)
-            except Exception:  # noqa: BLE001 - it is logged
-                text = "what a thread was to put, or to tell, failed"
-                self._drops.once("failed", text, level=logging.ERROR, exc_info=True)
-            if not isinstance(entry, tuple):
-                continue
-            _, payload, key, _ = entry
-            with self._wake:
-                self.sent += 1
-                self._keys[key] -= 1
-                if not self._keys[key]:
-                    del self._keys[key]
-                self._bytes -= len(payload)
-                relieved = self.backlogged and self._bytes < self._limit_bytes // 8
-                if relieved:
-                    self.backlogged = False
-            if relieved:
-                self._on_room()
-
-    def _handle(self, entry: tuple[Outlet, Payload, str, float] | Callable[[], None]) -> None:
-        if not isinstance(entry, tuple):
-            entry()
-            return
-        publisher, payload, _, since = entry
-        if self._queue and _is_large(payload) and time.monotonic() - since > self._most_s:
-            self._on_late()
-        else:
-            self._put(publisher, payload)
-
-
-def _is_large(payload: Payload) -> bool:
-    return len(payload) > Outgoing.LARGE_BYTES

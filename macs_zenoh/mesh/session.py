@@ -33,6 +33,7 @@ from .opening import open_now, open_session
 from .outgoing import Outgoing
 from .panics import call, end_on_panics, last_words, watched
 from .reliable import Recovered
+from .streams import Streams
 from .token_news import TokenNews
 from .tracing import Tracing
 from .zenoh_config import check_files, first_line, id_is_chosen, insert, warn_of_lowered, zenoh_config
@@ -164,6 +165,11 @@ class Mesh:
     def backlogged(self) -> bool:
         """Whether so much waits to be sent that callers should slow down; `on_room` tells when it is over."""
         return self._outgoing.backlogged
+
+    @property
+    def streams(self) -> Streams:
+        """For topic data of others."""
+        return self._outgoing.streams
 
     @property
     def looped(self) -> int:

@@ -23,7 +23,9 @@ from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import MacsError, Refused
 from macs_zenoh.losses import Losses
 from macs_zenoh.mesh import Mesh, Sample, Traffic
-from macs_zenoh.mesh.outgoing import Outgoing, Sender
+from macs_zenoh.mesh.outgoing import Outgoing
+from macs_zenoh.mesh.sender import Sender
+from macs_zenoh.mesh.streams import Streams
 from macs_zenoh.protocol.keyexpr import PING, UNICAST
 from macs_zenoh.protocol.limits import CALL_BYTES
 from tests.support.local import patient
@@ -31,6 +33,7 @@ from tests.support.routers import Router
 from tests.support.waiting import PATIENCE_S, until
 
 KEY = "macs/to/unity/0/1/unity/2"
+TOPIC_KEY = "macs/from/ros/7/nd__x"
 LARGE = Mesh.LARGE_BYTES + 1
 NOBODY: Any = None
 
@@ -88,6 +91,39 @@ async def test_a_large_command_is_put_by_a_thread_and_what_follows_it_comes_behi
         await mesh.drain()
         await until(lambda: len(here) + mesh.drops["backlog"] == 80)
         assert mesh.drops["backlog"] > 0
+
+
+@pytest.mark.megabytes
+async def test_large_topic_data_of_others_is_put_by_a_thread(router: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the order of its key, with what follows it, while this program's own subscriptions get it at once. Who brings
+    it is told when it is too much and when it is not; of what is more than that each is dropped and counted."""
+    monkeypatch.setattr(Streams, "MOST_S", math.inf)
+    here: list[tuple[int, bytes]] = []
+    away: list[tuple[int, bytes]] = []
+    room = asyncio.Event()
+    async with (
+        await Mesh.open(patient(router)) as mesh,
+        await Mesh.open(patient(router)) as other,
+    ):
+        mesh.subscribe(TOPIC_KEY, keeper(here))
+        other.subscribe(TOPIC_KEY, keeper(away))
+        mesh.streams.on_room(room.set)
+        await until(lambda: (mesh.streams.put(TOPIC_KEY, b"begin"), away)[1])  # the routers know who listens
+        expected = [(len(payload), payload[-4:]) for payload in payloads(20)]
+        for payload in payloads(20):
+            mesh.streams.put(TOPIC_KEY, payload)
+            await asyncio.sleep(0.02)
+        await until(lambda: here[-20:] == expected and away[-20:] == expected)
+        assert not mesh.drops
+        assert mesh.streams.sent >= 10
+        before, backlogged = len(here), False
+        for payload in [bytes(2 << 20)] * 100:
+            mesh.streams.put(TOPIC_KEY, payload)
+            backlogged |= mesh.streams.backlogged
+        assert backlogged
+        await room.wait()
+        await until(lambda: len(here) == before + 100)
+        assert 0 < mesh.drops["backlog"] < 100
 
 
 def test_what_follows_large_commands_waits_no_longer_than_it_may() -> None:

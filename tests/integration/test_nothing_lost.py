@@ -245,13 +245,13 @@ async def test_a_receiver_elsewhere_that_has_stopped_stops_nobody(two_ports: tup
     await ended(send(sender, load))  # of more than all that may wait anywhere
 
 
-async def test_a_robot_program_that_streams_unpaced(port: int) -> None:
+@pytest.mark.parametrize(("size", "count", "bytes_per_s"), [(1 << 10, 20_000, 6e6), (1 << 20, 100, 40e6)])
+async def test_a_robot_program_that_streams_unpaced(port: int, size: int, count: int, bytes_per_s: float) -> None:
     """One headset that registered on a robot program gets every message of its topic, in order."""
     robot, receiver = Headset.join(port, 0, robot=True), Headset.join(port, 0)
     await registered(robot, [receiver])
-    count = 20_000
-    load = pieces(sequence.topic(robot.id, 1024, count, [receiver.id], TOPIC))
-    reading = Receiver(receiver, count, 6e6)
+    load = pieces(sequence.topic(robot.id, size, count, [receiver.id], TOPIC))
+    reading = Receiver(receiver, count, bytes_per_s)
     reading.start()
     await ended(send(robot, load), reading)
     assert [n for _, n in reading.numbers] == list(range(count))
