@@ -130,6 +130,8 @@ class Connection(asyncio.BufferedProtocol):
         """What is counted for it of a frame that has begun."""
         self._read_bytes = FIRST_READ_BYTES
         """How much is read at once: less, when little of it makes much work, more when much makes little."""
+        self._asked_at = 0.0
+        """When room for bytes was asked for last."""
         self._unread = 0
         """Of what waited in the socket when the agent's time had run out: how much is still to be read."""
         self._looked = False
@@ -199,10 +201,15 @@ class Connection(asyncio.BufferedProtocol):
         self._schedule()
 
     def get_buffer(self, sizehint: int) -> memoryview:
+        self._asked_at = time.monotonic()
         return self.peer.space()[: self._read_bytes]
 
     def buffer_updated(self, nbytes: int) -> None:
-        began = time.monotonic()
+        # from when it was asked for: what is small over TLS takes longer to decrypt, here and now, than to handle
+        self.handle(nbytes, self._asked_at)
+
+    def handle(self, nbytes: int, began: float) -> None:
+        """So many bytes have come, with which the loop has been busy since ``began``."""
         self._unread -= nbytes
         self.received_bytes += nbytes
         if (events := self.peer.advance(nbytes, began)) is not None:

@@ -150,7 +150,7 @@ class WebSocketTransport(asyncio.Transport):
         filled, self._filled = self._filled, 0
         self._space = None  # a view that is kept would keep a frame from growing
         if filled and self._connection is not None and self._gives:
-            self._connection.buffer_updated(filled)
+            self._connection.handle(filled, time.monotonic())
 
     @property
     def _gives(self) -> bool:

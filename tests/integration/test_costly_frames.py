@@ -225,3 +225,21 @@ async def test_a_frame_that_cannot_be_read_costs_no_other(
         assert busy.connections[0].all_drops() == {"failed": 3}
     (told,) = [record for record in caplog.records if record.exc_info]
     assert str(busy.connections[0]) in told.getMessage()
+
+
+async def test_to_decrypt_is_work_for_who_sends() -> None:
+    """What is small over TLS takes longer between the question for room and the data than behind it: as much less is
+    read at once as behind costly frames."""
+    busy = Busy()
+    async with two(busy):
+        connection = busy.connections[0]
+        await until(lambda: connection.peer.state is State.ONLINE)
+        room = connection.get_buffer(-1)
+        before, data = len(room), said("a")
+        until_s = time.monotonic() + 4 * TURN_S
+        while time.monotonic() < until_s:
+            pass
+        room[: len(data)] = data
+        connection.buffer_updated(len(data))
+        assert busy.did == [(connection.agent_id, "a")]
+        assert len(connection.get_buffer(-1)) <= before // 3
