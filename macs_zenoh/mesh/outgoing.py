@@ -126,7 +126,7 @@ class Outgoing:
         self._commands = Sender(self.COMMANDS_BYTES, loopback.put, lambda: None, drops, late, self.COMMANDS_S)
         """For large commands put on the loop, and what follows them with their keys: Zenoh waits for room for their
         fragments (``fragment_wait_ms``)."""
-        self.streams = Streams(self, loopback, drops, from_thread)
+        self.streams = Streams(self, loopback, drops, from_thread, late)
         self._loop_thread = threading.get_ident()
         self._heartbeats = Heartbeats(self.HEARTBEAT_S)
 

@@ -31,12 +31,12 @@ class Streams:
         loopback: Loopback,
         drops: Losses,
         from_thread: Callable[[Callable[[], None]], None],
+        on_late: Callable[[], None],
     ) -> None:
         self._outgoing = outgoing
-        self._drops = drops
         self._on_room: Callbacks[Callable[[], None]] = Callbacks()
-        room, late = partial(from_thread, self._room), partial(from_thread, self._late)
-        self._sender = Sender(self.MOST_BYTES, loopback.put, room, drops, late, self.MOST_S)
+        room = partial(from_thread, self._room)
+        self._sender = Sender(self.MOST_BYTES, loopback.put, room, drops, on_late, self.MOST_S)
 
     def put(self, key: str, payload: Payload) -> None:
         """Publish. On the loop."""
@@ -69,6 +69,3 @@ class Streams:
     def _room(self) -> None:
         for callback in self._on_room:
             callback()
-
-    def _late(self) -> None:
-        self._drops["backlog"] += 1
