@@ -201,6 +201,7 @@ async def _be_gateway(settings: Settings, now: list[Gateway]) -> int:
 
     _raise_descriptor_limit()
     memory.give_back()
+    running.switch_soon()
     memory.collect_seldom()
     if settings.mesh.mode == "router":
         _judge_router(settings.mesh)

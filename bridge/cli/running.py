@@ -39,12 +39,13 @@ for a confirmation."""
 
 
 SWITCH_S = 0.001
-"""So soon Python's threads take turns in a robot's program."""
+"""So soon Python's threads take turns in a robot's program, and in a gateway."""
 
 
 def switch_soon() -> None:
     """For who has to stop a robot: that comes in a thread of Zenoh's, which waits for its turn several times while the
-    loop has much to do, 5 ms each unless this is called."""
+    loop has much to do, 5 ms each unless this is called. And for a gateway, whose loop waits for Zenoh's threads after
+    each piece that TLS encrypts."""
     sys.setswitchinterval(SWITCH_S)
 
 

@@ -20,7 +20,7 @@ from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.kept import Kept
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.protocol.limits import REQUESTS_PER_S, UNFINISHED_FREE_BYTES
-from macs_zenoh.protocol.messages import AgentsGone, GoneAgent, SessionResumed
+from macs_zenoh.protocol.messages import ROS, AgentsGone, GoneAgent, SessionResumed
 from macs_zenoh.protocol.outbox import Chunk, Outbox
 from macs_zenoh.protocol.rate_limit import Pace
 from macs_zenoh.protocol.recipient import Recipient, to_agent
@@ -121,6 +121,8 @@ class Connection(asyncio.BufferedProtocol):
         """What the agent did and is not handled yet, since that takes longer than a turn."""
         self._waits = False
         """Whether that waits for its turn: then the agent is not read from."""
+        self._flushes = False
+        """Whether what was gathered for it waits for its turn."""
         self._lost = False
         """Whether the socket has ended meanwhile."""
         self._closed = False
@@ -224,7 +226,8 @@ class Connection(asyncio.BufferedProtocol):
             part = min(TURN_S / took_s, 0.5 if self._rest else 1.0)
             self._read_bytes = max(LEAST_READ_BYTES, int(self._read_bytes * part))
         elif took_s < TURN_S / 2 and nbytes >= self._read_bytes // 2 and self._read_bytes < MOST_READ_BYTES:
-            self._read_bytes *= 2
+            if not self._rest:  # else nobody knows yet how long it takes
+                self._read_bytes *= 2
         rounds = self._memory.rounds
         turn_s = rounds.spend(self.host, self._share, took_s)
         if turn_s and not self._waits and not self._transport.is_closing():
@@ -280,21 +283,23 @@ class Connection(asyncio.BufferedProtocol):
     # -- in ------------------------------------------------------------------------------------------------------
 
     def take(self, events: Iterable[Event], began: float) -> None:
-        """What the agent did: as much as a turn has time for that began then, the rest when others have had theirs."""
+        """What the agent did: as much as a turn has time for that began then, the rest when others have had theirs.
+        All of it, when this round of the loop has done enough for addresses that take much."""
         self._rest.append(iter(events))
         if not self._waits:
-            self._handle_some(began)
+            if not self._memory.rounds.are_over(self.host):
+                self._handle_some(began)
             if self._rest:
                 self._waits = True
                 self.pause()
-                self._memory.rounds.enter(self.host, self._handle_on)
+                self._memory.rounds.enter(self.host, self._handle_on, 0.0)
 
     def _handle_on(self) -> None:
         began = time.monotonic()
         self._handle_some(began)
         self._memory.rounds.spend(self.host, self._share, time.monotonic() - began)
         if self._rest:
-            self._memory.rounds.enter(self.host, self._handle_on)
+            self._memory.rounds.enter(self.host, self._handle_on, 0.0)
             return
         self._waits = False
         self.resume()
@@ -453,8 +458,21 @@ class Connection(asyncio.BufferedProtocol):
         self._writer.open_direct()
 
     def flush(self) -> None:
-        """Write what was gathered since the last flush, in one go."""
+        """Write what was gathered since the last flush, in one go. What has to be encrypted for one of many that take
+        much waits for its turn, but nothing that goes to a robot program."""
+        if self._flushes or not self._writer.encrypts or self.peer.agent_type == ROS:
+            if not self._flushes:
+                self._writer.flush()
+        elif self._memory.rounds.are_over(self.host):
+            self._flushes = True
+            self._memory.rounds.enter(self.host, self._flush_on, 0.0)
+        else:
+            self._flush_on()
+
+    def _flush_on(self) -> None:
+        self._flushes, began = False, time.monotonic()
         self._writer.flush()
+        self._memory.rounds.count(self.host, time.monotonic() - began)
 
     def pause(self) -> None:
         """Stop reading from the agent until as many `resume` as `pause` were called."""

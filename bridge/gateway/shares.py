@@ -5,6 +5,9 @@ up everybody else for sixty, in each round. So who has used up his share is not 
 many have it in each round as take one turn's time together: others wait for those, however many there are. Addresses
 take turns, and the connections of each among themselves.
 
+Many that each take little take much as well: of an address that is beyond its share no more is done in a round, once
+that round has had a turn's time for such addresses. What has been read waits, and what is to be encrypted for it.
+
 Time is that of the loop's own thread, in which none passes while it waits: on a machine that is busy besides nobody's
 little work seems to be much, and a share is always one of what there is.
 """
@@ -12,6 +15,7 @@ little work seems to be much, and a share is always one of what there is.
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
@@ -22,6 +26,8 @@ SHARE = 0.05
 """So much of the time anybody may take without waiting: a turn is used up by what is beyond it."""
 SHARE_OF_ADDRESS = 0.2
 """The same for all from one address together."""
+BUSY_S = 0.1
+"""So long after it was last beyond its share an address counts as one that takes much."""
 ADDRESSES = 4096
 LITTLE_S = TURN_S / 40
 UNTIMED = 16
@@ -32,12 +38,13 @@ that a single small message costs."""
 class Share:
     """What somebody has used of his turn."""
 
-    __slots__ = ("_at", "_share", "_spent_s")
+    __slots__ = ("_at", "_share", "_spent_s", "busy_until")
 
     def __init__(self, share: float = SHARE) -> None:
         self._share = share
         self._spent_s = 0.0
         self._at = 0.0
+        self.busy_until = -math.inf
 
     def spend(self, took_s: float, now: float) -> bool:
         """Work for him has taken so long; whether that was his turn, and the next one begins."""
@@ -46,6 +53,7 @@ class Share:
         if self._spent_s <= TURN_S:
             return False
         self._spent_s = 0.0
+        self.busy_until = now + BUSY_S
         return True
 
 
@@ -60,11 +68,25 @@ class Rounds:
         """How much of little work there was since."""
         self._waiting: OrderedDict[str, deque[tuple[Callable[[], object], float]]] = OrderedDict()
         self._of_address: OrderedDict[str, Share] = OrderedDict()
+        self._round_s = 0.0
+        """What this round has had of work for addresses that take much."""
         self._going = False
+        """Whether the next round is waited for."""
 
     def spend(self, host: str, share: Share, took_s: float) -> float:
         """Work for a connection has ended just now and taken at most so long. Whether it has to wait for its turn, for
         what it has used itself or all of its address together: how long that turn may take, then; else 0."""
+        took_s, now, over = self._count(host, took_s)
+        if share.spend(took_s, now):
+            return TURN_S
+        return took_s if over else 0.0
+
+    def count(self, host: str, took_s: float) -> None:
+        """The same for what is done for it, and not for what it does: nobody is read from less for that."""
+        self._count(host, took_s)
+
+    def _count(self, host: str, took_s: float) -> tuple[float, float, bool]:
+        """How long it was, as far as this thread had a processor; until when; and whether the address is over."""
         together = self._of_address.get(host)
         if together is None:
             together = self._of_address[host] = Share(SHARE_OF_ADDRESS)
@@ -77,13 +99,28 @@ class Rounds:
             self._untimed, now = 0, self._clock()
             took_s, self._before = min(took_s, now - self._before), now
         over = together.spend(took_s, now)
-        if share.spend(took_s, now):
-            return TURN_S
-        return took_s if over else 0.0
+        if now < together.busy_until:
+            self._round_s += took_s
+        return took_s, now, over
+
+    def are_over(self, host: str) -> bool:
+        """Whether work for this address has to wait for another round: it takes much, and this round has had a turn's
+        time for those that do."""
+        together = self._of_address.get(host)
+        if together is None or self._before >= together.busy_until:
+            return False
+        if not self._going:
+            self._round_s = 0.0
+            self._await_round()
+        return self._round_s > TURN_S
 
     def enter(self, host: str, go_on: Callable[[], object], turn_s: float = TURN_S) -> None:
-        """Call this when it is the turn of this connection, in another round of the loop."""
+        """Call this when it is the turn of this connection, in another round of the loop. It takes at least so long of
+        that round's time."""
         self._waiting.setdefault(host, deque()).append((go_on, turn_s))
+        self._await_round()
+
+    def _await_round(self) -> None:
         if not self._going:
             self._going = True
             asyncio.get_running_loop().call_soon(self._next)
@@ -100,17 +137,16 @@ class Rounds:
         await mine
 
     def _next(self) -> None:
-        turns: list[Callable[[], object]] = []
-        left_s = TURN_S
-        while self._waiting and left_s > 0:
+        self._going, self._round_s, left_s = False, 0.0, TURN_S
+        if self._waiting:
+            self._await_round()  # before those that go on: what they have read from now on is of that round
+        for _ in range(sum(map(len, self._waiting.values()))):
             host, waiting = self._waiting.popitem(last=False)
             go_on, turn_s = waiting.popleft()
             if waiting:
                 self._waiting[host] = waiting
-            turns.append(go_on)
-            left_s -= turn_s
-        self._going = bool(self._waiting)
-        if self._going:
-            asyncio.get_running_loop().call_soon(self._next)
-        for go_on in turns:
+            began = time.monotonic()
             go_on()
+            left_s -= max(turn_s, time.monotonic() - began)
+            if left_s <= 0:
+                break

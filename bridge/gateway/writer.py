@@ -50,8 +50,8 @@ class Writer:
         self._gathered_bytes = 0
         self._direct: DirectWriter | None = None
         self._wants_direct = False
-        self._joins = False
-        """Whether what is written together is one piece: TLS encrypts each piece for itself."""
+        self.encrypts = False
+        """Whether TLS does, each piece for itself: so what is written together is made one."""
         self._lock = threading.RLock()
         """Held by whoever writes, the loop or a thread of Zenoh's, as long as older messages are on their way."""
         self._rest = b""
@@ -60,7 +60,7 @@ class Writer:
     def attach(self, transport: asyncio.Transport) -> None:
         """The connection is there."""
         self._transport = transport
-        self._joins = bool(transport.get_extra_info("sslcontext"))
+        self.encrypts = bool(transport.get_extra_info("sslcontext"))
         transport.set_write_buffer_limits(high=BUFFER_BYTES)
 
     def detach(self) -> None:
@@ -184,7 +184,7 @@ class Writer:
                 chunks, size = [rest, *chunks], size + len(rest)
             if chunks and not self._transport.is_closing():
                 self.written_bytes += size
-                self._transport.writelines(joined(chunks) if self._joins and len(chunks) > 1 else chunks)
+                self._transport.writelines(joined(chunks) if self.encrypts and len(chunks) > 1 else chunks)
 
     def pause(self) -> None:
         """The transport takes nothing more."""

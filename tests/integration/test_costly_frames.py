@@ -5,15 +5,16 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager, suppress
 from itertools import chain
 
 import pytest
 
 from bridge.gateway.connection import Connection
 from bridge.gateway.memory import Memory
-from bridge.gateway.shares import TURN_S
+from bridge.gateway.shares import TURN_S, Rounds
 from macs_zenoh.protocol.kept import Kept, Room
 from macs_zenoh.protocol.messages import (
     ROS,
@@ -95,6 +96,15 @@ async def two(
     """Two headsets' sockets, whose connections are configured unless otherwise said."""
 
     memory = Memory(64 << 20, 32 << 20)
+    async with many(busy, memory, 2, configured=configured, write_timeout_s=write_timeout_s) as (one, other):
+        yield one, other
+
+
+@asynccontextmanager
+async def many(
+    busy: Busy, memory: Memory, count: int, *, configured: bool = True, write_timeout_s: float = 30.0
+) -> AsyncIterator[list[socket.socket]]:
+    """The same of so many."""
 
     def make() -> Connection:
         return Connection(busy, memory=memory, outbox_bytes=64 << 20, write_timeout_s=write_timeout_s)  # type: ignore[arg-type]
@@ -102,12 +112,13 @@ async def two(
     server = await asyncio.get_running_loop().create_server(make, "127.0.0.1", 0)
     address = server.sockets[0].getsockname()[:2]
     hello = encode_frame(management=encode_management(Configuration(UNITY, 0)))
-    with socket.create_connection(address) as one, socket.create_connection(address) as other:
-        await until(lambda: busy.came == 2)
-        for each in (one, other) if configured else ():
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.create_connection(address)) for _ in range(count)]
+        await until(lambda: busy.came == count)
+        for each in sockets if configured else ():
             each.sendall(hello)
         await asyncio.sleep(0)
-        yield one, other
+        yield sockets
     server.close()
 
 
@@ -243,3 +254,66 @@ async def test_to_decrypt_is_work_for_who_sends() -> None:
         connection.buffer_updated(len(data))
         assert busy.did == [(connection.agent_id, "a")]
         assert len(connection.get_buffer(-1)) <= before // 3
+
+
+class Timed(Busy):
+    """One that a clock stands beside, which its work alone moves on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.clock_s = 100.0
+        self.round = 0
+        self.rounds: list[int] = []
+        """In which round of the loop each question was answered."""
+
+    def handle(self, connection: Connection, event: Event) -> None:
+        super().handle(connection, event)
+        if isinstance(event, AskedOnline):
+            self.clock_s += COSTS_S
+            self.rounds.append(self.round)
+
+
+async def test_many_of_one_address_wait_for_each_other_and_not_everybody_for_all_of_them() -> None:
+    """Each asks one thing, which takes a part of a turn: what is read from all of them in one round of the loop is
+    not answered in that round."""
+    busy = Timed()
+    memory = Memory(64 << 20, 32 << 20)
+    memory.rounds = Rounds(lambda: busy.clock_s)
+
+    def passes() -> None:
+        busy.round += 1
+        ticking[0] = loop.call_soon(passes)
+
+    loop = asyncio.get_running_loop()
+    ticking = [loop.call_soon(passes)]
+    async with many(busy, memory, 20) as sockets:
+        for number in range(1, 4):
+            for each in sockets:
+                each.sendall(question(number))
+            await until(lambda wanted=20 * number: len(busy.rounds) == wanted)  # type: ignore[misc]
+    ticking[0].cancel()
+    in_round = Counter(busy.rounds[20:])  # the first of them show that the address takes much
+    assert max(in_round.values()) <= 2 * TURN_S / COSTS_S + 2
+
+
+async def test_what_is_encrypted_for_one_of_many_waits_for_its_turn() -> None:
+    """Topics and answers do, in their order; what goes to a robot program does not."""
+    busy = Timed()
+    memory = Memory(64 << 20, 32 << 20)
+    memory.rounds = Rounds(lambda: busy.clock_s)
+    async with many(busy, memory, 2):
+        headset, robot = busy.connections
+        robot.peer.agent_type = ROS
+        headset._writer.encrypts = robot._writer.encrypts = True  # as it is over TLS
+        while not memory.rounds.are_over(headset.host):
+            busy.clock_s += TURN_S
+            memory.rounds.count(headset.host, TURN_S)
+        sent = headset.sent_bytes, robot.sent_bytes
+        for each in (headset, robot):
+            assert each.gather_calls([b"one"])
+            each.flush()
+        assert (headset.sent_bytes, robot.sent_bytes) == (sent[0], sent[1] + 3)
+        assert not headset.gather_calls([b"two"])
+        headset.flush()
+        assert headset.sent_bytes == sent[0]
+        await until(lambda: headset.sent_bytes == sent[0] + 6)

@@ -129,3 +129,42 @@ def test_who_comes_back_has_what_he_had_left() -> None:
     after.has_left(before)
     assert after.request(1, 0.0) is FLOODED
     assert after.command("x", 1, 0.0) is FLOODED
+
+
+async def test_of_many_that_take_much_together_no_more_is_done_in_a_round_than_a_turn() -> None:
+    """Each takes little: others would wait for all of them. Whoever is not one of them never waits."""
+    clock = [100.0]
+    rounds, each_s = Rounds(lambda: clock[0]), TURN_S / 10
+
+    def work(host: str) -> bool:
+        if rounds.are_over(host):
+            return False
+        clock[0] += each_s
+        rounds.spend(host, Share(), each_s)
+        return True
+
+    assert sum(work("10.0.0.1") for _ in range(15)) == 15  # from here on it takes much
+    for _ in range(3):
+        await asyncio.sleep(0)
+        done = [work("10.0.0.1") for _ in range(100)]
+        assert sum(done) == pytest.approx(11, abs=1)
+        assert work("10.0.0.2")
+
+
+async def test_what_goes_on_in_its_turn_counts_in_its_round() -> None:
+    """Or as much again would be done beside it."""
+    clock, went = [100.0], list[bool]()
+    rounds = Rounds(lambda: clock[0])
+    while not rounds.are_over("10.0.0.1"):
+        clock[0] += TURN_S / 2
+        rounds.count("10.0.0.1", TURN_S / 2)
+
+    def goes_on() -> None:
+        clock[0] += 2 * TURN_S
+        rounds.count("10.0.0.1", 2 * TURN_S)
+
+    rounds.enter("10.0.0.1", goes_on)
+    for _ in range(2):  # in the same round, and in the next one
+        asyncio.get_running_loop().call_soon(lambda: went.append(rounds.are_over("10.0.0.1")))
+        await asyncio.sleep(0)
+    assert went == [True, False]
