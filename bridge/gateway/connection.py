@@ -225,9 +225,8 @@ class Connection(asyncio.BufferedProtocol):
         if took_s > TURN_S:
             part = min(TURN_S / took_s, 0.5 if self._rest else 1.0)
             self._read_bytes = max(LEAST_READ_BYTES, int(self._read_bytes * part))
-        elif took_s < TURN_S / 2 and nbytes >= self._read_bytes // 2 and self._read_bytes < MOST_READ_BYTES:
-            if not self._rest:  # else nobody knows yet how long it takes
-                self._read_bytes *= 2
+        elif took_s < TURN_S / 2 and nbytes >= self._read_bytes // 2 and not self._rest:  # else who knows how long
+            self._read_bytes = min(2 * self._read_bytes, MOST_READ_BYTES)
         rounds = self._memory.rounds
         turn_s = rounds.spend(self.host, self._share, took_s)
         if turn_s and not self._waits and not self._transport.is_closing():

@@ -25,7 +25,7 @@ from .declared import Outlet, Payload, Traffic
 from .heartbeat import Counted, Heartbeats
 from .loopback import Loopback
 from .panics import call, unwatched
-from .sender import LARGE_BYTES, Sender, is_large
+from .sender import LARGE_BYTES, Sender, close_together, is_large
 from .streams import Streams
 from .tracing import Marked, Tracing
 
@@ -136,11 +136,10 @@ class Outgoing:
         self._apart.clear()
 
     def close(self, timeout_s: float) -> None:
-        """Send what is queued, for at most so long."""
-        self._sender.close(timeout_s)
-        self._commands.close(timeout_s)
-        self.streams.close(timeout_s)
-        self._heartbeats.close(timeout_s)
+        """Send what is queued, for at most so long, and tell no more numbers."""
+        ends_at = time.monotonic() + timeout_s
+        close_together((self._sender, self._commands, self.streams.sender), timeout_s)
+        self._heartbeats.close(max(0.1, ends_at - time.monotonic()))
 
     def undeclare(self) -> None:
         """Have no publishers any more, on a session that goes on."""

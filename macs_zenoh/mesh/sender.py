@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from macs_zenoh.losses import Losses
 
@@ -26,7 +26,8 @@ class Sender:
     """A thread that puts what may take long, in order. It starts with the first such payload.
 
     So long as ``most_s`` a large payload may wait while others wait behind it; then it is not put, and ``on_late``
-    called. One that cannot be put, for a reason that nobody thought of, costs itself (``failed`` in ``drops``).
+    called. One that cannot be put, for a reason that nobody thought of, costs itself (``failed`` in ``drops``). Where
+    there can be no more threads, whoever puts does it himself (``no_thread``).
     """
 
     def __init__(
@@ -80,10 +81,21 @@ class Sender:
             self.backlogged = self._bytes > self._limit_bytes // 4
             self._queue.append((publisher, payload, key, time.monotonic()))
             self._keys[key] += 1
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="macs-sender", daemon=True)
-                self._thread.start()
+            has_thread = self._thread is not None or self._start()
             self._wake.notify()
+        if not has_thread:
+            while self._put_one(waits=False):
+                pass
+        return True
+
+    def _start(self) -> bool:
+        thread = threading.Thread(target=self._run, name="macs-sender", daemon=True)
+        try:
+            thread.start()
+        except RuntimeError as error:  # the next one tries again
+            self._drops.once("no_thread", "what is large holds up everything: no thread can put it: %s", error)
+            return False
+        self._thread = thread
         return True
 
     def when_sent(self, callback: Callable[[], None]) -> None:
@@ -94,41 +106,51 @@ class Sender:
                 return
         callback()
 
-    def close(self, timeout_s: float) -> None:
-        """Send what is queued, for at most ``timeout_s``, and end."""
+    def end(self) -> None:
+        """Send what is queued, and end."""
         with self._wake:
             self._closing = True
             self._wake.notify()
+
+    def close(self, timeout_s: float) -> None:
+        """The same, and wait for that, for at most ``timeout_s``."""
+        self.end()
         if self._thread is not None:
             self._thread.join(timeout_s)
 
     def _run(self) -> None:
-        while True:
-            with self._wake:
-                while not self._queue:
-                    if self._closing:
-                        return
-                    self._wake.wait()
-                entry = self._queue.popleft()
-            try:
-                self._handle(entry)
-            except Exception:  # noqa: BLE001 - it is logged
-                text = "what a thread was to put, or to tell, failed"
-                self._drops.once("failed", text, level=logging.ERROR, exc_info=True)
-            if not isinstance(entry, tuple):
-                continue
-            _, payload, key, _ = entry
-            with self._wake:
-                self.sent += 1
-                self._keys[key] -= 1
-                if not self._keys[key]:
-                    del self._keys[key]
-                self._bytes -= len(payload)
-                relieved = self.backlogged and self._bytes < self._limit_bytes // 8
-                if relieved:
-                    self.backlogged = False
+        while self._put_one(waits=True):
+            pass
+
+    def _put_one(self, *, waits: bool) -> bool:
+        """Put what is next, or tell whoever is; False when there is nothing, where that ends it."""
+        with self._wake:
+            while not self._queue:
+                if self._closing or not waits:
+                    return False
+                self._wake.wait()
+            entry = self._queue.popleft()
+        try:
+            self._handle(entry)
+        except Exception:  # noqa: BLE001 - it is logged
+            text = "what a thread was to put, or to tell, failed"
+            self._drops.once("failed", text, level=logging.ERROR, exc_info=True)
+        if isinstance(entry, tuple):
+            self._has_put(len(entry[1]), entry[2])
+        return True
+
+    def _has_put(self, size: int, key: str) -> None:
+        with self._wake:
+            self.sent += 1
+            self._keys[key] -= 1
+            if not self._keys[key]:
+                del self._keys[key]
+            self._bytes -= size
+            relieved = self.backlogged and self._bytes < self._limit_bytes // 8
             if relieved:
-                self._on_room()
+                self.backlogged = False
+        if relieved:
+            self._on_room()
 
     def _handle(self, entry: tuple[Outlet, Payload, str, float] | Callable[[], None]) -> None:
         if not isinstance(entry, tuple):
@@ -139,3 +161,12 @@ class Sender:
             self._on_late()
         else:
             self._put(publisher, payload)
+
+
+def close_together(senders: Sequence[Sender], timeout_s: float) -> None:
+    """Close them all within this time: each sends what it has while the others do."""
+    ends_at = time.monotonic() + timeout_s
+    for sender in senders:
+        sender.end()
+    for sender in senders:
+        sender.close(max(0.0, ends_at - time.monotonic()))

@@ -36,23 +36,23 @@ class Streams:
         self._outgoing = outgoing
         self._on_room: Callbacks[Callable[[], None]] = Callbacks()
         room = partial(from_thread, self._room)
-        self._sender = Sender(self.MOST_BYTES, loopback.put, room, drops, on_late, self.MOST_S)
+        self.sender = Sender(self.MOST_BYTES, loopback.put, room, drops, on_late, self.MOST_S)
 
     def put(self, key: str, payload: Payload) -> None:
         """Publish. On the loop."""
-        by_thread = is_large(payload) or self._sender.has(key)
-        if not (by_thread and self._outgoing.put_by(self._sender, key, payload, Traffic.STREAM)):
+        by_thread = is_large(payload) or self.sender.has(key)
+        if not (by_thread and self._outgoing.put_by(self.sender, key, payload, Traffic.STREAM)):
             self._outgoing.put(key, payload, Traffic.STREAM)
 
     @property
     def backlogged(self) -> bool:
         """Whether so much waits that who brings more should be held back; `on_room` tells when it is over."""
-        return self._sender.backlogged
+        return self.sender.backlogged
 
     @property
     def sent(self) -> int:
         """How many of what had to wait were put."""
-        return self._sender.sent
+        return self.sender.sent
 
     def on_room(self, callback: Callable[[], None]) -> Handle:
         """Call ``callback`` whenever a backlog has gone."""
@@ -60,11 +60,7 @@ class Streams:
 
     def when_sent(self, callback: Callable[[], None]) -> None:
         """`Sender.when_sent`."""
-        self._sender.when_sent(callback)
-
-    def close(self, timeout_s: float) -> None:
-        """`Sender.close`."""
-        self._sender.close(timeout_s)
+        self.sender.when_sent(callback)
 
     def _room(self) -> None:
         for callback in self._on_room:

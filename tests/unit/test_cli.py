@@ -540,3 +540,25 @@ def test_help_of_awareness_names_the_node_that_there_is() -> None:
 
 def awareness_node() -> str:
     return str(Path(__file__).parents[2] / "bridge" / "awareness" / "node.py")
+
+
+async def test_a_gateway_lets_threads_take_turns_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its loop waits for Zenoh's threads after each piece that TLS encrypts: before it opens a session that is set."""
+    from bridge import memory
+    from bridge.cli import gateway
+    from macs_zenoh.mesh import Mesh
+
+    class Opened(Exception):
+        pass
+
+    async def opening(*args: object, **how: object) -> Mesh:
+        raise Opened
+
+    called: list[float] = []
+    monkeypatch.setattr(sys, "setswitchinterval", called.append)
+    for name in ("give_back", "collect_seldom"):
+        monkeypatch.setattr(memory, name, lambda: None)
+    monkeypatch.setattr(Mesh, "open", opening)
+    with pytest.raises(Opened):
+        await gateway._be_gateway(Settings(), [])
+    assert called == [0.001]
