@@ -8,6 +8,7 @@ the first link). Pure, except `read_text`.
 from __future__ import annotations
 
 import difflib
+import functools
 import os
 import re
 import sys
@@ -51,7 +52,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     section: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
-        for field in msgspec.structs.fields(self):
+        for field in _fields(type(self)):
             try:
                 msgspec.convert(getattr(self, field.name), field.type)
             except msgspec.ValidationError as error:
@@ -66,7 +67,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     def _chosen(self, field: str) -> bool:
         """Whether the field differs from its default."""
-        return bool(getattr(self, field) != getattr(type(self)(), field))
+        return bool(getattr(self, field) != getattr(_defaults(type(self)), field))
 
 
 _S = TypeVar("_S", bound=msgspec.Struct)
@@ -154,5 +155,13 @@ def _metas(kind: Any) -> Iterator[Meta]:
     return (part for part in _parts(kind) if isinstance(part, Meta))
 
 
+@functools.cache
 def _fields(struct: type[msgspec.Struct]) -> tuple[msgspec.structs.FieldInfo, ...]:
+    """Its fields. msgspec evaluates every annotation for them, each time: most of what a session took to open."""
     return msgspec.structs.fields(struct)
+
+
+@functools.cache
+def _defaults(kind: type[_S]) -> _S:
+    """A section in which nothing was chosen. Nobody else has it, so that nobody can change its lists."""
+    return kind()

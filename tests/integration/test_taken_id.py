@@ -69,10 +69,7 @@ async def test_an_id_that_was_chosen_is_kept(tmp_path: Path, where: str) -> None
             assert mesh.zid == zenoh_id(mesh) == "abc123"
             noticed = asyncio.create_task(locked_out.locked_out(mesh))
             ours = asyncio.create_task(locked_out.locked_out(mesh, any_id=True))
-            link.cut()
-            await until(lambda: not mesh.linked)
-            async with await Mesh.open(MeshSettings(connect=[router.endpoint], overrides=['id:"abc123"'])):
-                link.mend()
+            async with stolen(mesh, link, router.endpoint):
                 await asyncio.wait_for(ours, PATIENCE_S)  # who made the id up himself wants another one
                 assert not noticed.done()
             noticed.cancel()

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import zenoh
 
@@ -168,6 +169,15 @@ def test_an_option_that_was_not_given_changes_nothing() -> None:
     """`changed` leaves fields whose new value is None."""
     settings = RobotSettings(id=7)
     assert changed(settings, id=None, group=3) == RobotSettings(id=7, group=3)
+
+
+def test_a_section_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """msgspec evaluates every annotation of a class whose fields it is asked for: not for each session again."""
+    MeshSettings(lease_ms=5000).zenoh()
+    asked: list[object] = []
+    monkeypatch.setattr(msgspec.structs, "fields", asked.append)
+    MeshSettings(lease_ms=6000).zenoh()
+    assert asked == []
 
 
 def test_zenoh_accepts_every_entry() -> None:
