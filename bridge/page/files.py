@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gzip
 import hashlib
 from collections.abc import Sequence
@@ -61,6 +62,7 @@ def without_libraries() -> File:
     return _file("index.html", WITHOUT_LIBRARIES.encode())
 
 
+@functools.cache
 def _file(name: str, body: bytes) -> File:
     compressed = gzip.compress(body, 9, mtime=0) if len(body) > COMPRESSED_BYTES else b""
     tag = f'"{hashlib.blake2b(body, digest_size=12).hexdigest()}"'

@@ -27,10 +27,10 @@ async def open_session(
 ) -> zenoh.Session:
     """A session of Zenoh's by these settings. See `Mesh.open`."""
     zenoh.init_log_from_env_or("off" if quiet else LOGGED)  # RUST_LOG, as with Zenoh's own tools
-    check_files(zenoh_config(settings))  # once: a file that is being replaced ends nobody who waits
+    config = zenoh_config(settings)
+    check_files(config)  # once: a file that is being replaced ends nobody who waits
     waiting = False
     while True:
-        config = zenoh_config(settings)
         try:
             return await open_now(config)
         except zenoh.ZError as error:
@@ -43,6 +43,7 @@ async def open_session(
                 waiting = True
                 (on_waiting or _log_waiting)(", ".join(settings.routers) or "a router")
             await asyncio.sleep(settings.retry_max_ms / 1000)
+            config = zenoh_config(settings)
 
 
 async def open_now(config: zenoh.Config) -> zenoh.Session:

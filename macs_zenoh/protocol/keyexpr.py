@@ -100,6 +100,8 @@ class Key(Generic[_F]):
     """Which field is the block of the id behind it; None where none is."""
     _names: frozenset[str] = field(init=False, repr=False, compare=False)
     _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
+    _templates: dict[frozenset[str], str] = field(init=False, repr=False, compare=False, default_factory=dict)
+    """Those of expressions, by which fields are given."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fields", tuple(re.findall(r"\{(\w+)\}", self.template)))
@@ -127,6 +129,13 @@ class Key(Generic[_F]):
         A tail in which nothing is given becomes ``**``, so ``UNICAST.every(type=1, id=7)`` is ``macs/to/ros/0/7/**``.
         """
         self._complete(values)
+        given = frozenset(values)
+        if given not in self._templates:
+            self._templates[given] = self._template(given)
+        return self._fill(values, self._templates[given])
+
+    def _template(self, values: frozenset[str]) -> str:
+        """The template of an expression in which these fields are given."""
         given = [name in values for name in self.fields]
         last = max((i for i, here in enumerate(given) if here), default=-1)
         tail = self.fields[last + 1 :]
@@ -136,7 +145,7 @@ class Key(Generic[_F]):
         for name in self.fields[: last + 1]:
             if name not in values:
                 template = template.replace("{" + name + "}", "*")
-        return self._fill(values, template)
+        return template
 
     def parse(self, key: str) -> _F | None:
         """The fields of a concrete key (types and ids as numbers), or None when the key is not of this space."""
