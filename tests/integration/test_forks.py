@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from macs_zenoh.config import MeshSettings
+from macs_zenoh.mesh import Mesh
+from tests.support import starter as starting
 from tests.support.forks import ROOT, Forked, Starter
 from tests.support.programs import free_port
 
@@ -77,3 +80,11 @@ async def test_it_has_nothing_of_the_others(starter: Starter) -> None:
     pipes = [{str(path) for path in each if str(path).startswith("pipe:")} for each in kept]
     assert all(pipes)
     assert set.intersection(*pipes) == set()
+
+
+async def test_who_leaves_a_session_open_is_known(router: str) -> None:
+    """Such a program ends the long way, where it hangs as one that was executed does."""
+    before = len(starting.open_sessions())
+    async with await Mesh.open(MeshSettings(connect=[router])):
+        assert len(starting.open_sessions()) == before + 1
+    assert len(starting.open_sessions()) == before

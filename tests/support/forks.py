@@ -1,7 +1,7 @@
 """Programs of ours without what it costs to load them: much of the processor's time of a test run was that.
 
 In a parallel run a program that is ``python -m bridge ...`` is forked of a process that has loaded its modules
-(`tests.support.starter`), and from there on it is the same. Whoever runs tests one by one, as those that measure time,
+(`tests.support.starter`), and from there on it is the same, but that it does not take them apart at its end. Whoever runs tests one by one, as those that measure time,
 has programs that are executed, and so have tests of how programs start.
 """
 
@@ -27,10 +27,13 @@ LINE_BYTES = 64 << 20
 
 MODULES = (
     *("bridge.cli.agent", "bridge.cli.gateway", "bridge.cli.router", "bridge.cli.topic", "bridge.gateway"),
-    *("bridge.doctor.first", "bridge.graph.site", "bridge.headset.script", "bridge.recording.program"),
-    *("bridge.rmw_zenoh.program", "bridge.router", "numpy", "uvloop"),
+    *("bridge.cli.doctor", "bridge.cli.ls", "bridge.cli.record", "bridge.cli.stop"),
+    *("bridge.doctor.first", "bridge.graph.echo", "bridge.graph.site", "bridge.headset.script"),
+    *("bridge.recording.program", "bridge.rmw_zenoh.program", "bridge.router"),
+    *("numpy", "uvloop", "yaml", "aiohttp.web", "lz4.frame", "rich.table", "rosbags.typesys", "cryptography.x509"),
+    *("ament_index_python", "rcl_interfaces.msg", "email.parser", "encodings.idna", "importlib.metadata"),
 )
-"""What is loaded, as far as it is here: most programs need most of it. Nothing of ROS, which has threads at once."""
+"""What is loaded, as far as it is here: most programs need most of it. Nothing of rclpy, which has threads at once."""
 OURS = ("bridge", "bridge.cli.demo_robot")
 
 READ_WHEN_USED = re.compile(r"(MACS|PYTEST|ROS|RUST)_\w+|COLUMNS|LINES|NO_COLOR|FORCE_COLOR")

@@ -24,7 +24,9 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 
 def made_of(name: str, sources: Iterable[Path], make: Callable[[Path], object]) -> Path:
     """The same for all runs, as long as the sources, files or folders, are as they were, and what is installed too."""
-    state = hashlib.sha256(repr((sys.version, sorted(Path(sysconfig.get_paths()["purelib"]).iterdir()))).encode())
+    state = hashlib.sha256(
+        repr((sys.version, sorted(path.name for path in Path(sysconfig.get_paths()["purelib"]).iterdir()))).encode()
+    )
     for source in sources:
         for path in sorted(source.rglob("*")) if source.is_dir() else [source]:
             if path.is_file() and path.suffix != ".pyc":

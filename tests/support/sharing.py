@@ -29,6 +29,12 @@ LONG = (
 ONE_WORKER = ("tests/integration/test_wheel.py",)
 """Files whose tests wait for the same thing to be made: one worker does, and none for another."""
 
+TOGETHER = (
+    ("tests/unit/test_errors.py", "tests/unit/test_house.py", "tests/unit/test_imports.py"),
+    ("tests/unit/test_counters.py", "tests/unit/test_docs_site.py"),
+)
+"""Quick files that one worker does after the other: each reads all sources, and finds them read."""
+
 QUICK = "tests/unit/"
 
 
@@ -55,6 +61,7 @@ def page_groups(names: Iterable[str]) -> dict[str, str]:
 def scope_of(name: str, groups: Mapping[str, str]) -> str:
     """What a test is handed out with: its group, its file, or nothing but itself."""
     path = path_of(name)
+    path = next((group[0] for group in TOGETHER if path in group), path)
     return path if path.startswith((QUICK, *ONE_WORKER)) else groups.get(path, name)
 
 

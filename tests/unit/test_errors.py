@@ -8,6 +8,7 @@ from pathlib import Path
 
 from macs_zenoh import errors
 from macs_zenoh.errors import MacsError
+from tests.support.sources import nodes
 
 ROOT = Path(__file__).parents[2]
 INTERNAL = {
@@ -45,7 +46,7 @@ def test_errors_of_other_modules_hang_on_the_tree() -> None:
     """What another module defines and a user can see is caught by ``except MacsError``."""
     known = set(drawn())
     for path in sorted([*(ROOT / "macs_zenoh").rglob("*.py"), *(ROOT / "bridge").rglob("*.py")]):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in nodes(path):
             bases = _bases(node) if isinstance(node, ast.ClassDef) else set()
             if isinstance(node, ast.ClassDef) and (bases & known or any(map(_is_error, bases))):
                 assert bases & known or node.name in INTERNAL | {"MacsError"}, f"{path.name}: {node.name}"

@@ -17,6 +17,7 @@ import pytest
 
 import macs_zenoh
 from macs_zenoh import errors
+from tests.support.sources import nodes, parsed
 
 ROOT = Path(__file__).parents[2]
 CORE = sorted((ROOT / "macs_zenoh").rglob("*.py"))
@@ -61,12 +62,6 @@ INPUT_OUTPUT = {
     "bridge",
     "tests",
 }
-
-
-@cache
-def parsed(path: Path) -> ast.Module:
-    """A file is parsed once for all rules."""
-    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 @cache
@@ -194,17 +189,17 @@ def test_one_module_spells_keys_and_one_endpoints() -> None:
     """No other text in the code begins as a key of the mesh or of Zenoh, or puts an endpoint together."""
     keys, endpoints = {}, {}
     for path in (*CORE, *BRIDGE):
-        nodes = list(ast.walk(parsed(path)))
-        documents = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        inside = nodes(path)
+        documents = {id(node.value) for node in inside if isinstance(node, ast.Expr)}
         texts = {
             node.value
-            for node in nodes
+            for node in inside
             if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documents
         }
         if path.name != "keyexpr.py":
             keys[path] = {text for text in texts if KEY.match(text) and " " not in text}
         if path.name != "endpoints.py":
-            made = [part for node in nodes if isinstance(node, ast.JoinedStr) for part in node.values[:1]]
+            made = [part for node in inside if isinstance(node, ast.JoinedStr) for part in node.values[:1]]
             begin = {str(part.value) for part in made if isinstance(part, ast.Constant)}
             endpoints[path] = {text for text in begin if ENDPOINT.fullmatch(text)}
     assert those(keys.items()) == {}
@@ -214,7 +209,7 @@ def test_one_module_spells_keys_and_one_endpoints() -> None:
 def test_the_oldest_python_can_load_it() -> None:
     """No class is a named tuple and something else as well, such as generic: Python 3.10 refuses to load that."""
     for path in (*CORE, *BRIDGE):
-        for node in ast.walk(parsed(path)):
+        for node in nodes(path):
             if isinstance(node, ast.ClassDef) and len(node.bases) > 1:
                 assert "NamedTuple" not in {ast.unparse(base) for base in node.bases}, f"{path.name}: {node.name}"
 
@@ -289,9 +284,9 @@ def test_tests_import_each_other_by_full_names() -> None:
 
 def nowhere(path: Path) -> Iterator[tuple[int, str]]:
     """Names of ours in a file that do not exist, with their lines. What needs ROS is looked at where ROS is."""
-    nodes = list(ast.walk(parsed(path)))
+    inside = nodes(path)
     modules: dict[str, ModuleType] = {}
-    for node in nodes:
+    for node in inside:
         if not isinstance(node, ast.ImportFrom) or node.level or not (node.module or "").startswith(OURS):
             continue
         try:
@@ -305,9 +300,9 @@ def nowhere(path: Path) -> Iterator[tuple[int, str]]:
                 yield node.lineno, f"{node.module}.{alias.name}"
             elif isinstance(found := getattr(module, alias.name), ModuleType):
                 modules[alias.asname or alias.name] = found
-    hidden = {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
-    hidden |= {node.arg for node in nodes if isinstance(node, ast.arg)}
-    for node in nodes:
+    hidden = {node.id for node in inside if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+    hidden |= {node.arg for node in inside if isinstance(node, ast.arg)}
+    for node in inside:
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id not in hidden:
             used = modules.get(node.value.id)
             if used is not None and not hasattr(used, node.attr):
