@@ -1,8 +1,9 @@
 """Programs of ours without what it costs to load them: much of the processor's time of a test run was that.
 
 In a parallel run a program that is ``python -m bridge ...`` is forked of a process that has loaded its modules
-(`tests.support.starter`), and from there on it is the same, but that it does not take them apart at its end. Whoever runs tests one by one, as those that measure time,
-has programs that are executed, and so have tests of how programs start.
+(`tests.support.starter`), and from there on it is the same, but that it does not take them apart at its end. Whoever
+runs tests one by one, as those that measure time, has programs that are executed, and so have tests of how programs
+start.
 """
 
 from __future__ import annotations
