@@ -18,6 +18,7 @@ import msgspec
 import uvloop
 
 import macs_zenoh
+from bridge.ros.counts import PutFor
 from macs_zenoh.errors import Refused
 from macs_zenoh.protocol.messages import (
     ROS,
@@ -27,10 +28,11 @@ from macs_zenoh.protocol.messages import (
     NodeType,
     StreamData,
     decode_data,
+    encode_data,
     encode_management,
     node_name,
 )
-from macs_zenoh.protocol.robot_state import Offered, TopicQos
+from macs_zenoh.protocol.robot_state import Offered, RobotStatus, StatusRequest, StopStatus, StreamCount, TopicQos
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
 
@@ -47,6 +49,7 @@ class Robot:
         self._agent = agent
         self._streams = Streams(agent)
         self._registered: dict[str, tuple[AddNode, set[int]]] = {}
+        self._put_for = {topic: PutFor() for topic in TOPICS}
         self._kept: dict[str, set[int]] = {}
         self._publishing: list[threading.Thread] = []
 
@@ -66,7 +69,18 @@ class Robot:
         node = decode_data(AddNode, call.data)
         _, registrants = self._registered.setdefault(node.tos_name, (node, set()))
         registrants.add(node.registrant_agent_id)
+        self._put_for[node.tos_name].registered((UNITY, registrant) for registrant in registrants)
         return b""
+
+    async def status(self, call: macs_zenoh.Call) -> bytes:
+        """Nothing but how much was put."""
+        asked, to = decode_data(StatusRequest, call.data).counts if call.data else "", (UNITY, call.sender_id)
+        for topic, put_for in self._put_for.items():
+            if asked and (count := put_for.to_tell(to, again=asked == "all")):
+                message = encode_message(self._metadata(topic, StreamCount.manager).encode(), encode_data(count))
+                targets = encode_management(StreamData({str(UNITY): [call.sender_id]}))
+                self._streams.publish(node_name(topic), encode_frame(ROS, management=targets, message=message))
+        return encode_data(RobotStatus("/bench", False, StopStatus(), []))
 
     async def registrants(self) -> dict[str, Any]:
         """How many each topic has."""
@@ -81,6 +95,7 @@ class Robot:
         """Nobody is registered but those."""
         for topic in list(self._registered):
             self._registered[topic] = (self._registered[topic][0], set(self._kept.get(topic, ())))
+            self._put_for[topic].registered((UNITY, registrant) for registrant in self._registered[topic][1])
         return {}
 
     async def publish(self, topic: str, size: int, hz: float, count: int) -> dict[str, Any]:
@@ -88,25 +103,32 @@ class Robot:
         known = self._registered.get(topic)
         node = node_name(topic)
         targets = StreamData({str(UNITY): sorted(known[1]) if known else []})
-        metadata = Metadata(
-            ROS,
-            self._agent.id,
-            message_manager=StreamData.manager,
-            node_type=NodeType.SUBSCRIBER,
-            node_name=node,
-            data_exchange_type=TYPE,
-        )
+        receivers, put_for = frozenset((UNITY, each) for each in targets.dest_agents[str(UNITY)]), self._put_for[topic]
+        metadata = self._metadata(topic, StreamData.manager)
         cdr = stamped(size)
         cdr[len(PREFIX) + 4 :] = os.urandom(size)
         message = encode_message(metadata.encode(), bytes(cdr))
         frame = bytearray(encode_frame(ROS, management=encode_management(targets), message=message))
         at = len(frame) - len(cdr) + AT
-        thread = threading.Thread(
-            target=pace, args=(count, hz, lambda message: self._streams.publish(node, bytes(message)), frame, at)
-        )
+
+        def put(message: bytearray) -> None:
+            self._streams.publish(node, bytes(message))
+            put_for.add(receivers)
+
+        thread = threading.Thread(target=pace, args=(count, hz, put, frame, at))
         thread.start()
         self._publishing.append(thread)
         return {}
+
+    def _metadata(self, topic: str, manager: str) -> Metadata:
+        return Metadata(
+            ROS,
+            self._agent.id,
+            message_manager=manager,
+            node_type=NodeType.SUBSCRIBER,
+            node_name=node_name(topic),
+            data_exchange_type=TYPE,
+        )
 
     async def published(self) -> dict[str, Any]:
         """Wait until all of it is published."""
@@ -124,6 +146,7 @@ async def main() -> None:
         agent.serve("add_node", robot.add_node)
         agent.serve("offers", robot.offers)
         agent.serve("definitions", robot.definitions)
+        agent.serve("status", robot.status)
         say({})
         while line := await loop.run_in_executor(None, sys.stdin.readline):
             command = json.loads(line)

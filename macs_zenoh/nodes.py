@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -83,13 +83,21 @@ Asked = tuple[str, frozenset[int], frozenset[int], str | None]
 class Nodes:
     """The interface nodes that one agent uses. Made when it uses the first."""
 
-    def __init__(self, agent: Agent, layout: Layout, *, patient: bool = False) -> None:
-        """``patient``: topics may come a hundredth of a second later, which costs less."""
+    def __init__(
+        self,
+        agent: Agent,
+        layout: Layout,
+        *,
+        patient: bool = False,
+        on_count: Callable[[str, bytes], None] = lambda key, data: None,
+    ) -> None:
+        """``patient``: topics may come a hundredth of a second later, which costs less. ``on_count(key, data)``: how
+        much a robot has put for this agent, where it was asked to tell (`StreamCount`)."""
         self.agent = agent
         self._patient = patient
         self._nodes: dict[NodeKey, Node] = {}
         self._streams: dict[tuple[int, str], Declared] = {}
-        self._reader = StreamReader(layout, self._bad_frame)
+        self._reader = StreamReader(layout, self._bad_frame, on_count)
         self._types: Types | None = None
         self._services: dict[tuple[str, int], ServiceUser] = {}
         self._publishers: dict[Published, TopicPublisher] = {}

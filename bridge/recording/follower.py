@@ -9,7 +9,9 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
+from bridge.recording.arrived import Arrived
 from bridge.recording.disk import Entry, Sink, now_ns
 from bridge.recording.schema_source import Schemas
 from bridge.recording.streams import Channel, robot_channel
@@ -20,11 +22,12 @@ from macs_zenoh.nodes import Nodes
 from macs_zenoh.protocol.directory import AgentInfo, Change
 from macs_zenoh.protocol.keyexpr import STREAM
 from macs_zenoh.protocol.limits import ANSWER_BYTES
-from macs_zenoh.protocol.messages import ROS, decode_data, node_name
+from macs_zenoh.protocol.messages import ROS, decode_data, encode_data, node_name
 from macs_zenoh.protocol.offers import short_type
-from macs_zenoh.protocol.robot_state import Offered, TopicQos
+from macs_zenoh.protocol.robot_state import Offered, StatusRequest, StreamCount, TopicQos
 from macs_zenoh.protocol.schemas import full_type
 from macs_zenoh.protocol.wire import Layout, parse_frames
+from macs_zenoh.timeouts import within
 from macs_zenoh.topics import TopicMessage, TopicSubscription
 
 log = logging.getLogger("macs.record")
@@ -42,7 +45,13 @@ LOOK_S = 10.0
 """What a robot has is asked again so often: what it says of a change may get lost, or come before anybody listens."""
 PATIENCE_S = 20.0
 """How long a registration may take."""
+COUNTS_S = 5.0
+"""How often a robot is asked how much it has put: each answer is a message of a topic more, on its link."""
+NEW_COUNTS, ALL_COUNTS = (encode_data(StatusRequest(counts)) for counts in ("new", "all"))
+"""What the verb ``status`` is asked besides."""
 OnNote = Callable[[dict[str, object]], None]
+OnLost = Callable[[str, int, Arrived], None]
+"""Of a topic, how many more messages have not come, and how it is with the topic now."""
 
 
 class RobotFollower:
@@ -61,6 +70,7 @@ class RobotFollower:
         on_note: OnNote,
         on_stop_state: Callable[[], None],
         on_offered: Callable[[Offered], None] = lambda offered: None,
+        on_lost: OnLost = lambda topic, more, arrived: None,
     ) -> None:
         self.robot = robot
         self.offered = Offered()
@@ -74,8 +84,15 @@ class RobotFollower:
         self._on_note = on_note
         self._on_stop_state = on_stop_state
         self._on_offered = on_offered
+        self._on_lost = on_lost
+        self._arrived: dict[str, Arrived] = {}
+        """By topic."""
+        self._counts_due = 0.0
+        self._awaited: set[str] = set()
+        """Topics of which the robot shall tell once more how much it has put."""
+        self._all_told = asyncio.Event()
         self._layout = Layout(agent.mesh.settings.id_slots, agent.mesh.settings.group_slots)
-        self._nodes = Nodes(agent, self._layout, patient=True)
+        self._nodes = Nodes(agent, self._layout, patient=True, on_count=self._counted)
         self._following: dict[str, asyncio.Task[None]] = {}
         self._stop_topic = ""
         self._has_told = False
@@ -91,6 +108,46 @@ class RobotFollower:
     def id_changed(self, old: int, new: int) -> None:
         """The recording has another id."""
         self._nodes.id_changed((self._agent.type_number, old), new)
+
+    def asked_of_status(self) -> bytes:
+        """What the verb ``status`` is asked besides: now and then, how much the robot has put. Before it has told any
+        each time, so that it is known whether it does."""
+        now = time.monotonic()
+        if now < self._counts_due and any(arrived.told for arrived in self._arrived.values()):
+            return b""
+        self._counts_due = now + COUNTS_S
+        return NEW_COUNTS
+
+    async def last_counts(self, timeout_s: float) -> None:
+        """Wait until the robot has told how much it has put of each topic, if it ever has."""
+        self._awaited = {topic for topic, arrived in self._arrived.items() if arrived.told is not None}
+        if not self._awaited:
+            return
+        self._all_told.clear()
+        with suppress(MacsError, asyncio.TimeoutError):
+            await within(self._ask_for_counts(timeout_s), timeout_s)
+
+    async def _ask_for_counts(self, timeout_s: float) -> None:
+        await self._agent.call(ROS, self.robot, "status", ALL_COUNTS, timeout_s=timeout_s)
+        await self._all_told.wait()
+
+    def _counted(self, key: str, data: bytes) -> None:
+        """The robot has told, behind all that it counts."""
+        parsed = STREAM.parse(key)
+        topic = self.topic_of(parsed.node) if parsed is not None else ""
+        arrived = self._arrived.get(topic)
+        if arrived is None:
+            return
+        try:
+            more = arrived.count(decode_data(StreamCount, data))
+        except WireError as error:
+            log.debug("how much ros/%d has put of %s cannot be read: %s", self.robot, topic, error)
+            return
+        if more:
+            self._on_lost(topic, more, arrived)
+        self._awaited.discard(topic)
+        if not self._awaited:
+            self._all_told.set()
 
     def close(self) -> None:
         """Follow no more: the robot is told."""
@@ -125,6 +182,7 @@ class RobotFollower:
             subscription = self.subscriptions.pop(topic, None)
             if subscription is not None:
                 subscription.close()
+                self._arrived.pop(topic, None)
 
     def forget_offers(self) -> None:
         """It has left: whatever comes under its id has to tell what it offers."""
@@ -188,13 +246,17 @@ class RobotFollower:
         self.subscriptions[topic] = subscription
         subscription.on_refused(lambda _, reason: self._not_recorded(topic, reason))
         channel = robot_channel(self.robot, topic, of_type, schema.text, schema.hash, qos)
-        subscription.on_message(self._taking(channel, on_message))
+        arrived = self._arrived[topic] = Arrived()
+        subscription.on_message(self._taking(channel, arrived, on_message))
 
-    def _taking(self, channel: Channel, on_message: Callable[[], None] | None) -> Callable[[TopicMessage], None]:
+    def _taking(
+        self, channel: Channel, arrived: Arrived, on_message: Callable[[], None] | None
+    ) -> Callable[[TopicMessage], None]:
         put, keep = self._sink.put, channel.topic if channel.latched else ""
 
         def take(message: TopicMessage) -> None:
             data = message.data
+            arrived.message()
             ago_s = time.monotonic() - message.received_s
             put(Entry(channel, channel.next(len(data)), now_ns() - int(ago_s * 1e9), data, keep))
             if on_message is not None:

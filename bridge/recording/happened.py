@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from bridge.recording.bag import Bag
-from bridge.recording.streams import CONTROL, DEADMAN, DROPS, JSON, LOST, REFUSALS, STOPS
+from bridge.recording.streams import CONTROL, DEADMAN, DROPS, JSON, LOST, LOST_BEFORE, REFUSALS, STOPS
 
 TEXT = 300
 """Characters of one: names and reasons come from the network."""
@@ -69,6 +69,10 @@ def _lost(value: dict[str, Any]) -> str:
     return "the recording has lost in all: " + _counts(value["lost"])
 
 
+def _lost_before(value: dict[str, Any]) -> str:
+    return f"{value['more']} messages of {value['topic']} did not come to the recording, {value['in_all']} in all"
+
+
 def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in sorted(counts.items()))
 
@@ -83,6 +87,7 @@ _WORDS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     REFUSALS: ("refusal", _refusal),
     DROPS: ("loss", _drops),
     LOST: ("loss", _lost),
+    LOST_BEFORE: ("loss", _lost_before),
     CONTROL: ("control", _control),
 }
 KINDS = tuple(dict.fromkeys(kind for kind, _ in _WORDS.values()))

@@ -121,6 +121,8 @@ class Recording:
 
     async def stop(self) -> None:
         """End, with all that waits written."""
+        if not self.ended.is_set():
+            await self.recorder.last_counts()
         self.recorder.close()
         self._count_losses()
         if self._disk is not None:

@@ -11,13 +11,14 @@ from typing import Any
 
 import msgspec
 
+from bridge.recording.arrived import Arrived
 from bridge.recording.conditions import Condition, Event, stop_topic
 from bridge.recording.disk import Entry, Sink, now_ns
 from bridge.recording.doors import Doors
 from bridge.recording.follower import RobotFollower
 from bridge.recording.schema_source import Schemas
 from bridge.recording.sent import SentCommands
-from bridge.recording.streams import MESSAGES, NOTES, OFFERS, PRESENCE, Channel
+from bridge.recording.streams import LOST_BEFORE, MESSAGES, NOTES, OFFERS, PRESENCE, Channel, robot_topic
 from bridge.recording.traced import Traces
 from bridge.recording.traffic import Said, Sent, Traffic
 from macs_zenoh.agent import Agent
@@ -35,6 +36,11 @@ log = logging.getLogger("macs.record")
 
 STATUS_S = 1.0
 """How often a robot is asked how it is; its stop is heard at once."""
+LAST_COUNTS_S = 1.0
+"""How long a recording that ends waits for robots to tell how much they have put for it."""
+BEFORE = "before_recorder"
+HERE = ("topics_behind", "loop_behind", "topic_full", "missed", "bad_frame")
+"""By these names is counted what has been lost on its way to a subscription and is known of."""
 WITHOUT_STATUS_S = 30.0
 """The same of one that has not answered: an existing program."""
 
@@ -100,6 +106,10 @@ class Recorder:
         """Whether a topic of a robot is wanted now; `RobotFollower.look_again` when that has changed."""
         self.on_offered: Callable[[int, Offered], None] = lambda robot, offered: None
         self._lost_before: Counter[str] = Counter()
+        self._not_come = 0
+        """Messages that robots have put for this recording, and that none of its subscriptions had."""
+        self._before = 0
+        """Of these, how many no counter here knows of."""
 
     def start(self) -> None:
         """Record from now on."""
@@ -145,9 +155,22 @@ class Recorder:
     def losses(self) -> Counter[str]:
         """What was lost here since this was asked last, by name, before it could be recorded."""
         now = Counter(self.agent.drops) + Counter(self.agent.mesh.drops) + Counter(bad_frame=self._bad_frames)
+        self._before = max(self._before, self._not_come - sum(now[name] for name in HERE))
+        now[BEFORE] = self._before
         more = now - self._lost_before
         self._lost_before = now
         return more
+
+    async def last_counts(self) -> None:
+        """Wait a moment until robots have told how much they have put in all, so that what was lost of it is known."""
+        await asyncio.gather(*(follower.last_counts(LAST_COUNTS_S) for follower in self.robots.values()))
+
+    def _lost_on_the_way(self, robot: int, topic: str, more: int, arrived: Arrived) -> None:
+        if arrived.lost == more:
+            log.warning("%s: messages of it do not come here (logged once, counted)", robot_topic(robot, topic))
+        self._not_come += more
+        value = {"robot": robot, "topic": topic, "more": more, "in_all": arrived.lost}
+        self._put(Event(LOST_BEFORE, value))
 
     def note(self, value: dict[str, Any]) -> None:
         """Something to know about the recording itself."""
@@ -197,6 +220,7 @@ class Recorder:
             on_note=self.note,
             on_stop_state=asked.set,
             on_offered=lambda offered: self.on_offered(robot, offered),
+            on_lost=lambda topic, more, arrived: self._lost_on_the_way(robot, topic, more, arrived),
         )
         self._watching[robot] = asyncio.get_running_loop().create_task(self._watch(robot))
 
@@ -212,7 +236,9 @@ class Recorder:
             asked.clear()
             if (ROS, robot) in self.agent.directory:
                 try:
-                    answer = await self.agent.call(ROS, robot, "status", timeout_s=5.0)
+                    answer = await self.agent.call(
+                        ROS, robot, "status", self.robots[robot].asked_of_status(), timeout_s=5.0
+                    )
                     status = decode_data(RobotStatus, answer, ANSWER_BYTES)
                     for event in condition.tell(status):
                         self._put(event)

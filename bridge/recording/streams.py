@@ -33,6 +33,7 @@ PRESENCE, STATUS, STOPS, CONTROL, DEADMAN, REFUSALS, DROPS, CALLS, MESSAGES, LOS
         "traces",
     )
 )
+LOST_BEFORE = f"{PREFIX}/lost_before"
 """JSON channels: who came and left; a robot's state; and what of it changed."""
 
 

@@ -2,8 +2,8 @@
 
 Verbs: ``add_node`` (data: AddNode) and ``remove_node`` (RemoveNode), answered with nothing or a refusal that says why;
 ``offers`` (no data), answered with `robot_state.Offered`; ``definitions`` (`DefinitionsRequest`), with the texts of
-types; ``status`` (no data), ``control`` (`ControlRequest`) and ``stop`` (``true`` or ``false``), answered with JSON;
-``trace``, see `traced`. See docs/robot.md.
+types; ``status`` (no data, or `StatusRequest`), ``control`` (`ControlRequest`) and ``stop`` (``true`` or ``false``),
+answered with JSON; ``trace``, see `traced`. See docs/robot.md.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import TypeVar
 
 from bridge.audit import open_audit, who
 from bridge.metrics.endpoint import watched_at
+from bridge.ros import counts
 from bridge.ros.checked import CheckedSettings
 from bridge.ros.command_clocks import ClockQuestions
 from bridge.ros.definitions import Definitions, Telling, offered_types
@@ -160,7 +161,7 @@ class RobotAgent:
             ("remove_node", self._remove_node),
             ("offers", self._offers),
             ("definitions", self._tell_definitions),
-            ("status", self._status),
+            ("status", counts.telling(self.nodes, self.state)),
             ("control", self._control),
             ("trace", telling(self.agent)),
         ):
@@ -336,9 +337,6 @@ class RobotAgent:
         request = decode_data(DefinitionsRequest, call.data) if call.data else DefinitionsRequest()
         types = request.types or offered_types(await self.offers.now())
         return encode_data(await self._definitions.tell((call.sender_type, call.sender_id), types))
-
-    async def _status(self, _call: Call) -> bytes:
-        return self.state()
 
     async def _control(self, call: Call) -> bytes:
         return encode_data(self._controlled(Registrant(type_number(call.sender_type), call.sender_id), call.data))

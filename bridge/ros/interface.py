@@ -265,6 +265,9 @@ class InterfaceNode(ABC):
     def cut_off(self) -> None:  # noqa: B027 - only some nodes care
         """The robot has lost the mesh. On the loop."""
 
+    def tell_count(self, registrant: Registrant, *, again: bool) -> None:  # noqa: B027 - only some nodes count
+        """A registrant wants to know how much was put for it; ``again``: also what it was told before. On the loop."""
+
     def emergency_stop(self, by: str) -> None:  # noqa: B027 - only some nodes move the robot
         """Somebody stopped the robot. In any thread, and soon."""
 

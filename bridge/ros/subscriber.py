@@ -14,19 +14,21 @@ from functools import partial
 from typing import Any
 
 from bridge.ros import qos
+from bridge.ros.counts import PutFor
 from bridge.ros.gaps import Gaps
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.latched import Newcomers, Receivers, Told, message_of
 from bridge.ros.side import Closable, Events, MessageType, OnRaw
-from bridge.ros.stream import Fanout
+from bridge.ros.stream import Fanout, StreamFraming
 from bridge.ros.topics import TOO_LARGE, TopicNode, check_topic_type
 from bridge.ros.unity_cdr import to_unity
 from macs_zenoh.errors import MacsError
-from macs_zenoh.protocol.messages import AddNode, NodeType, StreamData
+from macs_zenoh.protocol.messages import AddNode, NodeType, StreamData, encode_data
 from macs_zenoh.protocol.rate import Rate
 from macs_zenoh.protocol.reading import Message
 from macs_zenoh.protocol.recovery import SILENT_S
 from macs_zenoh.protocol.rmw_zenoh.qos import Qos
+from macs_zenoh.protocol.robot_state import StreamCount
 from macs_zenoh.protocol.trace import ROS_SENT, TAKEN
 
 log = logging.getLogger("macs.ros")
@@ -50,6 +52,7 @@ class SubscriberNode(TopicNode):
         self._loop = asyncio.get_running_loop()
         self._translate: Callable[[bytes], bytes] | None = None
         self._fanout_lock = threading.Lock()
+        self._put_for = PutFor()
         self._fanout = self._to_registrants()
         self._is_latched = True
         """Whether publishers hold messages for late ones, and until they are known."""
@@ -62,7 +65,18 @@ class SubscriberNode(TopicNode):
 
     def registrants_changed(self) -> None:
         with self._fanout_lock:
+            self._put_for.registered(self.registrants)
             self._fanout = self._to_registrants()
+
+    def tell_count(self, registrant: Registrant, *, again: bool) -> None:
+        count = self._put_for.to_tell(registrant, again=again)
+        if count is None:
+            return
+        framed = StreamFraming(self.metadata(StreamCount.manager), [registrant], self.robot.layout)
+        try:
+            self.robot.publish_stream(self.key.node_name, framed(encode_data(count)))
+        except MacsError as error:
+            log.debug("%s: %s is not told how much was put: %s", self.topic, registrant, error)
 
     def deregister(self, registrant: Registrant) -> None:
         super().deregister(registrant)
@@ -183,12 +197,17 @@ class SubscriberNode(TopicNode):
 
     def _put(self, cdr: bytes, fanout: Fanout | None = None) -> None:
         self.carried.count(len(cdr))
+        fanout = fanout or self._fanout
+        is_whole = True
         try:
-            for frame in (fanout or self._fanout)(cdr):
+            for frame in fanout(cdr):
                 if len(frame) > self._max_frame_bytes:
                     self._note_too_large(len(frame))
+                    is_whole = False
                     continue
                 self.robot.publish_stream(self.key.node_name, frame)
+            if is_whole:  # behind it: a count must not overtake what it counts
+                self._put_for.add(fanout.receivers)
         except MacsError as error:
             self.robot.drops.note("failed", self.topic, str(error))
 

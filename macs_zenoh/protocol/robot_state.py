@@ -166,6 +166,22 @@ class FollowRequest(Struct, frozen=True):
     follow: bool = False
 
 
+class StatusRequest(Struct, frozen=True):
+    """The data of the verb ``status``, if it has any: ``counts`` asks for a `StreamCount` of each topic on which the
+    asker is registered, where it has changed since (``new``) or in any case (``all``)."""
+
+    counts: Literal["", "new", "all"] = ""
+
+
+class StreamCount(Struct, frozen=True):
+    """Robot → one registrant, on the stream of a topic and behind its messages: how many of them were put for it since
+    it registered. ``since`` says when that was, by a clock of the robot's own: it tells registrations apart."""
+
+    manager: ClassVar[str] = "StreamCount"
+    since: Count
+    put: Count = 0
+
+
 class ControlRequest(Struct, frozen=True, rename="camel"):
     """Take control over a topic, release it, or give it to another agent (``to``, a headset unless ``toType``)."""
 

@@ -34,7 +34,7 @@ from macs_zenoh.protocol.messages import (
 )
 from macs_zenoh.protocol.messages import encode_data as encode
 from macs_zenoh.protocol.reading import Message
-from macs_zenoh.protocol.robot_state import STATUS
+from macs_zenoh.protocol.robot_state import STATUS, StatusRequest, StreamCount
 from macs_zenoh.protocol.routing import call
 from macs_zenoh.protocol.wire import parse_frame
 from tests.support.ros_peer import ROBOT, Peer, Streams, adding, command, removing
@@ -70,6 +70,34 @@ async def test_a_registered_topic_is_streamed(robot: RobotAgent, headset: Agent,
     assert decode_management(frame.management) == StreamData({"2": [5]})
     assert Metadata.decode(frame.metadata).sender_agent_id == ROBOT
     assert deserialize_message(bytes(frame.body), String).data == "hello"
+
+
+async def test_how_much_was_put_is_told_behind_it(robot: RobotAgent, headset: Agent, peer: Peer) -> None:
+    """Who asks for the robot's state may have itself told, on each topic's stream, what was put there for it: once,
+    unless asked for again. Others are told nothing, and other data of a question for the state is ignored."""
+    streams = Streams(headset)
+    await headset.call("ros", ROBOT, "add_node", encode(adding("/chatter")))
+    publisher = await peer.publisher(String, "/chatter", matched=1)
+    await streams.after(lambda: publisher.publish(String(data="hello")))
+    carried = {}
+
+    async def status(data: bytes) -> int:
+        told = json.loads(await headset.call("ros", ROBOT, "status", data))
+        carried.update({node["name"]: node["carried"]["messages"] for node in told["nodes"] if "carried" in node})
+        return int(carried["/chatter"])
+
+    while await status(b"x") != await status(b"{}"):
+        pass
+    for counts in ("new", "new", "all"):
+        await status(encode(StatusRequest(counts)))
+    publisher.publish(String(data="the last"))
+    found = []
+    while b"the last" not in bytes((frame := parse_frame((await get(streams.frames))[1])).body):
+        found.append(frame)
+    counted = [frame for frame in found if Metadata.decode(frame.metadata).message_manager == StreamCount.manager]
+    assert [decode_data(StreamCount, bytes(frame.body)).put for frame in counted] == [carried["/chatter"]] * 2
+    assert found[-2:] == counted
+    assert [decode_management(frame.management) for frame in counted] == [StreamData({"2": [5]})] * 2
 
 
 async def test_a_command_reaches_a_ros_topic(robot: RobotAgent, headset: Agent, peer: Peer) -> None:

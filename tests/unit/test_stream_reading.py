@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from macs_zenoh.errors import WireError
-from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, encode_management
+from macs_zenoh.protocol.messages import Metadata, NodeType, StreamData, decode_data, encode_data, encode_management
+from macs_zenoh.protocol.robot_state import StreamCount
 from macs_zenoh.protocol.stream_reading import KNOWN, KNOWN_BYTES, StreamReader
 from macs_zenoh.protocol.wire import MACS, encode_frame, encode_message
 
@@ -13,8 +14,16 @@ KEY = "macs/from/ros/7/nd__pose"
 ME = (2, 5)
 
 
-def frame(listed: dict[str, list[int]], data: bytes = b"\0\1\0\0x", name: str = "nd__pose", kind: int = 1) -> bytes:
-    metadata = Metadata(1, 7, node_type=kind, node_name=name, data_exchange_type="std_msgs/String")
+def frame(
+    listed: dict[str, list[int]],
+    data: bytes = b"\0\1\0\0x",
+    name: str = "nd__pose",
+    kind: int = 1,
+    manager: str = StreamData.manager,
+) -> bytes:
+    metadata = Metadata(
+        1, 7, message_manager=manager, node_type=kind, node_name=name, data_exchange_type="std_msgs/String"
+    )
     management = encode_management(StreamData(listed))
     return encode_frame(1, management=management, message=encode_message(metadata.encode(), data))
 
@@ -37,6 +46,16 @@ def test_only_what_lists_me_is_mine(reader: StreamReader, bad: list[WireError]) 
     assert reader.read(KEY, "nd__pose", theirs, (1, 5)) == [b"\0\1\0\0x"]
     assert reader.read(KEY, "nd__pose", mine + theirs + frame({"2": [5]}, b"second"), ME) == [b"\0\1\0\0x", b"second"]
     assert bad == []
+
+
+def test_a_count_is_no_data() -> None:
+    """How much a robot has put is told to who asked, behind the data; to others it says nothing."""
+    told: list[tuple[str, bytes]] = []
+    reader = StreamReader(MACS, lambda key, error: None, lambda key, data: told.append((key, data)))
+    count = frame({"2": [5]}, encode_data(StreamCount(3, 4)), manager=StreamCount.manager)
+    assert reader.read(KEY, "nd__pose", frame({"2": [5]}) + count, ME) == [b"\0\1\0\0x"]
+    assert reader.read(KEY, "nd__pose", count, (2, 6)) == []
+    assert [(key, decode_data(StreamCount, data)) for key, data in told] == [(KEY, StreamCount(3, 4))]
 
 
 def test_a_new_id_is_not_the_old_one(reader: StreamReader) -> None:

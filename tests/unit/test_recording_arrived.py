@@ -1,0 +1,101 @@
+"""What of a robot's topic has not come to a recording: what the robot counts, and what is missing of it."""
+
+from __future__ import annotations
+
+from bridge.recording.arrived import Arrived
+from bridge.ros.counts import SETS, PutFor
+from macs_zenoh.protocol.robot_state import StreamCount
+
+RECORDER, HEADSET, LATER = (2, 256), (2, 5), (2, 6)
+
+
+def test_each_registrant_is_counted_for() -> None:
+    """What was put before it registered, or for others alone, is none of its."""
+    put = PutFor()
+    put.registered([HEADSET])
+    put.add(frozenset([HEADSET]))
+    put.registered([HEADSET, RECORDER])
+    for _ in range(3):
+        put.add(frozenset([HEADSET, RECORDER]))
+    put.add(frozenset([HEADSET]))
+    counts = [put.to_tell(each, again=False) for each in (HEADSET, RECORDER)]
+    assert [count.put for count in counts if count] == [5, 3]
+    assert put.to_tell(LATER, again=True) is None
+
+
+def test_nothing_is_told_twice_unless_asked() -> None:
+    """A topic that stands still costs no link anything."""
+    put = PutFor()
+    put.registered([RECORDER])
+    assert put.to_tell(RECORDER, again=False) is None
+    put.add(frozenset([RECORDER]))
+    first = put.to_tell(RECORDER, again=False)
+    assert first is not None
+    assert first.put == 1
+    assert put.to_tell(RECORDER, again=False) is None
+    assert put.to_tell(RECORDER, again=True) == first
+
+
+def test_who_registers_again_is_counted_from_none() -> None:
+    """And can tell by the time that it is another registration."""
+    put = PutFor()
+    put.registered([RECORDER])
+    put.add(frozenset([RECORDER]))
+    before = put.to_tell(RECORDER, again=True)
+    put.registered([])
+    put.registered([RECORDER])
+    after = put.to_tell(RECORDER, again=True)
+    assert before is not None
+    assert after is not None
+    assert (before.put, after.put) == (1, 0)
+    assert before.since != after.since
+
+
+def test_many_sets_of_receivers() -> None:
+    """A latched topic puts for others each time: nothing is remembered of them but the counts."""
+    put = PutFor()
+    everybody = [(2, number) for number in range(1, 100)]
+    put.registered(everybody)
+    for number in range(1, 99):
+        put.add(frozenset(everybody[number - 1 : number + 1]))
+        assert len(put._new) <= SETS
+    counts = [count.put for each in everybody if (count := put.to_tell(each, again=True))]
+    assert counts == [1] + [2] * 97 + [1]
+
+
+def came(arrived: Arrived, messages: int) -> None:
+    for _ in range(messages):
+        arrived.message()
+
+
+def test_what_has_not_come_is_lost() -> None:
+    """Once, when it is told, and what comes later makes no loss undone or greater."""
+    arrived = Arrived()
+    came(arrived, 3)
+    assert arrived.count(StreamCount(1, 3)) == 0
+    came(arrived, 2)
+    assert arrived.count(StreamCount(1, 10)) == 5
+    assert arrived.count(StreamCount(1, 10)) == 0
+    came(arrived, 4)
+    assert arrived.count(StreamCount(1, 14)) == 0
+    assert arrived.lost == 5
+
+
+def test_what_has_come_before_it_is_counted_is_no_gain() -> None:
+    """A robot counts what it has put behind it: a message may come before its count."""
+    arrived = Arrived()
+    came(arrived, 4)
+    assert arrived.count(StreamCount(1, 3)) == 0
+    assert arrived.count(StreamCount(1, 5)) == 1
+
+
+def test_a_robot_that_was_started_again_has_lost_nothing_by_that() -> None:
+    """It counts from none; what is lost after its first word is known again."""
+    arrived = Arrived()
+    came(arrived, 90)
+    assert arrived.count(StreamCount(1, 100)) == 10
+    came(arrived, 20)
+    assert arrived.count(StreamCount(2, 15)) == 0
+    came(arrived, 5)
+    assert arrived.count(StreamCount(2, 22)) == 2
+    assert arrived.lost == 12
