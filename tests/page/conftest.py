@@ -1,7 +1,7 @@
 """A whole site for pages: router, gateway, the demo robot and its agent as processes, and browsers.
 
-All tests here run in one loop: a worker has one browser of each kind, in which each test has contexts of its own, and
-the tests of a module that leave its site as it was share it.
+All tests here run in one loop: a worker has one browser, in which each test has contexts of its own, and tests that
+leave their site as it was share it.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ import pytest_asyncio
 from bridge.tokens import store
 from macs_zenoh.protocol.rights import Rights
 from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
-from tests.support.browser import Watched, browser, opened
+from tests.page.polls import until
+from tests.support.browser import Watched, another, opened
 from tests.support.isolation import worker_number
 from tests.support.processes import Process
 from tests.support.programs import Program, free_port
-from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from playwright.async_api import Browser
+    from playwright.async_api import Browser, Playwright
 
 ROBOT = """
 [[robot.rules]]
@@ -65,19 +65,28 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     return report
 
 
-Chromium = Callable[..., Awaitable["Browser"]]
+Chromium = Callable[[], Awaitable["Browser"]]
 
 
 @pytest_asyncio.fixture(scope="session", loop_scope="session")
-async def chromium() -> AsyncIterator[Chromium]:
-    """The browser with these arguments, started once."""
-    found: dict[tuple[str, ...], Browser] = {}
+async def driver() -> AsyncIterator[Playwright]:
+    """What starts browsers, and speaks with them."""
+    from playwright.async_api import async_playwright
+
+    async with async_playwright() as started:
+        yield started
+
+
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
+async def chromium(driver: Playwright) -> AsyncIterator[Chromium]:
+    """The browser, started once."""
+    found: list[Browser] = []
     async with AsyncExitStack() as stack:
 
-        async def get(*arguments: str) -> Browser:
-            if arguments not in found or not found[arguments].is_connected():
-                found[arguments] = await stack.enter_async_context(browser(*arguments))
-            return found[arguments]
+        async def get() -> Browser:
+            if not found or not found[-1].is_connected():
+                found.append(await stack.enter_async_context(another(driver)))
+            return found[-1]
 
         yield get
 
@@ -193,17 +202,18 @@ async def start_site(tmp_path: Path, chromium: Chromium) -> AsyncIterator[StartS
 
 @dataclass
 class Shared:
-    """The site of a module, started for the first test and after one that failed."""
+    """The site that tests share, started anew after one that failed, and for those of a module with other rules."""
 
     folder: Path
     chromium: Chromium
-    rules: str
+    rules: str = ""
     stack: AsyncExitStack = field(default_factory=AsyncExitStack)
     site: Site | None = None
 
-    async def get(self) -> Site:
-        if self.site is None:
-            self.site = await started(self.stack, self.folder, self.chromium, rules=self.rules)
+    async def get(self, rules: str) -> Site:
+        if self.site is None or self.rules != rules:
+            await self.stop()
+            self.site, self.rules = await started(self.stack, self.folder, self.chromium, rules=rules), rules
         return replace(self.site, pages=[])
 
     async def stop(self) -> None:
@@ -211,20 +221,17 @@ class Shared:
         await self.stack.aclose()
 
 
-@pytest_asyncio.fixture(scope="module", loop_scope="session")
-async def shared(
-    tmp_path_factory: pytest.TempPathFactory, chromium: Chromium, request: pytest.FixtureRequest
-) -> AsyncIterator[Shared]:
-    found = Shared(tmp_path_factory.mktemp("site"), chromium, getattr(request.module, "RULES", ROBOT))
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
+async def shared(tmp_path_factory: pytest.TempPathFactory, chromium: Chromium) -> AsyncIterator[Shared]:
+    found = Shared(tmp_path_factory.mktemp("site"), chromium)
     yield found
     await found.stop()
 
 
 @pytest_asyncio.fixture(loop_scope="session")
 async def site(shared: Shared, request: pytest.FixtureRequest) -> AsyncIterator[Site]:
-    """The module's, which each test leaves as it was: all runs, and nothing is stopped. Its robot has the module's
-    ``RULES``."""
-    site = await shared.get()
+    """One that each test leaves as it was: all runs, and nothing is stopped. Its robot has the module's ``RULES``."""
+    site = await shared.get(getattr(request.module, "RULES", ROBOT))
     yield site
     good = False
     try:
@@ -235,8 +242,11 @@ async def site(shared: Shared, request: pytest.FixtureRequest) -> AsyncIterator[
             await shared.stop()
 
 
-@pytest_asyncio.fixture(scope="module", loop_scope="session")
-async def gateways(tmp_path_factory: pytest.TempPathFactory, chromium: Chromium) -> AsyncIterator[Gate]:
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
+async def gateways(
+    tmp_path_factory: pytest.TempPathFactory, chromium: Chromium, shared: Shared
+) -> AsyncIterator[Gate]:
+    await shared.stop()  # its robot publishes all the time
     secret, words = with_token(tmp_path_factory.mktemp("gate") / "tokens.json", Rights(may=["see"], robots="any"))
     async with AsyncExitStack() as stack:
         endpoint, ports = f"tcp/127.0.0.1:{free_port()}", (free_port(), free_port())
@@ -249,7 +259,7 @@ async def gateways(tmp_path_factory: pytest.TempPathFactory, chromium: Chromium)
 
 @pytest_asyncio.fixture(loop_scope="session")
 async def gate(gateways: Gate) -> AsyncIterator[Gate]:
-    """The module's gateways."""
+    """The gateways, which tests share."""
     gate = replace(gateways, pages=[])
     yield gate
     await judged(gate.pages)

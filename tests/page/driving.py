@@ -12,9 +12,9 @@ from typing import Any
 from geometry_msgs.msg import Twist
 
 from tests.page.conftest import HELD, Act, Site
+from tests.page.polls import until
 from tests.support.browser import Watched
 from tests.support.ros_peer import Peer
-from tests.support.waiting import until
 
 
 async def hold(page: Watched, across: float = 0.0, up: float = 0.8) -> None:

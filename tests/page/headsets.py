@@ -20,12 +20,11 @@ from sensor_msgs.msg import CompressedImage
 
 from tests.page.conftest import Act, Gate, Site
 from tests.page.driving import Heard
+from tests.page.polls import until
 from tests.support.browser import ROOT, SCREENSHOTS, Watched, opened
 from tests.support.ros_peer import Peer
-from tests.support.waiting import until
 
 IWER = ROOT / "build" / "npm" / "node_modules" / "iwer" / "build" / "iwer.min.js"
-WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 needs_headset = pytest.mark.skipif(not IWER.is_file(), reason="the WebXR emulator is missing: make page")
 
 DEVICE = """
@@ -34,11 +33,10 @@ device.installRuntime({ forceInstall: true }); // Chromium has one, without a he
 device.position.set(0, 1.6, 0.2);
 window.device = device;
 """
-SMALL = "Object.assign(window, { innerWidth: 320, innerHeight: 210 })"
-"""As large as the eyes of the emulated device are then: without graphics hardware each pixel costs the processor, and
-who drives has to be confirmed five times a second by a frame."""
-UNDRAWN = """
-Object.assign(window, { innerWidth: 32, innerHeight: 32 });
+LOOKED_AT = """
+const [width, height] = %s;
+Object.assign(window, { innerWidth: width, innerHeight: height, looking: false });
+Object.defineProperty(window, 'devicePixelRatio', { value: width / 640 });
 for (const { prototype } of [WebGLRenderingContext, WebGL2RenderingContext]) {
   const { drawElements, drawArrays, getParameter } = prototype;
   const cleared = new Map([[0x0c22, new Float32Array(4)], [0x0b73, 1], [0x0b91, 0]]);
@@ -46,16 +44,44 @@ for (const { prototype } of [WebGLRenderingContext, WebGL2RenderingContext]) {
     return cleared.get(name) ?? getParameter.call(this, name);
   };
   prototype.drawElements = function (mode, count, ...at) {
-    drawElements.call(this, mode, Math.min(count, 3), ...at);
+    drawElements.call(this, mode, looking ? count : Math.min(count, 3), ...at);
   };
   prototype.drawArrays = function (mode, first, count) {
-    drawArrays.call(this, mode, first, Math.min(count, 3));
+    drawArrays.call(this, mode, first, looking ? count : Math.min(count, 3));
   };
 }
+window.look = (whether) => {
+  looking = whether;
+  if (!macsXr.stage.immersive) macsXr.stage.renderer.setPixelRatio(whether ? 1 : devicePixelRatio);
+};
 """
-"""Next to no pixels, and of what is drawn one triangle each time: what graphics hardware does in a headset costs the
-processor next to nothing then, and what the scene does for it is the same. Nor does the emulator wait three times a
-frame until all is drawn, to ask what a picture is cleared with, which no headset does."""
+"""Of what is drawn one triangle each time, but in the frames that a test looks at: what graphics hardware does in a
+headset costs the processor next to nothing then, and what the scene does for it is the same. Nor does the emulator
+wait three times a frame until all is drawn, to ask what a picture is cleared with, which no headset does."""
+SMALL = LOOKED_AT % "[320, 210]"
+"""As large as the eyes of the emulated device are then: without graphics hardware each pixel costs the processor, and
+who drives has to be confirmed five times a second by a frame."""
+UNDRAWN = LOOKED_AT % "[32, 32]"
+"""For tests that look at no pixel."""
+SLOWER = """
+const { requestAnimationFrame: ask, cancelAnimationFrame: cancel } = window;
+const asked = new Map();
+let last = 0;
+window.requestAnimationFrame = (act) => {
+  const id = ++last;
+  const timer = setTimeout(() => {
+    const frame = ask((at) => (asked.delete(id), act(at)));
+    asked.set(id, () => cancel(frame));
+  }, 33);
+  asked.set(id, () => clearTimeout(timer));
+  return id;
+};
+window.cancelAnimationFrame = (id) => {
+  asked.get(id)?.();
+  asked.delete(id);
+};
+"""
+"""A frame 30 times a second, not 60."""
 PICTURES = "/test/picture"
 PATIENT_ROBOT = """
 [robot]
@@ -69,12 +95,14 @@ PIXELS = """([across, down, size]) => new Promise((done) => {
   const { stage } = macsXr;
   const render = Object.getPrototypeOf(stage).render;
   stage.render = () => {
+    look(true);
     render.call(stage);
     delete stage.render;
     const gl = stage.renderer.getContext();
     const pixels = new Uint8Array(4 * size * size);
     const [x, y] = [gl.drawingBufferWidth * across, gl.drawingBufferHeight * (1 - down)].map(Math.round);
     gl.readPixels(x - size / 2, y - size / 2, size, size, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    look(false);
     done(Array.from(pixels));
   };
 })"""
@@ -180,18 +208,27 @@ class Headset:
         """A picture of what is seen."""
         SCREENSHOTS.mkdir(parents=True, exist_ok=True)
         path = SCREENSHOTS / f"xr-{name}.png"
+        await self.value("look(true)")
+        await self.frame()
         await self.page.screenshot(path=path)
+        await self.value("look(false)")
         return path
 
 
 async def headset_at(
-    site: Site | Gate, settings: dict[str, Any] | None = None, *, wanted: bool = False, size: str = SMALL
+    site: Site | Gate,
+    settings: dict[str, Any] | None = None,
+    *,
+    wanted: bool = False,
+    size: str = SMALL,
+    rate: str = SLOWER,
 ) -> Headset:
     """A headset that has opened the scene, with these settings, and of this size, `UNDRAWN` for who looks at no pixel;
-    ``wanted``: where a token is."""
-    context = await (await site.chromium(*WEBGL)).new_context(viewport={"width": 640, "height": 420})
+    ``wanted``: where a token is; ``rate``: how often it has a frame, empty for as often as the browser can."""
+    context = await (await site.chromium()).new_context(viewport={"width": 640, "height": 420})
     await context.add_init_script(path=IWER)
-    await context.add_init_script(script=size)
+    for script in (size, rate):
+        await context.add_init_script(script=f"{{{script}}}")
     kept = json.dumps(json.dumps({**PATIENT, **(settings or {})}))
     await context.add_init_script(
         script=f"{DEVICE}\nlocalStorage.getItem('macs.xr') ?? localStorage.setItem('macs.xr', {kept})"

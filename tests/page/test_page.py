@@ -18,9 +18,9 @@ from macs_zenoh.protocol.rights import Rights
 from macs_zenoh.protocol.tokens import Token, hash_of, new_secret
 from tests.page.conftest import HELD, Site, StartSite, driven, released, says, still
 from tests.page.driving import GAMEPAD, NO_GAMEPAD, drives, heard_at, held, hold, key, pointer
+from tests.page.polls import until
 from tests.support.browser import AXE, OFFLINE, SCREENSHOTS, Watched, needs_browser
 from tests.support.thorough import some
-from tests.support.waiting import until
 
 pytestmark = needs_browser
 

@@ -11,8 +11,8 @@ pytest.importorskip("rclpy")
 from tests.page.conftest import HELD, Site, StartSite, driven, says
 from tests.page.driving import heard_at, hold, pointer
 from tests.page.headsets import PATIENT_ROBOT
+from tests.page.polls import until
 from tests.support.browser import Watched, needs_browser
-from tests.support.waiting import until
 
 pytestmark = needs_browser
 RULES = PATIENT_ROBOT

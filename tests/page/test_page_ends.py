@@ -20,12 +20,12 @@ pytest.importorskip("rclpy")
 
 from tests.page.conftest import HELD, ROBOT, Act, Site
 from tests.page.driving import Heard, drives, heard_at, within
-from tests.page.headsets import UNDRAWN, WEBGL, by_grip, headset_at, needs_headset
-from tests.support.browser import OFFLINE, Watched, browser, needs_browser
-from tests.support.waiting import until
+from tests.page.headsets import UNDRAWN, by_grip, headset_at, needs_headset
+from tests.page.polls import until
+from tests.support.browser import OFFLINE, Watched, another, needs_browser
 
 if TYPE_CHECKING:
-    from playwright.async_api import Browser
+    from playwright.async_api import Browser, Playwright
 
 pytestmark = [needs_browser, pytest.mark.timeout(240)]
 AGE_S = 1.0
@@ -102,12 +102,12 @@ def tell(which: list[int], what: signal.Signals) -> None:
 
 
 @pytest.mark.parametrize("place", PLACES)
-async def test_a_browser_that_is_killed_stops_its_robot(site: Site, place: Open) -> None:
+async def test_a_browser_that_is_killed_stops_its_robot(site: Site, driver: Playwright, place: Open) -> None:
     """By SIGKILL, while it drives: nothing is said any more, and the robot stands in time."""
     async with heard_at(site) as heard:
 
         async def measured() -> float:
-            async with browser(*WEBGL) as own:
+            async with another(driver) as own:
                 at = await place(replace(site, chromium=always(own), pages=[]))
                 (first, *_) = await processes(own)
                 await at.drives(heard)
@@ -126,10 +126,10 @@ async def test_a_browser_that_is_killed_stops_its_robot(site: Site, place: Open)
 
 
 @pytest.mark.parametrize("place", PLACES)
-async def test_a_browser_that_stands_still_stops_its_robot(site: Site, place: Open) -> None:
+async def test_a_browser_that_stands_still_stops_its_robot(site: Site, driver: Playwright, place: Open) -> None:
     """By SIGSTOP to all its processes: the robot stands in time, and when they go on, with the hold still held, what
     was on its way and what is held drive nothing."""
-    async with heard_at(site) as heard, browser(*WEBGL) as own:
+    async with heard_at(site) as heard, another(driver) as own:
         at = await place(replace(site, chromium=always(own), pages=[]))
         every = await processes(own)
 
@@ -200,8 +200,8 @@ async def lost(at: Place) -> bool:
     return not await at.held()
 
 
-def always(own: Browser) -> Callable[..., Awaitable[Browser]]:
-    async def get(*_: str) -> Browser:
+def always(own: Browser) -> Callable[[], Awaitable[Browser]]:
+    async def get() -> Browser:
         return own
 
     return get

@@ -17,8 +17,8 @@ pytest.importorskip("rclpy")
 from macs_zenoh.protocol.rights import Rights
 from tests.page.conftest import HELD, Site, StartSite, released, says, signed_in, with_token
 from tests.page.driving import GAMEPAD, GAMEPAD_HELD, NO_GAMEPAD, Heard, face_buttons, heard_at, hold
+from tests.page.polls import until
 from tests.support.browser import Watched, needs_browser
-from tests.support.waiting import until
 
 pytestmark = needs_browser
 RULES = ""

@@ -11,9 +11,9 @@ import pytest
 from bridge.recording.bag import Bag
 from macs_zenoh.protocol.rights import Rights
 from tests.page.conftest import StartSite, released, says, signed_in, with_token
+from tests.page.polls import until
 from tests.support.browser import needs_browser
 from tests.support.programs import Program
-from tests.support.waiting import until
 
 pytest.importorskip("rclpy")
 pytest.importorskip("mcap", reason="needs the extra record: pip install 'macs-zenoh[record]'")

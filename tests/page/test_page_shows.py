@@ -13,8 +13,8 @@ pytest.importorskip("rclpy")
 from bridge.headset.client import Headset
 from macs_zenoh.typed import Types
 from tests.page.conftest import Site, says
+from tests.page.polls import until
 from tests.support.browser import Watched, needs_browser
-from tests.support.waiting import until
 
 pytestmark = needs_browser
 

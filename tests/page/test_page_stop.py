@@ -11,9 +11,9 @@ import pytest
 
 from macs_zenoh.protocol.rights import Rights
 from tests.page.conftest import DOMAINS, Site, StartSite, released, says, signed_in, with_token
+from tests.page.polls import until
 from tests.support.browser import OFFLINE, Watched, needs_browser
 from tests.support.programs import Program
-from tests.support.waiting import until
 
 pytest.importorskip("rclpy")
 pytestmark = needs_browser

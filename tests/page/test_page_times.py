@@ -17,9 +17,9 @@ pytest.importorskip("rclpy")
 
 from tests.page.conftest import HELD, Site, says
 from tests.page.driving import drives, heard_at, within
+from tests.page.polls import until
 from tests.support.browser import OFFLINE, Watched, needs_browser
 from tests.support.links import Link, counted
-from tests.support.waiting import until
 
 pytestmark = [needs_browser, pytest.mark.timeout(240)]
 

@@ -9,10 +9,10 @@ import pytest
 pytest.importorskip("rclpy")
 
 from tests.page.conftest import StartSite
+from tests.page.polls import until
 from tests.support.browser import Watched, needs_browser
 from tests.support.links import Link, counted
 from tests.support.programs import Program
-from tests.support.waiting import until
 
 pytestmark = [needs_browser, pytest.mark.timeout(280)]
 

@@ -28,11 +28,11 @@ pytest.importorskip("rclpy")
 from geometry_msgs.msg import PoseStamped, TwistStamped
 
 from tests.page.conftest import Site
-from tests.page.headsets import PATIENT_ROBOT, UNDRAWN, WEBGL, Headset, headset_at, needs_headset
+from tests.page.headsets import PATIENT_ROBOT, UNDRAWN, Headset, headset_at, needs_headset
+from tests.page.polls import until
 from tests.support.browser import needs_browser
 from tests.support.processes import Process
 from tests.support.ros_peer import Peer
-from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset, pytest.mark.alone, pytest.mark.soak, pytest.mark.timeout(280)]
 RULES = PATIENT_ROBOT
@@ -111,7 +111,7 @@ async def test_how_late_and_how_dear(site: Site, tmp_path: Path) -> None:
     try:
         await drives.listen(peer, TwistStamped, DRIVEN)
         await poses.listen(peer, PoseStamped, "/xr/head")
-        headset = await headset_at(site, settings=settings, size=UNDRAWN)
+        headset = await headset_at(site, settings=settings, size=UNDRAWN, rate="")
         await headset.ready(pictures=False)
         await pictures(headset, tmp_path)
         await headset.enter()
@@ -182,7 +182,7 @@ async def show(headset: Headset, topics: list[str]) -> None:
 async def with_two_cameras(site: Site, headset: Headset, offset: float, folder: Path) -> list[str]:
     await headset.value("macsXr.links.pictureMs.length = 0; macsXr.frameMs.length = 0")
     trace = folder / "trace.json"
-    browser = await site.chromium(*WEBGL)
+    browser = await site.chromium()
     await browser.start_tracing(page=headset.page, path=trace, categories=["toplevel", "devtools.timeline"])
     await asyncio.sleep(4)
     await browser.stop_tracing()

@@ -12,8 +12,8 @@ pytest.importorskip("rclpy")
 from bridge.settings import ROBOT_HIDES
 from tests.page.conftest import Site
 from tests.page.headsets import PATIENT_ROBOT, PICTURES, Pictures, headset_at, needs_headset
+from tests.page.polls import until
 from tests.support.browser import needs_browser
-from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
 RULES = f"""{PATIENT_ROBOT}

@@ -12,8 +12,8 @@ pytest.importorskip("rclpy")
 from tests.page.conftest import ROBOT, Site, StartSite
 from tests.page.driving import heard_at
 from tests.page.headsets import PATIENT_ROBOT, Headset, headset_at, needs_headset
+from tests.page.polls import until
 from tests.support.browser import OFFLINE, needs_browser
-from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
 RULES = PATIENT_ROBOT + ROBOT

@@ -17,8 +17,8 @@ pytest.importorskip("rclpy")
 from tests.page.conftest import Site
 from tests.page.driving import heard_at
 from tests.page.headsets import PATIENT_ROBOT, PICTURES, UNDRAWN, Pictures, by_grip, headset_at, needs_headset
+from tests.page.polls import until
 from tests.support.browser import needs_browser
-from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
 RULES = PATIENT_ROBOT

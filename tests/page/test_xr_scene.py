@@ -19,9 +19,9 @@ from sensor_msgs.msg import Joy
 from tests.page.conftest import ROBOT, Site
 from tests.page.driving import Heard, heard_at
 from tests.page.headsets import PATIENT_ROBOT, UNDRAWN, Headset, about_up, headset_at, needs_headset
+from tests.page.polls import until
 from tests.support.browser import needs_browser
 from tests.support.ros_peer import Peer
-from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
 RULES = PATIENT_ROBOT + ROBOT

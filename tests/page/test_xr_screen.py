@@ -12,8 +12,8 @@ pytest.importorskip("rclpy")  # the kit has a camera, which is a ROS node
 
 from tests.page.conftest import Gate
 from tests.page.headsets import UNDRAWN, headset_at, needs_headset
+from tests.page.polls import until
 from tests.support.browser import needs_browser
-from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
 

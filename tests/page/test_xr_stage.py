@@ -9,8 +9,8 @@ pytest.importorskip("rclpy")  # the kit has a camera, which is a ROS node
 from bridge.page.routes import POLICY
 from tests.page.conftest import Gate
 from tests.page.headsets import UNDRAWN, headset_at, needs_headset
+from tests.page.polls import until
 from tests.support.browser import AXE, needs_browser
-from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
 

@@ -14,9 +14,9 @@ from geometry_msgs.msg import PoseStamped
 from tests.page.conftest import Site
 from tests.page.driving import Heard, heard_at
 from tests.page.headsets import PATIENT_ROBOT, Headset, headset_at, needs_headset
+from tests.page.polls import until
 from tests.support.browser import needs_browser
 from tests.support.ros_peer import Peer
-from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset]
 RULES = PATIENT_ROBOT

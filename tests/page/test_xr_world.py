@@ -17,9 +17,9 @@ from std_msgs.msg import Float32
 
 from tests.page.conftest import Site
 from tests.page.headsets import headset_at, needs_headset
+from tests.page.polls import until
 from tests.support.browser import needs_browser
 from tests.support.ros_peer import Peer
-from tests.support.waiting import until
 
 pytestmark = [needs_browser, needs_headset, pytest.mark.timeout(200)]
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from playwright.async_api import Browser, BrowserContext, Page
+    from playwright.async_api import Browser, BrowserContext, Page, Playwright
 
 ROOT = Path(__file__).parents[2]
 STATIC = ROOT / "bridge" / "page" / "static"
@@ -26,7 +26,12 @@ OFFLINE = re.compile(r"net::ERR_|WebSocket connection to .* failed|Failed to loa
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 SHELL = "chromium-headless-shell"
 """The same without windows and what a browser says by itself, for little more than half of the processor's time."""
-ARGUMENTS = ("--no-sandbox", "--disable-background-networking", "--disable-component-update", "--no-first-run")
+ARGUMENTS = (
+    *("--no-sandbox", "--disable-background-networking", "--disable-component-update", "--no-first-run"),
+    # WebGL by the processor, and by it alone: a page is put together without it, for half of what that takes
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
+    "--disable-gpu-compositing",
+)
 
 
 def node() -> list[str] | None:
@@ -95,12 +100,18 @@ async def browser(*arguments: str, whole: bool = False) -> AsyncIterator[Browser
     """A Chromium with nothing in its cache, started with these arguments as well; `whole`: with its own pages too."""
     from playwright.async_api import async_playwright
 
-    async with async_playwright() as playwright:
-        opened = await playwright.chromium.launch(executable_path=chromium(whole=whole), args=[*ARGUMENTS, *arguments])
-        try:
-            yield opened
-        finally:
-            await opened.close()
+    async with async_playwright() as driver, another(driver, *arguments, whole=whole) as started:
+        yield started
+
+
+@asynccontextmanager
+async def another(driver: Playwright, *arguments: str, whole: bool = False) -> AsyncIterator[Browser]:
+    """The same by a driver that is there: a process that takes as much to start as the browser."""
+    started = await driver.chromium.launch(executable_path=chromium(whole=whole), args=[*ARGUMENTS, *arguments])
+    try:
+        yield started
+    finally:
+        await started.close()
 
 
 async def opened(context: Browser | BrowserContext, url: str, **options: Any) -> Watched:

@@ -1,8 +1,8 @@
 """How the tests of a parallel run are shared out: by name, pure but for the scheduler at the end.
 
-A test is handed to whichever worker is free. Tests of one page's module share a site, and those of a worker its
-browsers, which take more of a machine than the tests themselves: so few workers have all of them. What takes long
-comes first, so that nobody waits for it at the end; modules of a moment are in between, since most of the others wait.
+A test is handed to whichever worker is free. Tests of pages share a site, and those of a worker its browser, which
+take more of a machine than the tests themselves: so few workers have all of them. What takes long comes first, so that
+nobody waits for it at the end; modules of a moment are in between, since most of the others wait.
 """
 
 from __future__ import annotations
@@ -15,6 +15,13 @@ from xdist.scheduler import LoadScopeScheduling
 PAGES = "tests/page/"
 BROWSERS = 3
 """So many workers have one at most."""
+IN_NODE = (
+    "tests/page/test_macs_js.py",
+    "tests/page/test_xr_command.py",
+    "tests/page/test_xr_pure.py",
+    "tests/page/test_xr_shown.py",
+)
+"""Files there whose tests run in node, and share nothing."""
 
 LONG = (
     "tests/conformance/",
@@ -43,11 +50,16 @@ def path_of(name: str) -> str:
     return name.partition("::")[0]
 
 
+def shown(name: str) -> bool:
+    """Whether a test looks at a page in a browser."""
+    return name.startswith(PAGES) and not name.startswith(IN_NODE)
+
+
 def page_groups(names: Iterable[str]) -> dict[str, str]:
     """The group of each file with pages: as many groups as there may be browsers, as equal as files allow."""
     counts: dict[str, int] = {}
     for name in names:
-        if name.startswith(PAGES):
+        if shown(name):
             counts[path_of(name)] = counts.get(path_of(name), 0) + 1
     sizes = dict.fromkeys(range(BROWSERS), 0)
     groups = {}
@@ -74,8 +86,10 @@ def order(names: Sequence[str]) -> list[int]:
 
     def place(index: int) -> tuple[int, float]:
         name = names[index]
-        if name.startswith((PAGES, *LONG)):
-            return (0, 0.0) if name.startswith(PAGES) else (1, 0.0)
+        if shown(name):
+            return 0, 0.0
+        if name.startswith(LONG):
+            return 1, 0.0
         path = path_of(name)
         return (2, (quick[path] - first) / (last - first + 1) if path in quick else places[name])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.support.sharing import BROWSERS, ONE_WORKER, TOGETHER, order, page_groups, path_of, scope_of
+from tests.support.sharing import BROWSERS, IN_NODE, ONE_WORKER, TOGETHER, order, page_groups, path_of, scope_of
 
 PAGES = [f"tests/page/test_{letter}.py::test_{number}" for letter in "abcde" for number in range(5)]
 QUICK = [f"tests/unit/test_{letter}.py::test_{number}" for letter in "abcd" for number in range(3)]
@@ -25,9 +25,10 @@ def test_what_waits_for_the_same_is_handed_out_together() -> None:
     assert {scope_of(name, groups) for name in PAGES} == set(groups.values())
     assert scope_of(QUICK[0], groups) == path_of(QUICK[0])
     assert {scope_of(f"{ONE_WORKER[0]}::test_{letter}", groups) for letter in "ab"} == {ONE_WORKER[0]}
-    assert scope_of(OTHERS[0], groups) == OTHERS[0]
     for group in TOGETHER:
         assert len({scope_of(f"{path}::test_a", groups) for path in group}) == 1
+    for name in (OTHERS[0], f"{IN_NODE[0]}::test_frames"):
+        assert scope_of(name, page_groups([*PAGES, name])) == name
 
 
 def test_what_is_long_comes_first() -> None:
