@@ -124,10 +124,11 @@ class Site:
         """Of the page."""
         return f"http://127.0.0.1:{self.web_port}/"
 
-    async def open(self, path: str = "", **options: Any) -> Watched:
-        """A page in a browser of its own, so far as cache and cookies go."""
+    async def open(self, path: str = "", *, script: str = "", **options: Any) -> Watched:
+        """A page in a browser of its own, so far as cache and cookies go, that runs a script before its own."""
         options = {"viewport": {"width": 1280, "height": 900}, "color_scheme": "dark", **options}
         context = await (await self.chromium()).new_context(**options)
+        await context.add_init_script(script=f"{{{script}}}")
         page = await opened(context, self.url + path)
         self.pages.append(page)
         return page

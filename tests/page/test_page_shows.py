@@ -63,6 +63,22 @@ async def test_a_map_lies_under_the_place(site: Site) -> None:
     await until(pillars)
 
 
+NO_PERIODS = """
+const { setTimeout: wait } = window;
+window.setTimeout = (act, ms, ...more) => wait(act, ms === 500 || ms === 2000 ? 1e9 : ms, ...more);
+"""
+"""Nothing is asked for again."""
+
+
+async def test_a_robot_is_asked_for_what_it_has_as_soon_as_it_is_there(site: Site) -> None:
+    """Its panels and its state do not wait for the next time that a page asks by itself; nor when it comes back."""
+    page = await site.open(script=NO_PERIODS)
+    await page.page.wait_for_selector('#pad[aria-disabled="false"]', timeout=60_000)
+    dropped = "(macsPage.headset.drop(), document.querySelector('#pad').getAttribute('aria-disabled'))"
+    assert await page.value(dropped) == "true"
+    await page.page.wait_for_selector('#pad[aria-disabled="false"]', timeout=60_000)
+
+
 async def test_a_plot_has_the_line_of_its_numbers(site: Site) -> None:
     """It is drawn, and grows: what is counted as a point is also seen."""
     page = await site.with_robot()

@@ -134,6 +134,7 @@ class Shown {
     this.drive = null;
     this.online = false;
     this.status = null;
+    this.waits = new Set();
     const { headset, driver, topics, types, may } = page;
     this.parts = { headset, driver, topics, types, may, stop: page.stop, tell: page.tell };
     this.areas = Object.fromEntries(["cameras", "control", "plots", "tables"].map((name) => [name, h("div", { class: `area ${name}` })]));
@@ -148,8 +149,10 @@ class Shown {
   }
 
   setOnline(online) {
-    if (online && !this.online) this.page.types.forget(this.robot);
+    const came = online && !this.online;
+    if (came) this.page.types.forget(this.robot);
     this.online = online;
+    if (came) for (const ask of this.waits) ask();
     this.drive?.setOnline(online);
     this.place.classList.toggle("lost", !online);
     this.#tellFacts();
@@ -182,7 +185,7 @@ class Shown {
     }
   }
 
-  /** Ask the gateway every so often, while the page is seen. */
+  /** Ask the gateway as soon as the robot is there, and every so often, while the page is seen. */
   async #every(ms, what, take) {
     while (!this.ended) {
       if (this.online && this.page.headset.connected && !document.hidden) {
@@ -192,7 +195,11 @@ class Shown {
         this.problem = answer?.error ?? "";
         this.#tellFacts();
       }
-      await new Promise((resolve) => setTimeout(resolve, ms));
+      await new Promise((resolve) => {
+        const ask = () => (clearTimeout(timer), this.waits.delete(ask), resolve());
+        const timer = setTimeout(ask, ms);
+        this.waits.add(ask);
+      });
     }
   }
 
