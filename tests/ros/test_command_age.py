@@ -91,12 +91,13 @@ class Site:
         return found
 
     async def drive(self, count: int, first: int = 1) -> None:
-        """Command, each with its number."""
-        loop = asyncio.get_running_loop()
+        """Command, each with its number, until the relay has met them all."""
+        loop, met = asyncio.get_running_loop(), self.relay.commands
         began = loop.time()
         for number in range(count):
             await self.commands.publish(twist(first + number))
             await asyncio.sleep(began + (number + 1) / HZ - loop.time())
+        await until(lambda: self.relay.commands >= met + count)
 
     @property
     def carried_out(self) -> list[float]:

@@ -20,6 +20,7 @@ PAGES = sorted(
 FOLDERS = ("macs_zenoh", "bridge", "config", "tests", "benchmarks", "examples", "interfaces")
 NOT_OURS = {
     *("nd__turn", "OnApplicationPause", "AmbientCapabilities", "CapabilityBoundingSet", "CAP_NET_BIND_SERVICE"),
+    "TasksMax",
     *("call_failed", "call_invalid"),  # made of call_ and the kind of failure
     *("cmd_vel_timeout", "rmw_zenohd"),  # of ROS
 }
