@@ -64,6 +64,15 @@ async def test_it_is_ended_by_the_same(starter: Starter, number: signal.Signals,
         forked.send_signal(number)
 
 
+async def test_it_reads_what_it_is_told(starter: Starter) -> None:
+    """Standard input is a pipe, which ends with whoever told it something."""
+    forked = await starter.fork("json.tool", ["--compact"], os.environ, with_input=True)
+    assert forked.stdin is not None
+    forked.stdin.write(b'{"a": [1, 2]}')
+    assert await forked.communicate() == (b'{"a":[1,2]}\n', b"")
+    assert forked.returncode == 0
+
+
 async def test_it_has_nothing_of_the_others(starter: Starter) -> None:
     """Descriptors of programs that run are not left to those that come: the end of each is seen."""
     made: list[Forked] = []

@@ -35,9 +35,9 @@ from macs_zenoh.protocol.messages import (
 from macs_zenoh.protocol.wire import encode_frame, encode_message
 from macs_zenoh.streams import Streams
 from macs_zenoh.typed import Types, request_of, response_of
+from tests.support.forks import Forked, started
 from tests.support.waiting import PATIENCE_S, until
 
-ROOT = Path(__file__).parents[2]
 SET_BOOL = "std_srvs/SetBool"
 STRING = "std_msgs/String"
 TYPES = Types()
@@ -111,7 +111,7 @@ class EchoRobot:
 class Process:
     """One `macs headset …` with its lines."""
 
-    def __init__(self, process: asyncio.subprocess.Process) -> None:
+    def __init__(self, process: asyncio.subprocess.Process | Forked) -> None:
         self.process = process
         self.told = ""
         """What was read of its log so far."""
@@ -191,20 +191,17 @@ async def robot(mesh_settings: MeshSettings, gateway: Gateway) -> AsyncIterator[
 @pytest.fixture
 async def start(gateway: Gateway) -> AsyncIterator[Start]:
     """Start `macs headset` with these words, by default at the gateway."""
-    started: list[asyncio.subprocess.Process] = []
+    running: list[asyncio.subprocess.Process | Forked] = []
 
     async def start(*words: str, port: int | None = None, options: tuple[str, ...] = ()) -> Process:
-        pipe = asyncio.subprocess.PIPE
         target = f"127.0.0.1:{port or gateway.port}"
-        arguments = ["-m", "bridge", "headset", target, *options, *words]
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, *arguments, stdin=pipe, stdout=pipe, stderr=pipe, cwd=ROOT, env=dict(os.environ)
-        )
-        started.append(process)
+        command = [sys.executable, "-m", "bridge", "headset", target, *options, *words]
+        process = await started(command, os.environ, asyncio.subprocess.PIPE)
+        running.append(process)
         return Process(process)
 
     yield start
-    for process in started:
+    for process in running:
         if process.returncode is None:
             process.kill()
             await process.communicate()
@@ -363,7 +360,7 @@ async def test_a_reader_that_leaves_ends_it(start: Start, robot: EchoRobot) -> N
     """When the reader of stdout leaves, as `head` does, the headset ends without a traceback."""
     process = await start("sub", "/talk", "std_msgs/String")
     await robot.registered(NodeType.SUBSCRIBER, "nd__talk")
-    process.process._transport.get_pipe_transport(1).close()  # type: ignore[attr-defined]
+    process.process.stdout._transport.close()  # type: ignore[attr-defined]
     cdr = TYPES.serialize("std_msgs/String", {"data": "hello"})
     while process.process.returncode is None:
         robot.stream("nd__talk", "std_msgs/String", cdr)

@@ -47,10 +47,15 @@ class Forked:
     """A program, as `asyncio.subprocess.Process` is one."""
 
     def __init__(
-        self, pid: int, out: asyncio.StreamReader, errors: asyncio.StreamReader, told: asyncio.StreamReader
+        self,
+        pid: int,
+        stdin: asyncio.StreamWriter | None,
+        out: asyncio.StreamReader,
+        errors: asyncio.StreamReader,
+        told: asyncio.StreamReader,
     ) -> None:
         self.pid = pid
-        self.stdin: asyncio.StreamWriter | None = None
+        self.stdin = stdin
         self.stdout, self.stderr = out, errors
         self.returncode: int | None = None
         self._ended = asyncio.get_running_loop().create_task(self._end(told))
@@ -66,7 +71,9 @@ class Forked:
         return await asyncio.shield(self._ended)
 
     async def communicate(self) -> tuple[bytes, bytes]:
-        """All that it writes until its end."""
+        """End its input; all that it writes until its end."""
+        if self.stdin is not None:
+            self.stdin.close()
         out, errors = await asyncio.gather(self.stdout.read(), self.stderr.read())
         await self.wait()
         return out, errors
@@ -110,11 +117,17 @@ class Starter:
         self._channel.close()
         self._process.wait()
 
-    async def fork(self, module: str, argv: Sequence[str], env: Mapping[str, str]) -> Forked:
-        """Have a program."""
+    async def fork(
+        self, module: str, argv: Sequence[str], env: Mapping[str, str], *, with_input: bool = False
+    ) -> Forked:
+        """Have a program; without input it reads nothing."""
         loop = asyncio.get_running_loop()
-        readers, theirs = [], []
+        readers, theirs, stdin = [], [], None
         try:
+            if with_input:
+                read, write = os.pipe()
+                theirs.append(read)
+                stdin = await _writer(write)
             for _ in range(3):
                 read, write = os.pipe()
                 theirs.append(write)
@@ -127,7 +140,17 @@ class Starter:
             for descriptor in theirs:
                 os.close(descriptor)
         out, errors, told = readers
-        return Forked(int(await told.readline()), out, errors, told)
+        return Forked(int(await told.readline()), stdin, out, errors, told)
+
+
+async def _writer(descriptor: int) -> asyncio.StreamWriter:
+    """The end of a pipe that is written to."""
+    loop = asyncio.get_running_loop()
+    pipe = os.fdopen(descriptor, "wb", 0)
+    transport, protocol = await loop.connect_write_pipe(
+        lambda: asyncio.StreamReaderProtocol(asyncio.StreamReader()), pipe
+    )
+    return asyncio.StreamWriter(transport, protocol, None, loop)
 
 
 _starters: dict[frozenset[tuple[str, str]], Starter] = {}
@@ -138,10 +161,10 @@ async def started(
     command: Sequence[str], env: Mapping[str, str], stdin: int | None = None
 ) -> asyncio.subprocess.Process | Forked:
     """Start a command, forked where that is the same as executed. Its output is piped."""
-    if stdin is None and _is_ours(command):
+    if stdin in (None, asyncio.subprocess.PIPE) and _is_ours(command):
         starter = await asyncio.to_thread(_starter, env)
         if starter is not None:
-            return await starter.fork(command[2], command[3:], env)
+            return await starter.fork(command[2], command[3:], env, with_input=stdin is not None)
     pipe = asyncio.subprocess.PIPE
     return await asyncio.create_subprocess_exec(
         *command, cwd=ROOT, env=env, stdin=stdin, stdout=pipe, stderr=pipe, limit=LINE_BYTES

@@ -3,7 +3,8 @@
 ``python -m tests.support.starter DESCRIPTOR MODULE...`` loads the modules, says over the socket how many threads it
 has, and starts what it is then asked for, one request a packet: ``{"module", "argv", "cwd", "env"}`` with three
 descriptors, for standard output, standard error, and what becomes of the program: its pid on a line, and at its end
-its exit code as `subprocess` has it. It ends when nobody can ask any more.
+its exit code as `subprocess` has it; with one for standard input before them where it reads any. It ends when nobody
+can ask any more.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def _serve(channel: socket.socket) -> tuple[dict[str, Any], list[int]] | None:
             _tell_ends(children)
         if channel not in ready:
             continue
-        request, descriptors, *_ = socket.recv_fds(channel, REQUEST_BYTES, 3)
+        request, descriptors, *_ = socket.recv_fds(channel, REQUEST_BYTES, 4)
         if not request:
             return None
         pid = os.fork()
@@ -91,10 +92,12 @@ def _tell(descriptor: int, number: int) -> None:
 
 def _become(asked: dict[str, Any], descriptors: list[int]) -> None:
     """Be that program, from its first line on."""
-    out, errors, told = descriptors
+    *given, out, errors, _ = descriptors
+    for stdin in given:
+        os.dup2(stdin, 0)
     os.dup2(out, 1)
     os.dup2(errors, 2)
-    for descriptor in (out, errors, told):
+    for descriptor in descriptors:
         os.close(descriptor)
     os.chdir(asked["cwd"])
     os.environ.clear()
