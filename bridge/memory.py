@@ -9,10 +9,11 @@ LARGE_BYTES = 4 << 20
 SPARE_BYTES = 32 << 20
 """A heap keeps so much at its end, until `CALM_S` after the last large sample."""
 
-SELDOM, YOUNG, OLD = 10_000, 2, 50
-"""So many objects more than before have Python look for circles among the young ones, by itself 700; after so many
-such looks among those that have stayed, by itself 10; and after so many of these among all, by itself 10. What has
-stayed is what came since: with 10 one such look held up a gateway for 26 ms, measured while a thousand joined."""
+SELDOM, YOUNG, OLD = 10_000, 0, 100
+"""So many objects more than before have Python look for circles among the young ones, by itself 700; beyond so many
+such looks among those that have stayed, by itself 10; and beyond so many of these among all, by itself 10. What has
+stayed is what came since: with 10 one such look held up a gateway for 26 ms, measured while a thousand joined. Every
+second look is one, so that nothing is looked at more than twice while it is young."""
 
 
 def give_back() -> None:

@@ -60,6 +60,7 @@ class Admission:
         self._max_connections = max_connections
         self._max_per_address = max_per_address
         self._inside: Counter[str] = Counter()
+        self._in_all = 0
         self._strangers: Counter[str] = Counter()
 
     def judge(self, address: str, *, stranger: bool = False) -> tuple[str, str] | None:
@@ -67,7 +68,7 @@ class Admission:
         ``stranger``: it has yet to show a token."""
         if self._allow and not is_in(address, self._allow):
             return "address_not_allowed", "its address is not in gateway.allow"
-        if self._inside.total() >= self._max_connections:
+        if self._in_all >= self._max_connections:
             return "too_many_connections", f"{self._max_connections} are connected (gateway.max_connections)"
         if self._inside[address] >= self._max_per_address:
             limit = f"{self._max_per_address} are connected from there (gateway.max_connections_per_address)"
@@ -81,6 +82,7 @@ class Admission:
     def enter(self, address: str, *, stranger: bool = False) -> None:
         """A connection from this address was let in."""
         self._inside[address] += 1
+        self._in_all += 1
         if stranger:
             self._strangers[address] += 1
 
@@ -92,6 +94,7 @@ class Admission:
 
     def leave(self, address: str) -> None:
         """It has ended."""
+        self._in_all -= 1
         self._inside[address] -= 1
         if self._inside[address] <= 0:
             del self._inside[address]

@@ -7,8 +7,9 @@ import logging
 import math
 import sys
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Sequence
+from functools import cached_property
 from itertools import chain
 from typing import cast
 
@@ -70,6 +71,52 @@ LEAST_READ_BYTES = 1024
 class Connection(asyncio.BufferedProtocol):
     """A TCP agent's socket. Everything it means is decided in `TcpAgent` and by its gateway."""
 
+    stranger = False
+    """Whether a token is wanted of its agent, and it has shown none yet."""
+    _not_let_in = False
+    asleep = False
+    """Whether its socket is gone, and the agent may come back over another."""
+    unseen = False
+    """Whether others may not see its agent yet, which has said nothing but what it is."""
+    seen_asleep = 0
+    """The so many-th sleep in which others see it; 0 while they see it awake."""
+    _successor: Connection | None = None
+    """Whose socket it is now, when its agent turned out to be one that was here before."""
+    shown_token: str | None = None
+    """What was shown before the first frame, where that is possible."""
+    greeted = False
+    greeted_at = -math.inf
+    _timer: asyncio.TimerHandle | None = None
+    drove_at = -math.inf
+    """When it sent a robot a command last."""
+    _refused = False
+    _pauses = 0
+    _waits = False
+    """Whether that waits for its turn: then the agent is not read from."""
+    _flushes = False
+    """Whether what was gathered for it waits for its turn."""
+    _lost = False
+    """Whether the socket has ended meanwhile."""
+    _closed = False
+    """Whether it was closed from here: what it says behind that does not count."""
+    received_bytes = 0
+    _unfinished = 0
+    """What is counted for it of a frame that has begun."""
+    _read_bytes = FIRST_READ_BYTES
+    """How much is read at once: less, when little of it makes much work, more when much makes little."""
+    _asked_at = 0.0
+    """When room for bytes was asked for last."""
+    _unread = 0
+    """Of what waited in the socket when the agent's time had run out: how much is still to be read."""
+    _looked = False
+    _read_by = math.inf
+    congested = False
+    """Whether so much waits for this agent that its senders should slow down."""
+    _tolled: asyncio.TimerHandle | None = None
+    grouped_at = -math.inf
+    """When it came into the group that others see it in, by the loop's clock."""
+    regrouping: asyncio.TimerHandle | None = None
+
     def __init__(
         self,
         owner: Owner,
@@ -81,25 +128,9 @@ class Connection(asyncio.BufferedProtocol):
     ) -> None:
         self.owner = owner
         self.entrance = entrance
-        self.stranger = False
-        """Whether a token is wanted of its agent, and it has shown none yet."""
-        self._not_let_in = False
-        self.asleep = False
-        """Whether its socket is gone, and the agent may come back over another."""
-        self.unseen = False
-        """Whether others may not see its agent yet, which has said nothing but what it is."""
-        self.seen_asleep = 0
-        """The so many-th sleep in which others see it; 0 while they see it awake."""
-        self._successor: Connection | None = None
-        """Whose socket it is now, when its agent turned out to be one that was here before."""
-        self.shown_token: str | None = None
-        """What was shown before the first frame, where that is possible."""
         self.peer: TcpAgent
         self.recipient: Recipient
         """What may be said to the agent."""
-        self.pace: Pace
-        self.greeted = False
-        self.greeted_at = -math.inf
         self.host = self.address = "?"
         self.drops = Losses(log)
         self._outbox = Outbox(outbox_bytes)
@@ -109,47 +140,22 @@ class Connection(asyncio.BufferedProtocol):
         self._transport: asyncio.Transport
         self._writer = Writer(self._outbox)
         self._loop = asyncio.get_running_loop()
-        self._timer: asyncio.TimerHandle | None = None
         self._told: dict[Hashable, float] = {}
         """What the agent was told of its rights, and when."""
-        self.drove_at = -math.inf
-        """When it sent a robot a command last."""
-        self._refused = False
-        self._pauses = 0
         self._share = Share()
-        self._rest: deque[Iterator[Event]] = deque()
+        self._rest: list[Iterator[Event]] = []
         """What the agent did and is not handled yet, since that takes longer than a turn."""
-        self._waits = False
-        """Whether that waits for its turn: then the agent is not read from."""
-        self._flushes = False
-        """Whether what was gathered for it waits for its turn."""
-        self._lost = False
-        """Whether the socket has ended meanwhile."""
-        self._closed = False
-        """Whether it was closed from here: what it says behind that does not count."""
-        self.received_bytes = 0
-        self._unfinished = 0
-        """What is counted for it of a frame that has begun."""
-        self._read_bytes = FIRST_READ_BYTES
-        """How much is read at once: less, when little of it makes much work, more when much makes little."""
-        self._asked_at = 0.0
-        """When room for bytes was asked for last."""
-        self._unread = 0
-        """Of what waited in the socket when the agent's time had run out: how much is still to be read."""
-        self._looked = False
-        self._read_by = math.inf
-        self.congested = False
-        """Whether so much waits for this agent that its senders should slow down."""
         self.backpressure = Backpressure()
         self.robot_backpressure = Backpressure()
         """For robot programs, which can wait longer."""
         self.patience = Patience()
         """With others that it sends to."""
         self._toll = Toll(REQUESTS_PER_S)
-        self._tolled: asyncio.TimerHandle | None = None
-        self.grouped_at = -math.inf
-        """When it came into the group that others see it in, by the loop's clock."""
-        self.regrouping: asyncio.TimerHandle | None = None
+
+    @cached_property
+    def pace(self) -> Pace:
+        """How fast it may send to robots, from when it first does: most only look."""
+        return self.owner.pace()
 
     @property
     def sent_bytes(self) -> int:
@@ -197,7 +203,6 @@ class Connection(asyncio.BufferedProtocol):
         self.peer = peer
         self.recipient = peer.recipient
         self.greeted, self.greeted_at = True, time.monotonic()
-        self.pace = self.owner.pace()
         self._writer.write([peer.welcome()])
         self.resume()
         self._schedule()
@@ -257,12 +262,12 @@ class Connection(asyncio.BufferedProtocol):
         self._transport = ENDED
         if self._rest:  # what was said before comes first
             self._lost = True
-            if self._timer is not None:
-                self._timer.cancel()
+            self._look_no_more()
             return
         if self.greeted and not self._refused and self.owner.sleeps(self):
             return
-        for timer in (self._timer, self._tolled, self.regrouping):
+        self._look_no_more()
+        for timer in (self._tolled, self.regrouping):
             if timer is not None:
                 timer.cancel()
         self._writer.close_direct()
@@ -318,7 +323,7 @@ class Connection(asyncio.BufferedProtocol):
                 if self._fails():
                     log.exception("%s: %s failed (logged once, counted as failed)", self, type(event).__name__)
             if self._successor is not None:
-                rest, self._rest = self._rest, deque()
+                rest, self._rest = self._rest, []
                 self._successor.take(chain.from_iterable(rest), began)
                 return
             if isinstance(event, Joined) and self._closed:
@@ -341,7 +346,7 @@ class Connection(asyncio.BufferedProtocol):
             except Exception:
                 if self._fails():
                     log.exception("%s: reading failed (logged once, counted as failed)", self)
-            self._rest.popleft()
+            del self._rest[0]
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, Rejected):
@@ -588,8 +593,7 @@ class Connection(asyncio.BufferedProtocol):
         transport, self._transport = self._transport, ENDED
         self.asleep = True
         self._writer.fall_asleep()
-        if self._timer is not None:
-            self._timer.cancel()
+        self._look_no_more()
         if self._tolled is not None:
             self._tolled.cancel()
             self._go_on()
@@ -632,8 +636,7 @@ class Connection(asyncio.BufferedProtocol):
         """What comes through this socket is another connection's from now on."""
         transport, self._transport = self._transport, ENDED
         self._successor = successor
-        if self._timer is not None:
-            self._timer.cancel()
+        self._look_no_more()
         self._writer.detach()
         self._memory.unfinished.note(self, self.host, 0)
         self._memory.waiting.set(self, self.host, 0)
@@ -653,12 +656,10 @@ class Connection(asyncio.BufferedProtocol):
 
     def all_drops(self) -> Counter[str]:
         """Everything that was dropped for this agent, by name."""
-        return self.drops + self.peer.drops + self._outbox.drops
+        return sum(filter(None, (self.drops, self.peer.drops, self._outbox.drops)), Counter[str]())
 
     def _schedule(self) -> None:
-        """Look again when time may have run out; sooner is never needed."""
-        if self._timer is not None:
-            self._timer.cancel()
+        """Look again when time may have run out; sooner is never needed, and who looks too early looks again."""
         due = self.peer.next_deadline()
         paused_at = self._writer.paused_at
         if paused_at is not None:
@@ -668,9 +669,19 @@ class Connection(asyncio.BufferedProtocol):
         delay_s = max(0.0, due - now) + 0.001
         if self._unread > 0:
             delay_s = max(delay_s, READ_S)
-        self._timer = asyncio.get_running_loop().call_later(delay_s, self._tick)
+        if self._timer is not None:
+            if self._timer.when() <= self._loop.time() + delay_s:
+                return
+            self._timer.cancel()
+        self._timer = self._loop.call_later(delay_s, self._tick)
+
+    def _look_no_more(self) -> None:
+        timer, self._timer = self._timer, None
+        if timer is not None:
+            timer.cancel()
 
     def _tick(self) -> None:
+        self._timer = None
         now = time.monotonic()
         in_time = now < self.peer.next_deadline()
         if in_time:

@@ -353,7 +353,8 @@ class Gateway:
             self._drops.once("zenoh_program", what, connection.address)
         self._forwarding.leave(connection)
         self._roll.changed()
-        self._drops += connection.all_drops()
+        if drops := connection.all_drops():
+            self._drops += drops
         self._received_bytes += connection.received_bytes
         self._sent_bytes += connection.sent_bytes
         self._delivery.forget()

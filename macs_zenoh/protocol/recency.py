@@ -10,7 +10,6 @@ that question.
 from __future__ import annotations
 
 import math
-from collections import deque
 
 QUESTIONS = 1 << 30
 """Numbers of questions are larger; those of connections are smaller."""
@@ -38,14 +37,14 @@ class Recency:
         """Whether its answers come so soon that one which does not come tells something."""
         self._slow = 0
         self._number = QUESTIONS
-        self._open: deque[tuple[int, float]] = deque()
+        self._open: list[tuple[int, float]] = []
         self._since = -math.inf
         """What comes now was said after this."""
 
     def ask(self, now: float) -> int | None:
         """A question is asked now: its number. None: so many are open that it had better not be."""
         while self._open and now - self._open[0][1] > self.LOST_S:
-            self._open.popleft()
+            del self._open[0]
         if len(self._open) >= self.OPEN:
             return None
         self._number += 1
@@ -58,7 +57,7 @@ class Recency:
         at = next((at for asked, at in self._open if asked == number), None)
         if at is None:
             return
-        while self._open.popleft()[0] != number:
+        while self._open.pop(0)[0] != number:
             pass  # it answers in order, if at all
         self._since = at
         if now - at <= self.QUICK_S:

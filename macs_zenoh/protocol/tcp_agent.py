@@ -12,7 +12,7 @@ Frames that come before the configuration are held until it is there, because he
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from enum import Enum
@@ -265,6 +265,29 @@ class TcpAgent:
     PERMITTED = 1024
     """So many kinds of frames are remembered as permitted, or not, by the rights of a token."""
 
+    returns = False
+    """Whether the agent says that it comes back when its connection ends."""
+    heard = 0
+    """How many frames of its session have come: all but the first configuration on each connection."""
+    grant: Grant = OPEN
+    _rights: Rights | None = None
+    agent_type = 0
+    group = 0
+    extensions = 0
+    """Version of our extensions that the agent says it understands; 0 is an existing program."""
+    functionality: Functionality | None = None
+    """What a robot last said that it offers."""
+    state = GREETED
+    corrected = 0
+    floods = False
+    """Whether it sends robots more commands than it may: those are dropped unread, until whoever set this resets
+    it."""
+    partial_bytes = 0
+    """How much memory a frame has that has begun and is not whole."""
+    _held_bytes = 0
+    _partial_since: float | None = None
+    _partial_begun = 0
+
     def __init__(
         self,
         agent_id: int,
@@ -291,15 +314,9 @@ class TcpAgent:
         self._admit = admit
         self._resume = resume
         self._members = members
-        self.returns = False
-        """Whether the agent says that it comes back when its connection ends."""
-        self.heard = 0
-        """How many frames of its session have come: all but the first configuration on each connection."""
-        self.grant: Grant = OPEN
-        self._rights: Rights | None = None
         self._permitted: dict[tuple[bytes, int, str, str], str | None] = {}
         """Of an agent with a token: why what goes there, and is that, may not go on."""
-        self._questions: deque[int] = deque(maxlen=2 * Recency.OPEN)
+        self._questions: list[int] = []
         """What it was asked last and has not answered."""
         self._registered: dict[tuple[int, str], Registering] = {}
         """Of an agent with a token: what it registered, by node type and name, and where."""
@@ -308,20 +325,7 @@ class TcpAgent:
         self.agent_id = agent_id
         self.former_ids: set[int] = set()
         self.connection_number = connection_number
-        self.agent_type = 0
-        self.group = 0
-        self.extensions = 0
-        """Version of our extensions that the agent says it understands; 0 is an existing program."""
-        self.functionality: Functionality | None = None
-        """What a robot last said that it offers."""
-        self.state = GREETED
         self.drops: Counter[str] = Counter()
-        self.corrected = 0
-        self.floods = False
-        """Whether it sends robots more commands than it may: those are dropped unread, until whoever set this resets
-        it."""
-        self.partial_bytes = 0
-        """How much memory a frame has that has begun and is not whole."""
         self._limits = limits
         self._custom = custom
         self.recipient = recipient or Recipient()
@@ -331,14 +335,11 @@ class TcpAgent:
         self._decoder = FrameDecoder(limits.max_frame_bytes, layout, scratch)
         if stranger:  # a frame behind its configuration may have come with it: its size is judged as an agent's
             self._limits = limits._replace(held_bytes=min(limits.held_bytes, STRANGER_HELD_BYTES))
-        self._held: deque[Frames] = deque()
-        self._held_bytes = 0
+        self._held: list[Frames] = []
         self._stops = Credit(self.STOPS_PER_S, now)
         self._halts = Credit(HALTS_PER_S, now)
         self._connected_at = now
         self._heard_at = now
-        self._partial_since: float | None = None
-        self._partial_begun = 0
         self._judge = Judge(0, agent_id)
         self._topics: dict[bytes, StreamData] = {}
         """Of a robot: management data that was read, by its bytes."""
@@ -352,7 +353,7 @@ class TcpAgent:
         """The first message on every connection; agents give up when anything else comes before it. A headset takes a
         later one as its new id, and answers again; with a ``number`` (`recency`) it is `Answered`."""
         if number:
-            self._questions.append(number)
+            self._questions = [*self._questions[1 - 2 * Recency.OPEN :], number]
         return to_agent(Welcome(agent_id=self.agent_id), request_id=number or self.connection_number)
 
     @property
@@ -642,9 +643,8 @@ class TcpAgent:
         self.agent_type, self.group = kind, group
         self.recipient.configured(kind, existing=not self.extensions)
         events.append(Joined(kind, group, configuration.functionality))
-        while self._held:
-            frame = self._held.popleft()
-            self._held_bytes -= len(frame.data)
+        held, self._held, self._held_bytes = self._held, [], 0
+        for frame in held:
             try:
                 self._frame(frame, events)
             except NotPermitted as error:

@@ -6,11 +6,17 @@ import gc
 import platform
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from bridge.cli import running
+from bridge.gateway.connection import Connection
+from bridge.gateway.memory import Memory
+from macs_zenoh.protocol.decoders import FrameDecoder
+from macs_zenoh.protocol.tcp_agent import TcpAgent
 
 
 @pytest.fixture
@@ -27,6 +33,26 @@ def test_who_is_ready_is_not_gone_through_again(thawed: None, capsys: pytest.Cap
     running.say_ready("somebody")
     assert gc.get_freeze_count() > 1000
     assert capsys.readouterr().out == "ready: somebody\n"
+
+
+async def test_a_connection_that_only_looks_takes_little() -> None:
+    """A connection for which nothing waits, and that has asked for nothing, has no queues of its own (12 KB with)."""
+    memory, scratch = Memory(1 << 20, 1 << 20), bytearray(FrameDecoder.SPACE_BYTES)
+
+    def connection(number: int) -> tuple[Connection, TcpAgent]:
+        owner: Any = None
+        bare = Connection(owner, memory=memory, outbox_bytes=1 << 20, write_timeout_s=1.0)
+        return bare, TcpAgent(number, number, 0.0, scratch=scratch)
+
+    first = [connection(number) for number in range(100)]
+    tracemalloc.start()
+    try:
+        others = [connection(number) for number in range(1000, 1100)]
+        each = tracemalloc.get_traced_memory()[0] / len(others)
+    finally:
+        tracemalloc.stop()
+    assert len(first) == 100
+    assert each < 9000
 
 
 COPIES = """
