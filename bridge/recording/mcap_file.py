@@ -42,11 +42,11 @@ REMEMBERED = 256
 COMPRESSIONS = ("zstd", "lz4", "none")
 LARGE_BYTES = 64 << 10
 """A message of so much is written from where it is, without a copy in between."""
-SAMPLES, SAMPLE_BYTES = 3, 16 << 10
-"""So much of a chunk is tried first: what gets no smaller, as pictures that are compressed or full of noise, is
-written as it is, for a tenth of the time."""
+SAMPLED_BYTES, LEAST_SAMPLE_BYTES = 48 << 10, 4 << 10
+"""So much of a chunk is tried first, of each of its pieces the same: what gets no smaller, as pictures that are
+compressed or full of noise, is written as it is, for a tenth of the time."""
 WORTH = 0.9
-"""Of its size a sample has to have at most so much."""
+"""Of its size a chunk has to have at most so much, as the samples tell: each counts as much as its piece is large."""
 
 Closing = Callable[[], Mapping[str, Mapping[str, str]]]
 """Says at the end what stands in metadata records, by their names."""
@@ -353,11 +353,14 @@ class McapFile:
     def _gets_smaller(self, raw: Sequence[bytes]) -> bool:
         """Whether it is worth the time to make a chunk smaller, as pieces of it tell."""
         size = sum(map(len, raw))
-        if not self._compression or size <= SAMPLES * SAMPLE_BYTES:
+        if not self._compression or size <= SAMPLED_BYTES:
             return bool(self._compression)
-        step = (size - SAMPLE_BYTES) // (SAMPLES - 1)
-        sample = b"".join(_cut(raw, at, at + SAMPLE_BYTES) for at in range(0, size, step))
-        return len(self._compress(sample)) <= WORTH * len(sample)
+        each, smaller = max(LEAST_SAMPLE_BYTES, SAMPLED_BYTES // len(raw)), 0.0
+        for piece in raw:
+            at = max(0, len(piece) - each) // 2
+            sample = piece[at : at + each]
+            smaller += len(self._compress(sample)) / len(sample) * len(piece)
+        return smaller <= WORTH * size
 
     def _write(self, *pieces: bytes) -> None:
         """All of it or nothing."""
@@ -376,16 +379,6 @@ class McapFile:
             os.lseek(self._file, self._at, os.SEEK_SET)
             raise
         self._at += written
-
-
-def _cut(pieces: Sequence[bytes], start: int, end: int) -> bytes:
-    """Of what pieces are together, from here to there."""
-    cut, at = [], 0
-    for piece in pieces:
-        if at < end and start < at + len(piece):
-            cut.append(piece[max(0, start - at) : end - at])
-        at += len(piece)
-    return b"".join(cut)
 
 
 def _bytes(*records: McapRecord) -> bytes:

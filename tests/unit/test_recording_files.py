@@ -127,6 +127,23 @@ def test_large_messages_are_read_among_small_ones(tmp_path: Path, compression: s
     assert (path.stat().st_size < sum(sizes) // 2) == (not noisy and compression != "none")
 
 
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_what_gets_no_smaller_is_written_as_it_is(tmp_path: Path, compression: str) -> None:
+    """Small messages of which much could be saved do not have the noisy pictures beside them compressed for nothing,
+    nor does a noisy one keep those from it that get smaller."""
+    noise, plain = os.urandom(900_000), bytes(900_000)
+    file = McapFile(tmp_path / "a.mcap", compression=compression, chunk_bytes=4 << 20)
+    channel = file.channel("/a", "cdr", 0, {})
+    for pictures in ([noise, noise], [noise, plain, plain]):
+        for picture in pictures:
+            for number in range(200):
+                file.add(channel, number, number, number, bytes(100))
+            file.add(channel, number, number, number, picture)
+        file.flush()
+    file.close()
+    assert [chunk.compression for chunk in file.index.chunks] == ["", compression]
+
+
 def test_others_files_are_read(tmp_path: Path) -> None:
     """Files of mcap's own writer, with chunks and without, channels in chunks, and messages out of order."""
     from mcap.writer import CompressionType, Writer
