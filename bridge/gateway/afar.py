@@ -2,7 +2,8 @@
 
 The receiver's gateway sees that it is full and notes it to the sender's, which from then on reads from the sender
 only once in a while: as long as such notes come, and no longer. So a note slows down who sends to that receiver for a
-moment and never stops it, whoever forged it, and a receiver that has stopped reading stops nobody.
+moment and never stops it, whoever forged it, and a receiver that has stopped reading stops nobody. Several that stand
+still slow down a sender for no longer together than one: a stop may be behind what it sends them.
 """
 
 from __future__ import annotations
@@ -18,11 +19,14 @@ from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.slow import Note
 
 from .agents import Agents
-from .backpressure import HOLD_S
+from .backpressure import HOLD_S, STOPPED_S
 from .connection import Connection
 
 NOTED_S = 2 * HOLD_S
 """So long a note holds. It is repeated as long as the receiver is full and moves."""
+
+MOVES_S = STOPPED_S + HOLD_S
+"""Notes that go on for longer are of a receiver that moves: of others none come any more."""
 
 RECEIVERS = 64
 """Of so many receivers at once notes are kept for one sender."""
@@ -47,9 +51,11 @@ class FarSender:
         self._note(slow=True)
 
     def resume(self) -> None:
-        """As fast as it likes, unless the receiver is still full and has moved."""
+        """As fast as it likes, when there is room. Of a receiver that has stopped nothing is said any more."""
         receiver = self.receiver
-        if not (receiver.congested and receiver.backpressure.hold(self, receiver.moved)):
+        if receiver.congested:
+            receiver.backpressure.hold(self, receiver.moved)
+        else:
             self._note(slow=False)
 
     def _note(self, *, slow: bool) -> None:
@@ -59,10 +65,25 @@ class FarSender:
 
 
 @dataclass
-class _Slowed:
-    """One of our senders: until when it is slow for which receivers."""
+class _Notes:
+    """Of one receiver that is full: when they began to come, when the last one came."""
 
-    receivers: dict[AgentKey, float] = field(default_factory=dict)
+    since: float
+    last: float
+
+    @property
+    def moves(self) -> bool:
+        """Whether it does, as far as can be seen from here."""
+        return self.last - self.since > MOVES_S
+
+
+@dataclass
+class _Slowed:
+    """One of our senders: for which receivers, and how long it has waited for those of which nobody knows that they
+    move."""
+
+    receivers: dict[AgentKey, _Notes] = field(default_factory=dict)
+    took_s: float = 0.0
     timer: asyncio.TimerHandle | None = None
     """Runs while it is not read from."""
 
@@ -102,9 +123,22 @@ class Afar:
     def has_read(self, connection: Connection) -> None:
         """A frame was read from one of `slowed`: no more for a while."""
         slowed = self.slowed[connection]
-        if slowed.timer is None:
+        if slowed.timer is None and self._lasts(connection, slowed) and self._may_wait(connection, slowed):
             connection.pause()
             slowed.timer = self._loop.call_later(HOLD_S, self._read_again, connection, slowed)
+
+    def _may_wait(self, connection: Connection, slowed: _Slowed) -> bool:
+        moves = any(notes.moves for notes in slowed.receivers.values())
+        if moves:
+            self._have_moved(connection, slowed)
+        costs_s = connection.patience.take(HOLD_S, self._loop.time(), moves=moves)
+        slowed.took_s += costs_s or 0.0
+        return costs_s is not None
+
+    def _have_moved(self, connection: Connection, slowed: _Slowed) -> None:
+        """What held it does not count."""
+        connection.patience.give_back(slowed.took_s)
+        slowed.took_s = 0.0
 
     def leave(self, connection: Connection) -> None:
         """It has ended."""
@@ -124,26 +158,34 @@ class Afar:
                 if info is not None and self._sends_to(connection, info):
                     self._slow_down(connection, receiver)
             elif (slowed := self.slowed.get(connection)) is not None:
-                slowed.receivers.pop(receiver, None)
+                if slowed.receivers.pop(receiver, None) is not None:
+                    self._have_moved(connection, slowed)
                 if not slowed.receivers:
                     self._end(connection, slowed)
 
     def _slow_down(self, connection: Connection, receiver: AgentKey) -> None:
         if connection.drives:
             return
-        slowed = self.slowed.get(connection)
-        if slowed is None:
-            slowed = self.slowed[connection] = _Slowed()
+        now, begins = self._loop.time(), connection not in self.slowed
+        slowed = self.slowed.setdefault(connection, _Slowed())
+        if (notes := slowed.receivers.get(receiver)) is not None:
+            notes.last = now
+        elif len(slowed.receivers) < RECEIVERS:
+            slowed.receivers[receiver] = _Notes(now, now)
+        if begins:
             self.has_read(connection)  # later on only after a frame: a large one must come to its end
-        if receiver in slowed.receivers or len(slowed.receivers) < RECEIVERS:
-            slowed.receivers[receiver] = self._loop.time() + NOTED_S
+
+    def _lasts(self, connection: Connection, slowed: _Slowed) -> bool:
+        """Whether any receiver is still full; else it is over."""
+        since = self._loop.time() - NOTED_S
+        slowed.receivers = {agent: notes for agent, notes in slowed.receivers.items() if notes.last > since}
+        if not slowed.receivers:
+            self._end(connection, slowed)
+        return bool(slowed.receivers)
 
     def _read_again(self, connection: Connection, slowed: _Slowed) -> None:
         """It has waited."""
-        now = self._loop.time()
-        slowed.receivers = {agent: until for agent, until in slowed.receivers.items() if until > now}
-        if not slowed.receivers:
-            self._end(connection, slowed)
+        if not self._lasts(connection, slowed):
             return
         slowed.timer = None
         connection.resume()

@@ -22,6 +22,7 @@ PARTS = (
     "guards",
     "opened",
     "halt",
+    "halt_refused",
     "halt_again",
 )
 

@@ -447,6 +447,35 @@ const parts = {
     assert.equal(others.words().state, "free");
   },
 
+  async halt_refused() {
+    const one = (await halts())();
+    const refuse = (robot, reason) =>
+      one.halt.headset.dispatchEvent(new CustomEvent("refused", { detail: { robot, name: "/emergency_stop", reason } }));
+    one.halt.setOnline([1, 2]);
+    one.says(1, true);
+    one.says(2, true);
+    one.halt.release();
+    assert.equal(one.words().text, "robot 1, 2 stopped");
+    refuse(1, "unity/7 may not release what operator/0 stopped");
+    assert.match(one.words().text, /robot 1 was not released \(unity\/7 may not release what operator\/0 stopped\)/);
+    assert.doesNotMatch(one.words().text, /robot 2 was/);
+    one.says(2, false);
+    one.says(1, true); // it says again how it is
+    assert.match(one.words().text, /robot 1 was not released/);
+    one.says(1, false);
+    assert.deepEqual(one.words(), { state: "free", text: "" });
+    one.says(1, true);
+    assert.equal(one.words().text, "robot 1 stopped", "that was about another stop");
+    one.halt.release();
+    refuse(0, "no right");
+    assert.match(one.words().text, /robot 1 was not released \(no right\)/, "the gateway says it of all");
+    one.halt.press();
+    assert.doesNotMatch(one.words().text, /not released/);
+    one.says(1, true);
+    one.says(2, true);
+    one.halt.release();
+  },
+
   async halt_again() {
     mock.timers.enable({ apis: ["setInterval", "setTimeout"] });
     const started = await halts();

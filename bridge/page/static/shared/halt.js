@@ -52,6 +52,8 @@ export class Halt extends EventTarget {
     this.pressedAt = kept ? performance.now() : -Infinity;
     /** robot → why it does not stop for us. */
     this.why = new Map();
+    /** Who was asked to go on and is stopped still: robot → why it does not, null as long as it has said nothing of that. */
+    this.letting = new Map();
     headset.addEventListener("refused", ({ detail }) => this.#refused(detail));
     headset.addEventListener("link", ({ detail: { up } }) => this.#link(up));
     setInterval(() => this.check(), CHECK_MS).unref?.();
@@ -60,7 +62,10 @@ export class Halt extends EventTarget {
   setOnline(robots) {
     const gone = [...this.online].filter((robot) => !robots.includes(robot));
     this.online = new Set(robots);
-    for (const robot of gone) this.said.delete(robot);
+    for (const robot of gone) {
+      this.said.delete(robot);
+      this.letting.delete(robot);
+    }
     for (const node of [this.state, this.command]) {
       if (gone.length) node?.deregister({ robots: gone.filter((robot) => node.robots.has(robot)) });
       node?.register(this.#whom(robots));
@@ -72,8 +77,10 @@ export class Halt extends EventTarget {
 
   /** Without a connection nothing is known of anybody; then each that does not say that it holds is told again. */
   #link(up) {
-    if (!up) this.said.clear();
-    else this.#wantAll();
+    if (!up) {
+      this.said.clear();
+      this.letting.clear();
+    } else this.#wantAll();
     this.#send();
   }
 
@@ -88,6 +95,7 @@ export class Halt extends EventTarget {
     if (!this.may) return false;
     if (!this.open) this.beganAt = performance.now();
     this.took.clear();
+    this.letting.clear();
     this.all = true;
     this.pressedAt = performance.now();
     for (const robot of this.known) this.wanted.add(robot);
@@ -106,6 +114,7 @@ export class Halt extends EventTarget {
     this.beganAt = null;
     const robots = this.stopped();
     const sent = robots.length > 0 && Boolean(this.command?.publish(FALSE, this.#whom(robots)));
+    this.letting = new Map(sent ? robots.map((robot) => [robot, null]) : []);
     this.#changed();
     return { robots, sent };
   }
@@ -178,6 +187,7 @@ export class Halt extends EventTarget {
     this.said.set(robot, stopped);
     this.heardAt.set(robot, performance.now());
     this.why.delete(robot);
+    if (!stopped) this.letting.delete(robot);
     if (stopped && this.wanted.delete(robot) && this.beganAt !== null) this.took.set(robot, performance.now() - this.beganAt);
     if (!stopped && this.all && before === undefined) this.wanted.add(robot);
     if (before && !stopped) {
@@ -194,7 +204,10 @@ export class Halt extends EventTarget {
 
   #refused({ robot, name, reason }) {
     if (name !== TOPIC) return;
-    for (const one of robot ? [robot] : this.wanted) this.why.set(one, reason);
+    for (const one of robot ? [robot] : [...this.wanted, ...this.letting.keys()]) {
+      if (this.letting.has(one)) this.letting.set(one, reason);
+      else this.why.set(one, reason);
+    }
     this.#changed();
   }
 
@@ -234,6 +247,7 @@ export class Halt extends EventTarget {
       const took = stopped.flatMap((robot) => this.took.get(robot) ?? []);
       words.push(`${list(stopped)} stopped${took.length ? ` after ${Math.round(Math.max(...took))} ms` : ""}`);
     }
+    for (const [robot, reason] of this.letting) if (reason) words.push(`${list([robot])} was not released (${reason})`);
     if (away.length) words.push(`${list(away)} not online: stopped on return`);
     const nobody = this.online.size ? "how robots are is not known" : "no robot is online";
     if (this.all && !words.length) words.push(`${nobody}: each that comes is stopped`);
