@@ -64,7 +64,8 @@ READ_WITHIN_S = 5.0
 much of it is left."""
 
 MOST_READ_BYTES = FrameDecoder.SPACE_BYTES
-FIRST_READ_BYTES = 64 << 10
+FIRST_READ_BYTES = 16 << 10
+"""Of many that begin at once nobody knows yet that they take much."""
 LEAST_READ_BYTES = 1024
 
 
@@ -234,9 +235,9 @@ class Connection(asyncio.BufferedProtocol):
             self._read_bytes = min(2 * self._read_bytes, MOST_READ_BYTES)
         rounds = self._memory.rounds
         turn_s = rounds.spend(self.host, self._share, took_s)
-        if turn_s and not self._waits and not self._transport.is_closing():
+        if (turn_s or rounds.are_over(self.host)) and not self._waits and not self._transport.is_closing():
             self.pause()
-            rounds.enter(self.host, self.resume, turn_s)
+            rounds.enter(self.host, self.resume, turn_s or took_s)
 
     def _note_unfinished(self, unfinished: int) -> None:
         self._unfinished = unfinished if unfinished > UNFINISHED_FREE_BYTES else 0
@@ -306,7 +307,10 @@ class Connection(asyncio.BufferedProtocol):
             self._memory.rounds.enter(self.host, self._handle_on, 0.0)
             return
         self._waits = False
-        self.resume()
+        if self._memory.rounds.are_over(self.host) and not self._lost:
+            self._memory.rounds.enter(self.host, self.resume, time.monotonic() - began)
+        else:
+            self.resume()
         if self._lost:
             self._lost = False
             self.connection_lost(None)

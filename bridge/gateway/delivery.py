@@ -7,6 +7,7 @@ and sizes that do not add up. So every sample is checked here again, whoever put
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -30,6 +31,7 @@ from .agents import Agents
 from .backpressure import ROBOT_HOLD_S
 from .connection import Connection
 from .judged import JudgedFrames, Read
+from .shares import Rounds
 from .stead import Stead
 
 log = logging.getLogger("macs.gateway")
@@ -94,13 +96,21 @@ class Delivery:
     """
 
     def __init__(
-        self, agents: Agents, directory: Directory, layout: Layout, stead: Stead, judged: JudgedFrames, afar: Afar
+        self,
+        agents: Agents,
+        directory: Directory,
+        layout: Layout,
+        stead: Stead,
+        judged: JudgedFrames,
+        afar: Afar,
+        rounds: Rounds,
     ) -> None:
         self.drops = Losses(log)
         self._agents = agents
         self._directory = directory
         self._stead = stead
         self._afar = afar
+        self._rounds = rounds
         self._layout = layout
         self.streams: dict[str, Stream] = {}
         """By their keys."""
@@ -117,6 +127,7 @@ class Delivery:
 
     def inbox(self, batch: Iterator[Sample]) -> None:
         """Frames sent to ids of ours."""
+        began = time.monotonic()
         for key, payload in batch:
             target = self._targets.get(key)
             if target is None:
@@ -131,10 +142,11 @@ class Delivery:
             self._send_all(connection, self._read(key, payload, sender))
             if connection.congested:
                 self._hold_sender(sender, [connection])
-        self._flush()
+        self._flush(began)
 
     def group(self, batch: Iterator[Sample]) -> None:
         """Frames sent to groups that one of ours is in."""
+        began = time.monotonic()
         for key, payload in batch:
             circle = self._circles.get(key) or self._members(key)
             if circle is None:
@@ -143,10 +155,11 @@ class Delivery:
             for frame, metadata in self._read(key, payload, sender):
                 self._send_each(self._takers(key, frame, circle), frame, metadata)
             self._hold_sender(sender, members)
-        self._flush()
+        self._flush(began)
 
     def broadcast(self, batch: Iterator[Sample]) -> None:
         """Frames sent to everybody."""
+        began = time.monotonic()
         for key, payload in batch:
             circle = self._circles.get(key) or self._others(key)
             if circle is None:
@@ -155,10 +168,11 @@ class Delivery:
             for frame, metadata in self._read(key, payload, sender):
                 self._send_each(others, frame, metadata)
             self._hold_sender(sender, others)
-        self._flush()
+        self._flush(began)
 
     def stream(self, batch: Iterator[Sample]) -> None:
         """A robot's topic data, for those of its registrants that are ours."""
+        began = time.monotonic()
         for key, payload in batch:
             stream = self.streams.get(key)
             if stream is None:
@@ -188,7 +202,7 @@ class Delivery:
                             self._gather_stream(connection, stream.node, messages, keep=keep)
                     else:
                         self._unregistered(connection, frame, metadata)
-        self._flush()
+        self._flush(began)
 
     def stream_at_once(self, key: str, payload: Payload) -> bool:
         """The same for one message in a thread of Zenoh's, if nothing about it is new and all its receivers are
@@ -238,8 +252,9 @@ class Delivery:
         )
         return seen
 
-    def _flush(self) -> None:
-        """Write what was gathered, one write per connection."""
+    def _flush(self, began: float) -> None:
+        """Write what was gathered since then, one write per connection."""
+        self._rounds.add(time.monotonic() - began)
         gathered, self._gathered = self._gathered, []
         for connection in gathered:
             connection.flush()

@@ -141,7 +141,8 @@ class Gateway:
         stead = Stead(mesh, self._layout)
         judged = JudgedFrames()
         self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged, self._refusing.no_router)
-        self._delivery = Delivery(self.agents, self.directory, self._layout, stead, judged, forwarding.afar)
+        known = self.agents, self.directory, self._layout
+        self._delivery = Delivery(*known, stead, judged, forwarding.afar, self.rounds)
         self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
         self._roll = Roll(self._presence, self.agents)
         self._groups = Groups(self.agents, self._presence, self._subscriptions, self._delivery, self._roll)

@@ -70,6 +70,8 @@ class Rounds:
         self._of_address: OrderedDict[str, Share] = OrderedDict()
         self._round_s = 0.0
         """What this round has had of work for addresses that take much."""
+        self._busy_until = -math.inf
+        """So long there is any."""
         self._going = False
         """Whether the next round is waited for."""
 
@@ -84,6 +86,11 @@ class Rounds:
     def count(self, host: str, took_s: float) -> None:
         """The same for what is done for it, and not for what it does: nobody is read from less for that."""
         self._count(host, took_s)
+
+    def add(self, took_s: float) -> None:
+        """Work for whoever it may be has taken so long: while any address takes much, that is of its round."""
+        if self._before < self._busy_until:
+            self._round_s += took_s
 
     def _count(self, host: str, took_s: float) -> tuple[float, float, bool]:
         """How long it was, as far as this thread had a processor; until when; and whether the address is over."""
@@ -100,6 +107,7 @@ class Rounds:
             took_s, self._before = min(took_s, now - self._before), now
         over = together.spend(took_s, now)
         if now < together.busy_until:
+            self._busy_until = max(self._busy_until, together.busy_until)
             self._round_s += took_s
         return took_s, now, over
 

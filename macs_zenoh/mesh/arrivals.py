@@ -93,8 +93,8 @@ class Arrivals:
     """What each sample counts as besides its payload."""
     BATCH_S = 0.002
     """After so long what a handler has gathered is written."""
-    TURN_S = 0.008
-    """After so long the loop does other things."""
+    TURN_S = 0.004
+    """After so long the loop does other things: whoever has something to say there waits for this first."""
     PATIENCE_S = 0.1
     AT_ONCE_BYTES = 128 << 10
     """Larger ones take too long for a thread that reads from the link."""

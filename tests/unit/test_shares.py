@@ -168,3 +168,18 @@ async def test_what_goes_on_in_its_turn_counts_in_its_round() -> None:
         asyncio.get_running_loop().call_soon(lambda: went.append(rounds.are_over("10.0.0.1")))
         await asyncio.sleep(0)
     assert went == [True, False]
+
+
+async def test_what_is_handed_over_counts_while_any_address_takes_much() -> None:
+    """What is done for whoever it may be is of the same round: so much less of those that take much."""
+    clock = [100.0]
+    rounds = Rounds(lambda: clock[0])
+    rounds.add(TURN_S)
+    while not rounds.are_over("10.0.0.1"):
+        clock[0] += TURN_S
+        rounds.count("10.0.0.1", TURN_S)
+    await asyncio.sleep(0)
+    assert not rounds.are_over("10.0.0.1")
+    rounds.add(2 * TURN_S)
+    assert rounds.are_over("10.0.0.1")
+    assert not rounds.are_over("10.0.0.2")
