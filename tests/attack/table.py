@@ -105,6 +105,6 @@ def enter(
 
 def every() -> dict[str, Attack]:
     """All rows, by name."""
-    from tests.attack import floods, inputs, insiders, returning, sessions, web  # noqa: F401 - they fill the table
+    from tests.attack import floods, inputs, insiders, returning, robots, sessions, web  # noqa: F401 - they fill the table
 
     return ATTACKS

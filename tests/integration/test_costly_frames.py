@@ -273,6 +273,13 @@ class Timed(Busy):
             self.rounds.append(self.round)
 
 
+def _use_up(busy: Timed, memory: Memory, connection: Connection) -> None:
+    """What a round of the loop has for its address, which takes much."""
+    while not memory.rounds.are_over(connection.host):
+        busy.clock_s += TURN_S
+        memory.rounds.count(connection.host, TURN_S)
+
+
 async def test_many_of_one_address_wait_for_each_other_and_not_everybody_for_all_of_them() -> None:
     """Each asks one thing, which takes a part of a turn: what is read from all of them in one round of the loop is
     not answered in that round."""
@@ -305,9 +312,7 @@ async def test_what_is_encrypted_for_one_of_many_waits_for_its_turn() -> None:
         headset, robot = busy.connections
         robot.peer.agent_type = ROS
         headset._writer.encrypts = robot._writer.encrypts = True  # as it is over TLS
-        while not memory.rounds.are_over(headset.host):
-            busy.clock_s += TURN_S
-            memory.rounds.count(headset.host, TURN_S)
+        _use_up(busy, memory, headset)
         sent = headset.sent_bytes, robot.sent_bytes
         for each in (headset, robot):
             assert each.gather_calls([b"one"])
@@ -317,3 +322,23 @@ async def test_what_is_encrypted_for_one_of_many_waits_for_its_turn() -> None:
         headset.flush()
         assert headset.sent_bytes == sent[0]
         await until(lambda: headset.sent_bytes == sent[0] + 6)
+
+
+async def test_who_was_read_from_in_a_round_that_is_over_waits_for_his_turn() -> None:
+    """Also with what is no whole frame yet: to read and to take apart costs as well."""
+    busy = Timed()
+    memory = Memory(64 << 20, 32 << 20)
+    memory.rounds = Rounds(lambda: busy.clock_s)
+    async with many(busy, memory, 2) as (one, _):
+        one.sendall(question(1))
+        await until(lambda: (1, 1) in busy.did)
+        connection = busy.connections[0]
+        _use_up(busy, memory, connection)
+        for piece in (question(2)[:10], question(2)[10:]):
+            connection.get_buffer(-1)[: len(piece)] = piece
+            connection.buffer_updated(len(piece))
+            assert connection._pauses == 1
+            assert (1, 2) not in busy.did
+            await until(lambda: not connection._pauses)
+            _use_up(busy, memory, connection)
+        await until(lambda: (1, 2) in busy.did)
