@@ -25,13 +25,13 @@ from macs_zenoh.managers import Managers
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.addresses import joined
-from macs_zenoh.protocol.credit import Credit, Credits
+from macs_zenoh.protocol.credit import Credits
 from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.directory import Change
 from macs_zenoh.protocol.keyexpr import BROADCAST, STREAM, UNICAST
 from macs_zenoh.protocol.limits import REGISTRATION_REQUESTS
 from macs_zenoh.protocol.messages import ROS, UNITY, AccessRefused
-from macs_zenoh.protocol.rate_limit import TOGETHER, Pace
+from macs_zenoh.protocol.rate_limit import Pace, together
 from macs_zenoh.protocol.recipient import Recipient, to_agent
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.rights import Grant
@@ -119,7 +119,7 @@ class Gateway:
         self._numbers = 0
         self._received_bytes = self._sent_bytes = 0
         """Of connections that have ended."""
-        self._requests = Credit(TOGETHER * settings.max_requests_per_s, time.monotonic())
+        self._requests = together(settings.max_requests_per_s, time.monotonic())
         """Of all who send robots much."""
         self._leaving = Pieces(self._has_closed)
         self._departures = Departures(self.agents.online, lambda gone: self._roll.telling(gone))

@@ -10,11 +10,13 @@ Address = TypeVar("Address", bound=Hashable)
 
 
 class Credit:
-    """So many frames per second, a second's worth at once; 0 is no limit."""
+    """So many frames per second, at once ``most`` of them or a second's worth; 0 is no limit."""
 
-    def __init__(self, frames_per_s: float, now: float, left: float | None = None) -> None:
+    def __init__(
+        self, frames_per_s: float, now: float, left: float | None = None, *, most: float | None = None
+    ) -> None:
         self.frames_per_s = frames_per_s
-        self._most = max(1.0, frames_per_s)
+        self._most = max(1.0, frames_per_s if most is None else most)
         self._left = self._most if left is None else left
         self._at = now
 

@@ -118,6 +118,12 @@ TOGETHER = 4
 """So many who send all the requests that one may are served by one gateway: more would fill the way of all others."""
 
 
+def together(requests_per_s: float, now: float) -> Credit:
+    """What all of a gateway may have together, of whom each may send so many requests. At once it is no more than one
+    may send: of many who begin in the same moment everybody would hear the answers for a second."""
+    return Credit(TOGETHER * requests_per_s, now, most=requests_per_s)
+
+
 class Pace:
     """Of one connection. ``together`` is what all of a gateway may have; who sends little needs none of it."""
 

@@ -5,7 +5,17 @@ from __future__ import annotations
 import pytest
 
 from macs_zenoh.protocol.credit import Credit
-from macs_zenoh.protocol.rate_limit import FLOODED, NOW, SINGLE_BYTES, TOGETHER, TOO_OLD, WAITED, Pace, Passing
+from macs_zenoh.protocol.rate_limit import (
+    FLOODED,
+    NOW,
+    SINGLE_BYTES,
+    TOGETHER,
+    TOO_OLD,
+    WAITED,
+    Pace,
+    Passing,
+    together,
+)
 from macs_zenoh.protocol.recency import Recency
 
 MOVE, ARM = "move", "arm"
@@ -70,9 +80,9 @@ def test_the_largest_passes_at_a_low_limit_too() -> None:
 
 def test_many_who_send_all_that_one_may_share_what_a_few_may() -> None:
     """Twenty at their limit have no more together than four; who sends little passes whatever they do."""
-    together = Credit(TOGETHER * 100, 0.0)
-    crowd = [Pace(0, 100, 0.0, together) for _ in range(20)]
-    modest, passed, little = Pace(0, 100, 0.0, together), 0, 0
+    shared = Credit(TOGETHER * 100, 0.0)
+    crowd = [Pace(0, 100, 0.0, shared) for _ in range(20)]
+    modest, passed, little = Pace(0, 100, 0.0, shared), 0, 0
     for number in range(10_000):
         now = number / 1000
         passed += sum(pace.request(1, now) is NOW for pace in crowd)
@@ -81,6 +91,19 @@ def test_many_who_send_all_that_one_may_share_what_a_few_may() -> None:
     at_first = 20 * 100 * (1 - Pace.LITTLE)
     assert passed <= TOGETHER * 100 * 11 + 2 * at_first
     assert little == 100
+
+
+def test_many_that_begin_at_once_have_no_second_of_it_at_once() -> None:
+    """Or the answers to all of it would come in one go; at the rate it goes on."""
+    shared = together(100, 0.0)
+    crowd = [Pace(0, 100, 0.0, shared) for _ in range(20)]
+
+    def passed(now: float) -> int:
+        return sum(pace.request(1, now) is NOW for _ in range(100) for pace in crowd)
+
+    at_first = 20 * 100 * (1 - Pace.LITTLE)
+    assert passed(0.0) == pytest.approx(at_first + 100, abs=20)
+    assert sum(passed(tick / 100) for tick in range(1, 101)) == pytest.approx(TOGETHER * 100, rel=0.05)
 
 
 def test_after_a_gap_in_a_flow_what_comes_together_has_waited(pace: Pace) -> None:
