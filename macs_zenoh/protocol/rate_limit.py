@@ -127,7 +127,7 @@ def together(requests_per_s: float, now: float) -> Credit:
 class Pace:
     """Of one connection. ``together`` is what all of a gateway may have; who sends little needs none of it."""
 
-    LITTLE = 0.75
+    LITTLE = 0.9
     """Who has as much of a second's requests left has sent little."""
 
     KINDS = 256
