@@ -55,7 +55,7 @@ class Allowances:
         self._per_s = per_s
         self._most = max(1.0, per_s / 4)
         self._little = self.LITTLE * per_s
-        self._all = Credit(per_s * self.TOGETHER, -math.inf)
+        self._all = Credit(per_s * self.TOGETHER, -math.inf, most=per_s)  # at once no more than one may
         self._senders: OrderedDict[str, Credit] = OrderedDict()
         """Who sent longest ago comes first."""
 

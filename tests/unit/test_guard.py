@@ -49,6 +49,18 @@ def test_all_together_have_an_allowance_too() -> None:
     assert little == 100
 
 
+def test_many_that_begin_at_once_have_no_second_of_it_at_once() -> None:
+    """Or the answers to all of it would be on everybody's way in one go; at the rate it goes on."""
+    allowances = Allowances(100)
+
+    def passed(now: float) -> int:
+        return sum(allowances.take(f"unity/{sender}", 10, now) for _ in range(100) for sender in range(20))
+
+    at_first = 20 * 100 * (1 - Allowances.LITTLE)
+    assert passed(0.0) == pytest.approx(at_first + 100, abs=20)
+    assert sum(passed(tick / 100) for tick in range(1, 101)) == pytest.approx(100 * Allowances.TOGETHER, rel=0.05)
+
+
 def test_a_large_message_costs_more_and_passes_nevertheless() -> None:
     """One that is larger than all that a sender may send in a second passes, a second one right after it does not."""
     allowances = Allowances(100)
