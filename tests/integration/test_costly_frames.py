@@ -29,7 +29,8 @@ from macs_zenoh.protocol.tcp_agent import AskedOnline, Event, Joined, Sent, Stat
 from macs_zenoh.protocol.wire import Frames, encode_frame, encode_message
 from tests.support.waiting import until
 
-MANY = 100
+MANY = 60
+"""So few that one read brings them all."""
 COSTS_S = TURN_S / 3
 
 
