@@ -138,11 +138,10 @@ class Gateway:
         """Who is online."""
         self._robot_ids = RobotIds(settings.robots)
         self._refusing = Refusing(self._door, record, self._drops)
-        stead = Stead(mesh, self._layout)
-        judged = JudgedFrames()
-        self._forwarding = forwarding = Forwarding(mesh, self.agents, self.directory, judged, self._refusing.no_router)
-        known = self.agents, self.directory, self._layout
-        self._delivery = Delivery(*known, stead, judged, forwarding.afar, self.rounds)
+        stead, judged = Stead(mesh, self._layout), JudgedFrames()
+        self._forwarding = Forwarding(mesh, self.agents, self.directory, judged, self._refusing.no_router)
+        known, rounds = (self.agents, self.directory, self._layout), self.rounds
+        self._delivery = Delivery(*known, stead, judged, self._forwarding.afar, rounds)
         self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
         self._roll = Roll(self._presence, self.agents)
         self._groups = Groups(self.agents, self._presence, self._subscriptions, self._delivery, self._roll)
