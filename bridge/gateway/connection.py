@@ -105,6 +105,8 @@ class Connection(asyncio.BufferedProtocol):
     """What is counted for it of a frame that has begun."""
     _read_bytes = FIRST_READ_BYTES
     """How much is read at once: less, when little of it makes much work, more when much makes little."""
+    _read_last: tuple[int, float] | None = None
+    """How much was read that waits for its turn, and how long that took."""
     _asked_at = 0.0
     """When room for bytes was asked for last."""
     _unread = 0
@@ -228,16 +230,23 @@ class Connection(asyncio.BufferedProtocol):
         if unfinished != self._unfinished and (unfinished > UNFINISHED_FREE_BYTES or self._unfinished):
             self._note_unfinished(unfinished)
         took_s = time.monotonic() - began
-        if took_s > TURN_S:
-            part = min(TURN_S / took_s, 0.5 if self._rest else 1.0)
-            self._read_bytes = max(LEAST_READ_BYTES, int(self._read_bytes * part))
-        elif took_s < TURN_S / 2 and nbytes >= self._read_bytes // 2 and not self._rest:  # else who knows how long
-            self._read_bytes = min(2 * self._read_bytes, MOST_READ_BYTES)
+        if self._rest and took_s <= TURN_S:  # how long it takes is known when it has had its turn
+            self._read_last = nbytes, took_s
+        else:
+            self._adapt(nbytes, took_s)
         rounds = self._memory.rounds
         turn_s = rounds.spend(self.host, self._share, took_s)
         if (turn_s or rounds.are_over(self.host)) and not self._waits and not self._transport.is_closing():
             self.pause()
             rounds.enter(self.host, self.resume, turn_s or took_s)
+
+    def _adapt(self, nbytes: int, took_s: float) -> None:
+        """Read as much at once as a turn has time for: so many bytes took so long, if nothing of them waits."""
+        if took_s > TURN_S:
+            part = min(TURN_S / took_s, 0.5 if self._rest else 1.0)
+            self._read_bytes = max(LEAST_READ_BYTES, int(self._read_bytes * part))
+        elif took_s < TURN_S / 2 and nbytes >= self._read_bytes // 2 and not self._rest:
+            self._read_bytes = min(2 * self._read_bytes, MOST_READ_BYTES)
 
     def _note_unfinished(self, unfinished: int) -> None:
         self._unfinished = unfinished if unfinished > UNFINISHED_FREE_BYTES else 0
@@ -302,13 +311,18 @@ class Connection(asyncio.BufferedProtocol):
     def _handle_on(self) -> None:
         began = time.monotonic()
         self._handle_some(began)
-        self._memory.rounds.spend(self.host, self._share, time.monotonic() - began)
+        took_s = time.monotonic() - began
+        self._memory.rounds.spend(self.host, self._share, took_s)
+        if self._read_last is not None:
+            nbytes, read_s = self._read_last
+            self._read_last = None
+            self._adapt(nbytes, read_s + took_s)
         if self._rest:
             self._memory.rounds.enter(self.host, self._handle_on, 0.0)
             return
         self._waits = False
         if self._memory.rounds.are_over(self.host) and not self._lost:
-            self._memory.rounds.enter(self.host, self.resume, time.monotonic() - began)
+            self._memory.rounds.enter(self.host, self.resume, took_s)
         else:
             self.resume()
         if self._lost:

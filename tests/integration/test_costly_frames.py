@@ -343,3 +343,26 @@ async def test_who_was_read_from_in_a_round_that_is_over_waits_for_his_turn() ->
             await until(lambda: not connection._pauses)
             _use_up(busy, memory, connection)
         await until(lambda: (1, 2) in busy.did)
+
+
+async def test_more_is_read_at_once_of_what_costs_little_though_it_waits_for_its_turn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Or who waits for each turn, since he or others send much, would be read from in small pieces for ever."""
+    monkeypatch.setattr("bridge.gateway.connection.TURN_S", 10.0)  # a busy machine makes nothing costly
+    busy = Timed()
+    memory = Memory(64 << 20, 32 << 20)
+    memory.rounds = Rounds(lambda: busy.clock_s)
+    async with many(busy, memory, 2):
+        connection = busy.connections[0]
+        await until(lambda: connection.peer.state is State.ONLINE)
+        connection._read_bytes = 2048
+        for _ in range(3):
+            at_once = connection._read_bytes
+            _use_up(busy, memory, connection)
+            data = said("x") * (at_once // len(said("x")))
+            connection.get_buffer(-1)[: len(data)] = data
+            connection.handle(len(data), time.monotonic())
+            assert connection._waits
+            await until(lambda: not connection._waits and not connection._pauses)
+            assert connection._read_bytes == 2 * at_once
