@@ -47,6 +47,8 @@ PATIENCE_S = 20.0
 """How long a registration may take."""
 COUNTS_S = 5.0
 """How often a robot is asked how much it has put: each answer is a message of a topic more, on its link."""
+ALL_AGAIN_S = 0.6
+"""The same at the end; a robot tells it twice a second."""
 NEW_COUNTS, ALL_COUNTS = (encode_data(StatusRequest(counts)) for counts in ("new", "all"))
 """What the verb ``status`` is asked besides."""
 OnNote = Callable[[dict[str, object]], None]
@@ -128,8 +130,10 @@ class RobotFollower:
             await within(self._ask_for_counts(timeout_s), timeout_s)
 
     async def _ask_for_counts(self, timeout_s: float) -> None:
-        await self._agent.call(ROS, self.robot, "status", ALL_COUNTS, timeout_s=timeout_s)
-        await self._all_told.wait()
+        while not self._all_told.is_set():  # it may have been asked right before, or its word be lost
+            await self._agent.call(ROS, self.robot, "status", ALL_COUNTS, timeout_s=timeout_s)
+            with suppress(asyncio.TimeoutError):
+                await within(self._all_told.wait(), ALL_AGAIN_S)
 
     def _counted(self, key: str, data: bytes) -> None:
         """The robot has told, behind all that it counts."""

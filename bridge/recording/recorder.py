@@ -36,7 +36,7 @@ log = logging.getLogger("macs.record")
 
 STATUS_S = 1.0
 """How often a robot is asked how it is; its stop is heard at once."""
-LAST_COUNTS_S = 1.0
+LAST_COUNTS_S = 1.5
 """How long a recording that ends waits for robots to tell how much they have put for it."""
 BEFORE = "before_recorder"
 HERE = ("topics_behind", "loop_behind", "topic_full", "missed", "bad_frame")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Collection, Iterable
 
 from bridge.ros.interface import InterfaceNode, Registrant
@@ -21,6 +21,10 @@ from macs_zenoh.serving import Call, CallHandler
 
 SETS = 16
 """So many sets of receivers are counted by themselves before the counts of each of them are made anew."""
+AGAIN_S = 0.5
+"""Who asks again so soon is told nothing: one question has a message put for each topic on which he is registered."""
+ASKED = 1024
+"""Of so many it is remembered when they asked."""
 
 
 class PutFor:
@@ -66,17 +70,29 @@ class PutFor:
                     self._counts[each] = StreamCount(count.since, count.put + more)
 
 
-def telling(nodes: Iterable[InterfaceNode], state: Callable[[], bytes]) -> CallHandler:
+def telling(
+    nodes: Iterable[InterfaceNode], state: Callable[[], bytes], now: Callable[[], float] = time.monotonic
+) -> CallHandler:
     """Answers the verb ``status`` with the robot's state; who asks for it is told before that how much was put for
     it. Data that is no such request is ignored, as robots always have."""
+    asked_at: OrderedDict[Registrant, float] = OrderedDict()
+
+    def may_ask(sender: Registrant) -> bool:
+        if now() < asked_at.get(sender, -AGAIN_S) + AGAIN_S:
+            return False
+        asked_at[sender] = now()
+        asked_at.move_to_end(sender)
+        if len(asked_at) > ASKED:
+            asked_at.popitem(last=False)
+        return True
 
     async def answer(call: Call) -> bytes:
         try:
             asked = decode_data(StatusRequest, call.data).counts if call.data else ""
         except WireError:
             asked = ""
-        if asked:
-            sender = Registrant(type_number(call.sender_type), call.sender_id)
+        sender = Registrant(type_number(call.sender_type), call.sender_id)
+        if asked and may_ask(sender):
             for node in nodes:
                 node.tell_count(sender, again=asked == "all")
         return state()

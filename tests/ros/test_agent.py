@@ -13,7 +13,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Bool, String
 
 import macs_zenoh
-from bridge.ros import graph
+from bridge.ros import counts, graph
 from bridge.ros.agent import RobotAgent, open_robot
 from bridge.ros.graph import Offered, TopicQos
 from bridge.ros.interface import Registrant
@@ -72,9 +72,12 @@ async def test_a_registered_topic_is_streamed(robot: RobotAgent, headset: Agent,
     assert deserialize_message(bytes(frame.body), String).data == "hello"
 
 
-async def test_how_much_was_put_is_told_behind_it(robot: RobotAgent, headset: Agent, peer: Peer) -> None:
+async def test_how_much_was_put_is_told_behind_it(
+    robot: RobotAgent, headset: Agent, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Who asks for the robot's state may have itself told, on each topic's stream, what was put there for it: once,
     unless asked for again. Others are told nothing, and other data of a question for the state is ignored."""
+    monkeypatch.setattr(counts, "AGAIN_S", 0.0)
     streams = Streams(headset)
     await headset.call("ros", ROBOT, "add_node", encode(adding("/chatter")))
     publisher = await peer.publisher(String, "/chatter", matched=1)
@@ -88,8 +91,8 @@ async def test_how_much_was_put_is_told_behind_it(robot: RobotAgent, headset: Ag
 
     while await status(b"x") != await status(b"{}"):
         pass
-    for counts in ("new", "new", "all"):
-        await status(encode(StatusRequest(counts)))
+    for asked in (StatusRequest("new"), StatusRequest("new"), StatusRequest("all")):
+        await status(encode(asked))
     publisher.publish(String(data="the last"))
     found = []
     while b"the last" not in bytes((frame := parse_frame((await get(streams.frames))[1])).body):

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from bridge.recording.arrived import Arrived
-from bridge.ros.counts import SETS, PutFor
+from bridge.ros.counts import AGAIN_S, SETS, PutFor, telling
+from bridge.ros.interface import Registrant
+from macs_zenoh.protocol.messages import Metadata
 from macs_zenoh.protocol.robot_state import StreamCount
+from macs_zenoh.serving import Call
 
 RECORDER, HEADSET, LATER = (2, 256), (2, 5), (2, 6)
 
@@ -61,6 +64,32 @@ def test_many_sets_of_receivers() -> None:
         assert len(put._new) <= SETS
     counts = [count.put for each in everybody if (count := put.to_tell(each, again=True))]
     assert counts == [1] + [2] * 97 + [1]
+
+
+class Node:
+    """Notes who is told what."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[int, bool]] = []
+
+    def tell_count(self, registrant: Registrant, *, again: bool) -> None:
+        self.told.append((registrant.id, again))
+
+
+async def test_nobody_has_many_messages_put_by_asking() -> None:
+    """Each is told twice a second, whoever else asks; the state is answered each time, and to any data."""
+    node, time_s = Node(), [100.0]
+    answer = telling([node], lambda: b"state", lambda: time_s[0])  # type: ignore[list-item]
+
+    async def ask(sender: int, data: bytes) -> None:
+        assert await answer(Call("status", "unity", sender, Metadata(), data)) == b"state"
+
+    for data in (b"", b"x", b"{}", b'{"counts": "old"}', b'{"counts": "new"}', b'{"counts": "all"}'):
+        await ask(5, data)
+    await ask(6, b'{"counts": "all"}')
+    time_s[0] += AGAIN_S
+    await ask(5, b'{"counts": "all"}')
+    assert node.told == [(5, False), (6, True), (5, True)]
 
 
 def came(arrived: Arrived, messages: int) -> None:
