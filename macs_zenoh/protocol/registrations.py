@@ -138,12 +138,10 @@ class Registrations:
         """Forget everything an agent registered. Robots notice its end by themselves."""
         self._named.pop(agent, None)
         for key, wish in list(self._of_agent.get(agent, {}).items()):
-            ids, groups = wish.robot_ids, wish.groups
-            touched = self._seen_of(ids, groups)
-            self._unindex(wish, ids, groups)
-            wish.robot_ids, wish.groups = set(), set()
-            for robot_id in touched:
-                self._stream(wish, robot_id)
+            self._unindex(wish, wish.robot_ids, wish.groups)
+            if wish.node.node_type == SUBSCRIBER:
+                for robot_id in self._seen_of(wish.robot_ids, wish.groups):
+                    self._unregister((robot_id, wish.node.node_name), agent)
             self._forget(agent, key)
 
     def rename(self, agent: AgentKey, agent_id: int) -> None:
