@@ -552,10 +552,14 @@ class Connection(asyncio.BufferedProtocol):
         """Log the first of what is counted elsewhere."""
         self.drops.once(name, "%s: %s", self, problem, count=0)
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether nothing reaches the agent any more, nor comes from it."""
+        return self._transport is ENDED and not self._lost and not self.asleep
+
     def close(self, reason: str) -> None:
         """Send what is gathered, then FIN."""
-        has_ended = self._closed or (self._transport is ENDED and not self._lost)
-        if has_ended and not self.asleep:
+        if self.has_ended or (self._closed and not self.asleep):
             return
         self._closed = True
         self._expect_back_no_more()

@@ -59,6 +59,8 @@ class Roll:
         message = to_agent(AgentsGone(agents))
 
         def tell(connection: Connection) -> None:
+            if connection.has_ended:  # with those who left: it is forgotten in its turn
+                return
             rights = connection.peer.grant.rights
             if rights is None or connection.key[0] != UNITY:
                 connection.recipient.gone(agents)

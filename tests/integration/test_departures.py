@@ -87,6 +87,23 @@ async def test_work_for_many_is_done_in_pieces_and_in_order() -> None:
     assert turns >= 5
 
 
+async def test_who_has_left_is_told_of_nobody(
+    start_gateway: StartGateway, connect: Connect, crowd: AsyncExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A hundred whose sockets end in one moment are forgotten one after the other; none is told of those before."""
+    gateway = await start_gateway()
+    for _ in range(100):
+        (await crowd.enter_async_context(socket(gateway))).configure()
+    await until(lambda: len(list(gateway.agents.online())) == 100)
+    told: list[Connection] = []
+    monkeypatch.setattr(Connection, "send_call", lambda connection, message: told.append(connection))
+    for connection in gateway.agents.connections():
+        connection.abort()
+    await until(lambda: len(gateway.agents) == 0)
+    await until(lambda: not gateway.directory.ids(2))
+    assert not told
+
+
 @pytest.fixture
 async def crowd() -> AsyncIterator[AsyncExitStack]:
     async with AsyncExitStack() as stack:
