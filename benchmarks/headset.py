@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.headset PORT COUNT GROUP`` connects COUNT headsets to a gateway, or to the plain relay, on
 127.0.0.1; with ``robot`` behind it they are existing robot programs, with ``tls CA`` or ``websocket CA`` they come by
-TLS or WebSocket. ``python -m benchmarks.headset sink`` is the far
+TLS or WebSocket, with ``from ADDRESS`` from that address. ``python -m benchmarks.headset sink`` is the far
 end for one such worker in place of a gateway.
 """
 
@@ -68,9 +68,10 @@ class Headset:
         way: str = "plain",
         authority: str = "",
         token: str | None = None,
+        source: str = "",
     ) -> Headset:
         """Connect and configure: a gateway counts this headset, or robot program, from now on."""
-        sock = ways.connect(port, way, authority)
+        sock = ways.connect(port, way, authority, source)
         decoder = MessageDecoder()
         while not (messages := decoder.feed(sock.recv(65536))):
             pass
@@ -335,8 +336,10 @@ def main() -> None:
     port, count, group = map(int, sys.argv[1:4])
     robot = sys.argv[4:] == ["robot"]
     way, authority = sys.argv[4:6] if len(sys.argv) > 5 else ("plain", "")
+    way, authority, source = ("plain", "", authority) if way == "from" else (way, authority, "")
     token = sys.argv[6] if len(sys.argv) > 6 else None
-    joined = [Headset.join(port, group, robot=robot, way=way, authority=authority, token=token) for _ in range(count)]
+    how = {"robot": robot, "way": way, "authority": authority, "token": token, "source": source}
+    joined = [Headset.join(port, group, **how) for _ in range(count)]
     workers = Headsets(joined)
     names: tuple[str, ...] = ("send", "message_bytes", "register", "check", "receive", "ping", "echo")
     names = (*names, "prepare", "prepare_topic", "send_prepared", "receive_sequence")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator
 
@@ -23,19 +24,20 @@ def scale(stage: Stage, plan: Plan) -> Iterator[Figure]:
     port = stage.gateway(router)
     gateway = next(program for program in stage.programs if program.name == "gateway")
     first: dict[str, list[float]] = {}
+    addresses = (f"127.0.1.{last}" for last in itertools.count(1))  # who comes back at once is made to wait
     for number in (*NUMBERS, JOINS):
-        rounds = [_round(stage, robots, gateway, port, number) for _ in range(plan.rounds)]
+        rounds = [_round(stage, robots, gateway, port, number, next(addresses)) for _ in range(plan.rounds)]
         for what in rounds[0]:
             values = [each[what] for each in rounds]
             base = first.setdefault(what, values)
             yield Figure(f"{number} headsets {what}", values, base, f"{NUMBERS[0]} headsets", "us each", at_most=2.0)
 
 
-def _round(stage: Stage, robots: Program, gateway: Program, port: int, number: int) -> dict[str, float]:
-    """Microseconds of CPU that the gateway took for each headset."""
+def _round(stage: Stage, robots: Program, gateway: Program, port: int, number: int, address: str) -> dict[str, float]:
+    """Microseconds of CPU that the gateway took for each headset, all from one address."""
     robots.ask("forget")
     began = gateway.used_s
-    crowd, _ = stage.worker("headset", port, number, 0)
+    crowd, _ = stage.worker("headset", port, number, 0, "from", address)
     _wait(robots, "headsets", number)
     joined = gateway.used_s
     costs = {"join": joined - began}

@@ -14,9 +14,9 @@ from typing import Any
 from macs_zenoh.protocol.websocket import MESSAGE_BYTES, SUBPROTOCOL, WEBSOCKET_PATH
 
 
-def connect(port: int, way: str, authority: str) -> Any:
-    """By ``plain``, ``tls`` or ``websocket``, to 127.0.0.1."""
-    sock = socket.create_connection(("127.0.0.1", port))
+def connect(port: int, way: str, authority: str, source: str = "") -> Any:
+    """By ``plain``, ``tls`` or ``websocket``, to 127.0.0.1; from an address, if one is named."""
+    sock = socket.create_connection(("127.0.0.1", port), source_address=(source, 0) if source else None)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     if way == "plain":
         return sock
