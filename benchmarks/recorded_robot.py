@@ -69,7 +69,7 @@ class Robot:
         node = decode_data(AddNode, call.data)
         _, registrants = self._registered.setdefault(node.tos_name, (node, set()))
         registrants.add(node.registrant_agent_id)
-        self._put_for[node.tos_name].registered((UNITY, registrant) for registrant in registrants)
+        self._put_for[node.tos_name].registered(frozenset((UNITY, registrant) for registrant in registrants))
         return b""
 
     async def status(self, call: macs_zenoh.Call) -> bytes:
@@ -95,7 +95,7 @@ class Robot:
         """Nobody is registered but those."""
         for topic in list(self._registered):
             self._registered[topic] = (self._registered[topic][0], set(self._kept.get(topic, ())))
-            self._put_for[topic].registered((UNITY, registrant) for registrant in self._registered[topic][1])
+            self._put_for[topic].registered(frozenset((UNITY, each) for each in self._registered[topic][1]))
         return {}
 
     async def publish(self, topic: str, size: int, hz: float, count: int) -> dict[str, Any]:

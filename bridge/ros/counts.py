@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 
 from bridge.ros.interface import InterfaceNode, Registrant
 from macs_zenoh.errors import WireError
@@ -19,8 +19,7 @@ from macs_zenoh.protocol.messages import decode_data
 from macs_zenoh.protocol.robot_state import StatusRequest, StreamCount
 from macs_zenoh.serving import Call, CallHandler
 
-SETS = 16
-"""So many sets of receivers are counted by themselves before the counts of each of them are made anew."""
+Receivers = frozenset[tuple[int, int]]
 AGAIN_S = 0.5
 """Who asks again so soon is told nothing: one question has a message put for each topic on which he is registered."""
 ASKED = 1024
@@ -28,46 +27,52 @@ ASKED = 1024
 
 
 class PutFor:
-    """One topic's. From any thread."""
+    """One topic's. From any thread. A message to all who are registered costs the same however many they are."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._new: Counter[Collection[tuple[int, int]]] = Counter()
-        """By who gets it: messages that are not in the counts of each of them yet."""
-        self._counts: dict[tuple[int, int], StreamCount] = {}
+        self._all: Receivers = frozenset()
+        self._put = 0
+        """Messages to all who were registered then."""
+        self._began: dict[tuple[int, int], tuple[int, int]] = {}
+        """By registrant: when it registered, in ns, and how many had been put to all before."""
+        self._apart: Counter[tuple[int, int]] = Counter()
+        """By registrant: messages that went to some only."""
         self._told: dict[tuple[int, int], int] = {}
 
-    def registered(self, registrants: Iterable[tuple[int, int]]) -> None:
+    def registered(self, registrants: Receivers) -> None:
         """These are registered now: who is new is counted for from now on."""
         with self._lock:
-            self._sum_up()
-            since = time.monotonic_ns()
-            self._counts = {each: self._counts.get(each) or StreamCount(since) for each in registrants}
-            self._told = {each: told for each, told in self._told.items() if each in self._counts}
+            for gone in self._began.keys() - registrants:
+                del self._began[gone]
+                self._apart.pop(gone, None)
+                self._told.pop(gone, None)
+            now = (time.monotonic_ns(), self._put)
+            self._began.update(dict.fromkeys(registrants - self._began.keys(), now))
+            self._all = registrants
 
-    def add(self, receivers: Collection[tuple[int, int]]) -> None:
+    def add(self, receivers: Receivers) -> None:
         """One message was put for these."""
         with self._lock:
-            self._new[receivers] += 1
-            if len(self._new) > SETS:
-                self._sum_up()
+            if receivers is self._all:
+                self._put += 1
+                return
+            for each in receivers:  # some, or those who were registered when it began to be put
+                if each in self._began:
+                    self._apart[each] += 1
 
     def to_tell(self, registrant: tuple[int, int], *, again: bool) -> StreamCount | None:
         """What this one is to be told: nothing that it was told before, unless ``again``."""
         with self._lock:
-            self._sum_up()
-            count = self._counts.get(registrant)
-            if count is None or (self._told.get(registrant, 0) == count.put and not again):
+            began = self._began.get(registrant)
+            if began is None:
                 return None
-            self._told[registrant] = count.put
-            return count
-
-    def _sum_up(self) -> None:
-        new, self._new = self._new, Counter()
-        for receivers, more in new.items():
-            for each in receivers:
-                if (count := self._counts.get(each)) is not None:
-                    self._counts[each] = StreamCount(count.since, count.put + more)
+            since, before = began
+            put = self._put - before + self._apart[registrant]
+            if self._told.get(registrant, 0) == put and not again:
+                return None
+            self._told[registrant] = put
+            return StreamCount(since, put)
 
 
 def telling(

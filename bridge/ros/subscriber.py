@@ -65,8 +65,9 @@ class SubscriberNode(TopicNode):
 
     def registrants_changed(self) -> None:
         with self._fanout_lock:
-            self._put_for.registered(self.registrants)
-            self._fanout = self._to_registrants()
+            fanout = self._to_registrants()
+            self._put_for.registered(fanout.receivers)
+            self._fanout = fanout
 
     def tell_count(self, registrant: Registrant, *, again: bool) -> None:
         count = self._put_for.to_tell(registrant, again=again)

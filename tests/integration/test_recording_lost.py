@@ -52,7 +52,7 @@ class Robot:
     async def _add_node(self, call: macs_zenoh.Call) -> bytes:
         node = decode_data(AddNode, call.data)
         self.registered = [(node.registrant_agent_type, node.registrant_agent_id)]
-        self._put_for.registered(self.registered)
+        self._put_for.registered(frozenset(self.registered))
         return b""
 
     async def _status(self, call: macs_zenoh.Call) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bridge.recording.arrived import Arrived
-from bridge.ros.counts import AGAIN_S, SETS, PutFor, telling
+from bridge.ros.counts import AGAIN_S, PutFor, telling
 from bridge.ros.interface import Registrant
 from macs_zenoh.protocol.messages import Metadata
 from macs_zenoh.protocol.robot_state import StreamCount
@@ -15,9 +15,9 @@ RECORDER, HEADSET, LATER = (2, 256), (2, 5), (2, 6)
 def test_each_registrant_is_counted_for() -> None:
     """What was put before it registered, or for others alone, is none of its."""
     put = PutFor()
-    put.registered([HEADSET])
+    put.registered(frozenset([HEADSET]))
     put.add(frozenset([HEADSET]))
-    put.registered([HEADSET, RECORDER])
+    put.registered(frozenset([HEADSET, RECORDER]))
     for _ in range(3):
         put.add(frozenset([HEADSET, RECORDER]))
     put.add(frozenset([HEADSET]))
@@ -29,7 +29,7 @@ def test_each_registrant_is_counted_for() -> None:
 def test_nothing_is_told_twice_unless_asked() -> None:
     """A topic that stands still costs no link anything."""
     put = PutFor()
-    put.registered([RECORDER])
+    put.registered(frozenset([RECORDER]))
     assert put.to_tell(RECORDER, again=False) is None
     put.add(frozenset([RECORDER]))
     first = put.to_tell(RECORDER, again=False)
@@ -42,11 +42,11 @@ def test_nothing_is_told_twice_unless_asked() -> None:
 def test_who_registers_again_is_counted_from_none() -> None:
     """And can tell by the time that it is another registration."""
     put = PutFor()
-    put.registered([RECORDER])
+    put.registered(frozenset([RECORDER]))
     put.add(frozenset([RECORDER]))
     before = put.to_tell(RECORDER, again=True)
-    put.registered([])
-    put.registered([RECORDER])
+    put.registered(frozenset([]))
+    put.registered(frozenset([RECORDER]))
     after = put.to_tell(RECORDER, again=True)
     assert before is not None
     assert after is not None
@@ -54,16 +54,28 @@ def test_who_registers_again_is_counted_from_none() -> None:
     assert before.since != after.since
 
 
-def test_many_sets_of_receivers() -> None:
-    """A latched topic puts for others each time: nothing is remembered of them but the counts."""
+def test_who_is_registered_while_a_message_is_put() -> None:
+    """It was for those who were registered when it began to be put, whoever has come or left since."""
     put = PutFor()
-    everybody = [(2, number) for number in range(1, 100)]
+    before = frozenset([HEADSET, LATER])
+    put.registered(before)
+    put.registered(frozenset([HEADSET, RECORDER]))
+    put.add(before)
+    counts = [put.to_tell(each, again=True) for each in (HEADSET, RECORDER, LATER)]
+    assert [count and count.put for count in counts] == [1, 0, None]
+
+
+def test_many_registrants_cost_a_message_nothing() -> None:
+    """What goes to all is counted once for all of them."""
+    put = PutFor()
+    everybody = frozenset((2, number) for number in range(1, 1000))
     put.registered(everybody)
-    for number in range(1, 99):
-        put.add(frozenset(everybody[number - 1 : number + 1]))
-        assert len(put._new) <= SETS
-    counts = [count.put for each in everybody if (count := put.to_tell(each, again=True))]
-    assert counts == [1] + [2] * 97 + [1]
+    for _ in range(3):
+        put.add(everybody)
+    put.add(frozenset([HEADSET]))
+    assert not put._apart.keys() - {HEADSET}
+    counts = [put.to_tell(each, again=True) for each in (HEADSET, LATER)]
+    assert [count and count.put for count in counts] == [4, 3]
 
 
 class Node:
