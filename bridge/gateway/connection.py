@@ -146,6 +146,8 @@ class Connection(asyncio.BufferedProtocol):
         self._told: dict[Hashable, float] = {}
         """What the agent was told of its rights, and when."""
         self._share = Share()
+        self._given = Share()
+        """The same of what is encrypted for it: it is not read from less for that."""
         self._rest: list[Iterator[Event]] = []
         """What the agent did and is not handled yet, since that takes longer than a turn."""
         self.backpressure = Backpressure()
@@ -238,7 +240,7 @@ class Connection(asyncio.BufferedProtocol):
         turn_s = rounds.spend(self.host, self._share, took_s)
         if (turn_s or rounds.are_over(self.host)) and not self._waits and not self._transport.is_closing():
             self.pause()
-            rounds.enter(self.host, self.resume, turn_s or took_s)
+            rounds.enter(self.host, self._share, self.resume, turn_s or took_s)
 
     def _adapt(self, nbytes: int, took_s: float) -> None:
         """Read as much at once as a turn has time for: so many bytes took so long, if nothing of them waits."""
@@ -306,7 +308,7 @@ class Connection(asyncio.BufferedProtocol):
             if self._rest:
                 self._waits = True
                 self.pause()
-                self._memory.rounds.enter(self.host, self._handle_on, 0.0)
+                self._memory.rounds.enter(self.host, self._share, self._handle_on, 0.0)
 
     def _handle_on(self) -> None:
         began = time.monotonic()
@@ -318,11 +320,11 @@ class Connection(asyncio.BufferedProtocol):
             self._read_last = None
             self._adapt(nbytes, read_s + took_s)
         if self._rest:
-            self._memory.rounds.enter(self.host, self._handle_on, 0.0)
+            self._memory.rounds.enter(self.host, self._share, self._handle_on, 0.0)
             return
         self._waits = False
         if self._memory.rounds.are_over(self.host) and not self._lost:
-            self._memory.rounds.enter(self.host, self.resume, took_s)
+            self._memory.rounds.enter(self.host, self._share, self.resume, took_s)
         else:
             self.resume()
         if self._lost:
@@ -487,14 +489,14 @@ class Connection(asyncio.BufferedProtocol):
                 self._writer.flush()
         elif self._memory.rounds.are_over(self.host):
             self._flushes = True
-            self._memory.rounds.enter(self.host, self._flush_on, 0.0)
+            self._memory.rounds.enter(self.host, self._given, self._flush_on, 0.0)
         else:
             self._flush_on()
 
     def _flush_on(self) -> None:
         self._flushes, began = False, time.monotonic()
         self._writer.flush()
-        self._memory.rounds.count(self.host, time.monotonic() - began)
+        self._memory.rounds.spend(self.host, self._given, time.monotonic() - began)
 
     def pause(self) -> None:
         """Stop reading from the agent until as many `resume` as `pause` were called."""

@@ -3,7 +3,8 @@
 A loop reads from every socket that has something, one after the other: twenty that each take three milliseconds hold
 up everybody else for sixty, in each round. So who has used up his share is not read from until his turn comes, and as
 many have it in each round as take one turn's time together: others wait for those, however many there are. Addresses
-take turns, and the connections of each among themselves.
+take turns. Of one address, behind which there may be many, who has had little of late comes before those who have had
+much: his may be a stop, and twenty others would be up to twenty turns.
 
 Many that each take little take much as well: of an address that is beyond its share no more is done in a round, once
 that round has had a turn's time for such addresses. What has been read waits, and what is to be encrypted for it.
@@ -15,10 +16,12 @@ little work seems to be much, and a share is always one of what there is.
 from __future__ import annotations
 
 import asyncio
+import heapq
 import math
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable
+from itertools import count
 
 TURN_S = 0.003
 """Work for one agent that takes longer lets all others have their turn before it goes on."""
@@ -28,6 +31,12 @@ SHARE_OF_ADDRESS = 0.2
 """The same for all from one address together."""
 BUSY_S = 0.1
 """So long after it was last beyond its share an address counts as one that takes much."""
+RECENT_S = 1.0
+"""What anybody had is forgotten after so long."""
+MUCH_S = RECENT_S / 50
+"""Who had so much waits longest."""
+LATEST_S = 1.0
+"""So much longer at most he waits for others of his address, who have had less: nobody waits for ever."""
 ADDRESSES = 4096
 LITTLE_S = TURN_S / 40
 UNTIMED = 16
@@ -38,23 +47,29 @@ that a single small message costs."""
 class Share:
     """What somebody has used of his turn."""
 
-    __slots__ = ("_at", "_share", "_spent_s", "busy_until")
+    __slots__ = ("_at", "_had_s", "_share", "_spent_s", "busy_until")
 
     def __init__(self, share: float = SHARE) -> None:
         self._share = share
         self._spent_s = 0.0
+        self._had_s = 0.0
         self._at = 0.0
         self.busy_until = -math.inf
 
     def spend(self, took_s: float, now: float) -> bool:
         """Work for him has taken so long; whether that was his turn, and the next one begins."""
         self._spent_s = max(0.0, self._spent_s - self._share * (now - self._at)) + took_s
+        self._had_s = self.had_s(now) + took_s
         self._at = now
         if self._spent_s <= TURN_S:
             return False
         self._spent_s = 0.0
         self.busy_until = now + BUSY_S
         return True
+
+    def had_s(self, now: float) -> float:
+        """How much of the time he had of late."""
+        return self._had_s * max(0.0, 1.0 - (now - self._at) / RECENT_S)
 
 
 class Rounds:
@@ -66,7 +81,10 @@ class Rounds:
         """When somebody's work was looked at last."""
         self._untimed = 0
         """How much of little work there was since."""
-        self._waiting: OrderedDict[str, deque[tuple[Callable[[], object], float]]] = OrderedDict()
+        self._waiting: OrderedDict[str, list[tuple[float, int, Callable[[], object], float]]] = OrderedDict()
+        """By address, a heap: when each is due, which of those that are due then, what goes on, and for how long at
+        least."""
+        self._entered = count()
         self._of_address: OrderedDict[str, Share] = OrderedDict()
         self._round_s = 0.0
         """What this round has had of work for addresses that take much."""
@@ -82,10 +100,6 @@ class Rounds:
         if share.spend(took_s, now):
             return TURN_S
         return took_s if over else 0.0
-
-    def count(self, host: str, took_s: float) -> None:
-        """The same for what is done for it, and not for what it does: nobody is read from less for that."""
-        self._count(host, took_s)
 
     def add(self, took_s: float) -> None:
         """Work for whoever it may be has taken so long: while any address takes much, that is of its round."""
@@ -122,10 +136,12 @@ class Rounds:
             self._await_round()
         return self._round_s > TURN_S
 
-    def enter(self, host: str, go_on: Callable[[], object], turn_s: float = TURN_S) -> None:
-        """Call this when it is the turn of this connection, in another round of the loop. It takes at least so long of
-        that round's time."""
-        self._waiting.setdefault(host, deque()).append((go_on, turn_s))
+    def enter(self, host: str, share: Share | None, go_on: Callable[[], object], turn_s: float = TURN_S) -> None:
+        """Call this when it is the turn of who has this share, in another round of the loop. It takes at least so long
+        of that round's time. None: nobody knows what it takes; then it waits as if that had been much."""
+        had_s = MUCH_S if share is None else min(MUCH_S, share.had_s(self._before))
+        due = self._before + LATEST_S * had_s / MUCH_S
+        heapq.heappush(self._waiting.setdefault(host, []), (due, next(self._entered), go_on, turn_s))
         self._await_round()
 
     def _await_round(self) -> None:
@@ -133,15 +149,15 @@ class Rounds:
             self._going = True
             asyncio.get_running_loop().call_soon(self._next)
 
-    async def turn(self, host: str, turn_s: float = TURN_S) -> None:
-        """Wait for one's turn."""
+    async def turn(self, host: str, share: Share | None, turn_s: float = TURN_S) -> None:
+        """Wait for one's turn, as in `enter`."""
         mine: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
         def go_on() -> None:
             if not mine.done():
                 mine.set_result(None)
 
-        self.enter(host, go_on, turn_s)
+        self.enter(host, share, go_on, turn_s)
         await mine
 
     def _next(self) -> None:
@@ -150,7 +166,7 @@ class Rounds:
             self._await_round()  # before those that go on: what they have read from now on is of that round
         for _ in range(sum(map(len, self._waiting.values()))):
             host, waiting = self._waiting.popitem(last=False)
-            go_on, turn_s = waiting.popleft()
+            _, _, go_on, turn_s = heapq.heappop(waiting)
             if waiting:
                 self._waiting[host] = waiting
             began = time.monotonic()

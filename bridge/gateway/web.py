@@ -158,7 +158,7 @@ class WebPort:
             if problem is not None:
                 self.drops.once("other_page", "%s: a web request is refused: %s", outer.host, problem)
                 return web.json_response({"error": problem}, status=403)
-            await self.rounds.turn(outer.host)  # one request, and then all else that is due
+            await self.rounds.turn(outer.host, None)  # one request, and then all else that is due
             try:
                 response = await handler(request)
             finally:
@@ -313,7 +313,7 @@ class _Outer(asyncio.BufferedProtocol):
         rounds = self._port.rounds
         if (turn_s := rounds.spend(self.host, self._share, took_s)) and not self.transport.is_closing():
             self._shared.hold()
-            rounds.enter(self.host, self._shared.let_go, turn_s)
+            rounds.enter(self.host, self._share, self._shared.let_go, turn_s)
 
     def eof_received(self) -> bool | None:
         return self._inner.eof_received() if self._counted or self._stream is not None else None

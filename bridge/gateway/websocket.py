@@ -105,7 +105,7 @@ class WebSocketTransport(asyncio.Transport):
                 return
             if turn_s := self._rounds.spend(read.host, self._share, MESSAGE_S):
                 self._pass_on()  # meanwhile others have the place where it was put
-                await self._rounds.turn(read.host, turn_s)
+                await self._rounds.turn(read.host, self._share, turn_s)
             if message.type is WSMsgType.BINARY:
                 if not message.data and not self._spares():
                     return

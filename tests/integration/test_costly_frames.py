@@ -14,7 +14,7 @@ import pytest
 
 from bridge.gateway.connection import Connection
 from bridge.gateway.memory import Memory
-from bridge.gateway.shares import TURN_S, Rounds
+from bridge.gateway.shares import TURN_S, Rounds, Share
 from macs_zenoh.protocol.kept import Kept, Room
 from macs_zenoh.protocol.messages import (
     ROS,
@@ -278,7 +278,7 @@ def _use_up(busy: Timed, memory: Memory, connection: Connection) -> None:
     """What a round of the loop has for its address, which takes much."""
     while not memory.rounds.are_over(connection.host):
         busy.clock_s += TURN_S
-        memory.rounds.count(connection.host, TURN_S)
+        memory.rounds.spend(connection.host, Share(), TURN_S)
 
 
 async def test_many_of_one_address_wait_for_each_other_and_not_everybody_for_all_of_them() -> None:
@@ -302,6 +302,23 @@ async def test_many_of_one_address_wait_for_each_other_and_not_everybody_for_all
     ticking[0].cancel()
     in_round = Counter(busy.rounds[20:])  # the first of them show that the address takes much
     assert max(in_round.values()) <= 2 * TURN_S / COSTS_S + 2
+
+
+async def test_a_stop_from_the_address_of_many_that_take_much_comes_before_what_they_say() -> None:
+    """Behind one address there may be many houses and one proxy: who presses is handled within a few turns, and not
+    when each of twenty that flood has had one."""
+    busy = Timed()
+    memory = Memory(64 << 20, 32 << 20)
+    memory.rounds = Rounds(lambda: busy.clock_s)
+    async with many(busy, memory, 21) as (presser, *floods):
+        for each in floods:
+            each.sendall(b"".join(question(number) for number in range(2, MANY)))
+        for part in range(1, 4):
+            await until(lambda wanted=part * 20 * MANY // 4: len(busy.rounds) >= wanted)  # type: ignore[misc]
+            before = len(busy.did)
+            presser.sendall(said(f"stop {part}"))
+            await until(lambda said=(1, f"stop {part}"): said in busy.did)  # type: ignore[misc]
+            assert busy.did.index((1, f"stop {part}")) - before <= 8 * TURN_S / COSTS_S
 
 
 async def test_what_is_encrypted_for_one_of_many_waits_for_its_turn() -> None:

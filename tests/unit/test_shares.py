@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 
 from bridge.gateway import shares
-from bridge.gateway.shares import SHARE, TURN_S, Rounds, Share
+from bridge.gateway.shares import LATEST_S, SHARE, TURN_S, Rounds, Share
 from macs_zenoh.protocol.ping import PING_BYTES_PER_S, PINGS_PER_S, PingGate
 from macs_zenoh.protocol.rate_limit import FLOODED, NOW, Pace
 
@@ -81,7 +81,7 @@ async def went_on(entered: list[tuple[str, float]]) -> list[tuple[str, int]]:
 
     tick()
     for host, turn_s in entered:
-        rounds.enter(host, goes(host), turn_s)
+        rounds.enter(host, None, goes(host), turn_s)
     while len(went) < len(entered):
         await asyncio.sleep(0)
     return went
@@ -104,7 +104,7 @@ async def test_of_short_turns_several_are_in_one_round() -> None:
 async def test_who_is_cancelled_while_he_waits_holds_up_nobody() -> None:
     """His turn passes."""
     rounds = Rounds()
-    first, second = (asyncio.create_task(rounds.turn("10.0.0.1")) for _ in range(2))
+    first, second = (asyncio.create_task(rounds.turn("10.0.0.1", None)) for _ in range(2))
     await asyncio.sleep(0)
     first.cancel()
     await asyncio.wait_for(second, 10)
@@ -157,13 +157,13 @@ async def test_what_goes_on_in_its_turn_counts_in_its_round() -> None:
     rounds = Rounds(lambda: clock[0])
     while not rounds.are_over("10.0.0.1"):
         clock[0] += TURN_S / 2
-        rounds.count("10.0.0.1", TURN_S / 2)
+        rounds.spend("10.0.0.1", Share(), TURN_S / 2)
 
     def goes_on() -> None:
         clock[0] += 2 * TURN_S
-        rounds.count("10.0.0.1", 2 * TURN_S)
+        rounds.spend("10.0.0.1", Share(), 2 * TURN_S)
 
-    rounds.enter("10.0.0.1", goes_on)
+    rounds.enter("10.0.0.1", None, goes_on)
     for _ in range(2):  # in the same round, and in the next one
         asyncio.get_running_loop().call_soon(lambda: went.append(rounds.are_over("10.0.0.1")))
         await asyncio.sleep(0)
@@ -177,9 +177,50 @@ async def test_what_is_handed_over_counts_while_any_address_takes_much() -> None
     rounds.add(TURN_S)
     while not rounds.are_over("10.0.0.1"):
         clock[0] += TURN_S
-        rounds.count("10.0.0.1", TURN_S)
+        rounds.spend("10.0.0.1", Share(), TURN_S)
     await asyncio.sleep(0)
     assert not rounds.are_over("10.0.0.1")
     rounds.add(2 * TURN_S)
     assert rounds.are_over("10.0.0.1")
     assert not rounds.are_over("10.0.0.2")
+
+
+async def test_of_one_address_who_has_had_little_comes_first() -> None:
+    """A stop waits for none of twenty that have had much, nor the twenty for each other longer than before."""
+    clock, went = [100.0], list[str]()
+    rounds, many, one = Rounds(lambda: clock[0]), [Share() for _ in range(20)], Share()
+    for share in many:
+        clock[0] += 10 * TURN_S
+        rounds.spend("10.0.0.1", share, 10 * TURN_S)
+    clock[0] += TURN_S / 50
+    rounds.spend("10.0.0.1", one, TURN_S / 50)
+    for number, share in enumerate(many):
+        rounds.enter("10.0.0.1", share, lambda number=number: went.append(f"{number}"))  # type: ignore[misc]
+    rounds.enter("10.0.0.1", one, lambda: went.append("stop"))
+    while len(went) < 21:
+        await asyncio.sleep(0)
+    assert went[0] == "stop"
+    assert sorted(map(int, went[1:])) == list(range(20))
+
+
+async def test_who_has_had_much_waits_for_others_no_longer_than_a_second() -> None:
+    """However many come who have had nothing yet."""
+    clock, went = [100.0], list[float]()
+    rounds, much = Rounds(lambda: clock[0]), Share()
+    clock[0] += 1.0
+    rounds.spend("10.0.0.1", much, 1.0)
+    rounds.enter("10.0.0.1", much, lambda: went.append(clock[0]))
+
+    def another() -> None:
+        clock[0] += TURN_S
+        share = Share()
+        rounds.spend("10.0.0.1", share, TURN_S)
+        if not went:
+            rounds.enter("10.0.0.1", Share(), another)
+
+    for _ in range(5):
+        rounds.enter("10.0.0.1", Share(), another)
+    while not went:
+        assert clock[0] < 101.0 + LATEST_S + 10 * TURN_S
+        await asyncio.sleep(0)
+    assert went[0] == pytest.approx(101.0 + LATEST_S, abs=10 * TURN_S)
