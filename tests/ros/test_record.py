@@ -43,6 +43,7 @@ from tests.support.lichtblick import THERE, lichtblick
 from tests.support.programs import Program, ended, macs
 from tests.support.ros_peer import Peer, say_hello
 from tests.support.routers import Router
+from tests.support.thorough import some
 from tests.support.waiting import get, until
 
 SETTINGS = """
@@ -158,8 +159,8 @@ async def publish_each(peer: Peer, names: list[str]) -> dict[str, bytes]:
 async def test_every_type_is_recorded_as_it_was_published(site: Site, peer: Peer) -> None:
     """One message of every standard type and of a type of one's own: mcap-ros2-support, rosbags, rclpy and what
     Lichtblick reads files with read it, byte for byte what was published, and no schema is empty."""
-    names = [*STANDARD, OWN]
-    assert len(names) > 100
+    assert len(STANDARD) > 100
+    names = [*some(STANDARD), OWN]
     published = await publish_each(peer, names)
     topics = [f"/7{topic_of(name)}" for name in names]
     async with site.record() as recording:
