@@ -87,8 +87,11 @@ $(PAGE): $(wildcard bridge/page/npm/*) | $(if $(shell command -v npm),$(BIN)/pyt
 	@echo "fetching the libraries of the live page from npm (seconds, once)"
 	@$(BIN)/python -m bridge.page.libraries --work build/npm --for-tests || echo "try again with: make page"
 
-check: lint
-	@$(BIN)/python -m tests.run --fast
+# Beside each other; what lint says comes behind the tests.
+check: install
+	@mkdir -p build; $(MAKE) --no-print-directory lint >build/lint.txt 2>&1 & \
+	$(BIN)/python -m tests.run --fast && tests=good || tests=bad; \
+	wait $$! && lint=good || lint=bad; cat build/lint.txt; [[ $$tests$$lint == goodgood ]]
 
 # A whole run that ran no ROS test proves too little, so it fails (tests/conftest.py); a chosen part may.
 test: install

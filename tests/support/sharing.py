@@ -29,7 +29,9 @@ LONG = (
     "tests/integration/test_resume.py",
     "tests/integration/test_security_check.py",
     "tests/integration/test_wheel.py",
+    "tests/ros/test_definitions.py",
     "tests/ros/test_graph_verbs.py",
+    "tests/ros/test_robot_processes.py",
 )
 """Files with tests that take a minute, or half of it."""
 
