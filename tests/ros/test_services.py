@@ -105,7 +105,7 @@ async def test_a_headset_calls_a_ros_service(nodes: InterfaceNodes, headsets: He
 
 async def test_many_calls_are_open_at_once(nodes: InterfaceNodes, headsets: Headsets, peer: Peer) -> None:
     """Two hundred calls of three headsets are all answered, each to its own."""
-    await peer.service(SetBool, "/slow", said, nodes.robot.session)
+    await peer.service(SetBool, "/slow", said, nodes.robot.session, depth=1000)
     await nodes.add(adding("/slow", SET, node_type=3))
     asked = {(5 + number % 3, number) for number in range(200)}
     for sender, number in asked:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from geometry_msgs.msg import Twist
+from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from std_msgs.msg import String
@@ -49,9 +50,13 @@ class Peer:
         await self.session.run(lambda: self.session.node.create_subscription(kind, topic, receive, qos))
         return received
 
-    async def service(self, kind: type[Any], name: str, answer: Any, robot: RosSession) -> Any:
-        """A service, once the robot knows of it: for a call that comes sooner there is none."""
-        service = await self.session.run(lambda: self.session.node.create_service(kind, name, answer))
+    async def service(self, kind: type[Any], name: str, answer: Any, robot: RosSession, depth: int = 10) -> Any:
+        """A service, once the robot knows of it: for a call that comes sooner there is none. So many requests wait for
+        it; ROS loses more without a word, as of a service that is kept from the processor."""
+        kept = QoSProfile(depth=depth)
+        service = await self.session.run(
+            lambda: self.session.node.create_service(kind, name, answer, qos_profile=kept)
+        )
         await known(robot, name)
         return service
 
