@@ -21,7 +21,7 @@ from sensor_msgs.msg import CompressedImage
 from tests.page.conftest import Act, Gate, Site
 from tests.page.driving import Heard
 from tests.page.polls import until
-from tests.support.browser import ROOT, SCREENSHOTS, Watched, opened
+from tests.support.browser import ROOT, SCREENSHOTS, SLOWER, Watched, opened
 from tests.support.ros_peer import Peer
 
 IWER = ROOT / "build" / "npm" / "node_modules" / "iwer" / "build" / "iwer.min.js"
@@ -63,25 +63,6 @@ SMALL = LOOKED_AT % "[320, 210]"
 who drives has to be confirmed five times a second by a frame."""
 UNDRAWN = LOOKED_AT % "[32, 32]"
 """For tests that look at no pixel."""
-SLOWER = """
-const { requestAnimationFrame: ask, cancelAnimationFrame: cancel } = window;
-const asked = new Map();
-let last = 0;
-window.requestAnimationFrame = (act) => {
-  const id = ++last;
-  const timer = setTimeout(() => {
-    const frame = ask((at) => (asked.delete(id), act(at)));
-    asked.set(id, () => cancel(frame));
-  }, 33);
-  asked.set(id, () => clearTimeout(timer));
-  return id;
-};
-window.cancelAnimationFrame = (id) => {
-  asked.get(id)?.();
-  asked.delete(id);
-};
-"""
-"""A frame 30 times a second, not 60."""
 PICTURES = "/test/picture"
 PATIENT_ROBOT = """
 [robot]

@@ -171,6 +171,9 @@ async def test_who_has_control_is_respected(site: Site) -> None:
     await two.page.mouse.up()
 
 
+STOPPED_MS = 200
+
+
 async def test_a_stop_is_seen_on_two_pages_at_once(site: Site) -> None:
     """Pressed on one by a key, the robot's confirmation is on both within 200 ms, and nobody drives until it is
     released, which takes two presses."""
@@ -179,7 +182,7 @@ async def test_a_stop_is_seen_on_two_pages_at_once(site: Site) -> None:
     }).observe(document.querySelector('#stop-status'), {childList: true, characterData: true, subtree: true})"""
     one, two = await site.with_robot(), await site.with_robot()
     took: list[float] = []
-    for _ in range(5):
+    while len(took) < 5 and not (took and took[-1] <= STOPPED_MS):
         for page in (one, two):
             await page.value(f"window.sawStop = undefined; {watch}; undefined")
         await one.value(
@@ -195,7 +198,7 @@ async def test_a_stop_is_seen_on_two_pages_at_once(site: Site) -> None:
             await page.page.wait_for_selector('#pad[aria-disabled="false"]')
             await until(partial(page.value, "document.querySelector('#stop-status').textContent === ''"))
     print(f"a stop was on both pages after {', '.join(f'{ms:.0f}' for ms in took)} ms")
-    assert min(took) <= 200
+    assert took[-1] <= STOPPED_MS
 
 
 async def test_a_stop_that_finds_no_connection_is_sent_later(site: Site) -> None:

@@ -33,6 +33,26 @@ ARGUMENTS = (
     "--disable-gpu-compositing",
 )
 
+SLOWER = """
+const { requestAnimationFrame: ask, cancelAnimationFrame: cancel } = window;
+const asked = new Map();
+let last = 0;
+window.requestAnimationFrame = (act) => {
+  const id = ++last;
+  const timer = setTimeout(() => {
+    const frame = ask((at) => (asked.delete(id), act(at)));
+    asked.set(id, () => cancel(frame));
+  }, 33);
+  asked.set(id, () => clearTimeout(timer));
+  return id;
+};
+window.cancelAnimationFrame = (id) => {
+  asked.get(id)?.();
+  asked.delete(id);
+};
+"""
+"""A frame 30 times a second, not 60."""
+
 
 def node() -> list[str] | None:
     """How node is started, with WebSockets; None where there is none."""
