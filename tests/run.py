@@ -22,7 +22,7 @@ from tests.support import tiers, tools
 from tests.support.thorough import THOROUGH
 
 CORES = os.cpu_count() or 1
-WORKERS = min(4 * CORES, 12)
+WORKERS = min(5 * CORES, 12)
 """More than there are cores: most tests wait most of the time."""
 
 FEW_WORKERS = max(2, min(CORES, 3))

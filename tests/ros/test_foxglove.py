@@ -195,7 +195,7 @@ async def publishing(domain: int) -> AsyncIterator[Client]:
         Program("foxglove", "--port", "0", "-e", router.endpoint, "--publish", "--robot", "7") as server,
         client_of(server) as client,
     ):
-        assert any("may move robots" in line for line in server.log)
+        await until(lambda: any("may move robots" in line for line in server.log))  # another pipe than that of "ready"
         yield client
 
 
