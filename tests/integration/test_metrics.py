@@ -95,7 +95,7 @@ async def test_router_and_gateway_tell_who_watches() -> None:
             return figure((await get(f"{where}/metrics"))[1], "macs_linked") == 0
 
         await until(told, every_s=0.05)
-        assert any(f"router {endpoint} lost; reconnecting" in line for line in gateway.log)
+        await until(lambda: any(f"router {endpoint} lost; reconnecting" in line for line in gateway.log))
         assert any(re.search(rf"router {endpoint} connected \([0-9a-f]{{8}}\)", line) for line in gateway.log)
         assert any(re.search(r"client [0-9a-f]{8} at tcp/127\.0\.0\.1:\d+ is linked", line) for line in router.log)
 
