@@ -81,6 +81,8 @@ async def test_messages_as_recorded(router: str) -> None:
         listening = session.declare_subscriber(
             f"{DOMAIN}/**", lambda sample: loop.call_soon_threadsafe(heard.put_nowait, sample)
         )
+        told = session.liveliness().declare_token("listening")
+        await until(lambda: list(ours.session.liveliness().get("listening")))  # it has the subscriber, too
         node = ours.node(DOMAIN, "talker", "/robot1")
         for key, endpoint in by_key.items():
             publisher = node.publisher(endpoint.topic, endpoint.type, endpoint.hash, endpoint.qos)
@@ -102,6 +104,7 @@ async def test_messages_as_recorded(router: str) -> None:
                 assert (attached.number, attached.gid) == (number, publisher.gid)
                 assert fixed(sample.attachment.to_bytes()) == fixed(bytes.fromhex(row["attachment_hex"]))
             publisher.close()
+        told.undeclare()
         listening.undeclare()
 
 

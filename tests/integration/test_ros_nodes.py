@@ -10,6 +10,7 @@ import pytest
 
 import macs_zenoh
 from macs_zenoh import ros
+from macs_zenoh.protocol.rmw_zenoh.keyexpr import Kind
 from tests.support.waiting import PATIENCE_S, until
 
 pytest.importorskip("xxhash", reason="being a ROS node needs xxhash: pip install 'macs-zenoh[rmw-zenoh]'")
@@ -48,6 +49,8 @@ async def test_topics_in_order_and_what_is_held_for_late_ones(router: str) -> No
         held = talker.publisher("map", TEXT, qos=LATCHED)
         assert held.topic == "/robot1/map"
         early = listener.subscribe("/robot1/map", TEXT, qos=LATCHED)
+        graph = talker.network.graph(0)
+        await until(lambda: graph.on("/robot1/map", Kind.SUBSCRIPTION, others=True))  # not what is held
         for number in range(5):
             held.publish({"data": str(number)})
         for number in range(5):  # they have passed the router, and none of them is on its way to who comes later

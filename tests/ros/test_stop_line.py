@@ -12,7 +12,7 @@ import zenoh
 from bridge.ros import stop_line
 from bridge.ros.agent import open_robot
 from bridge.settings import RobotSettings, Settings
-from macs_zenoh import join, locked_out
+from macs_zenoh import join
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.errors import ConfigError, Refused
 from macs_zenoh.handles import Handle
@@ -22,6 +22,7 @@ from macs_zenoh.protocol.guard import Guard
 from macs_zenoh.protocol.messages import Metadata
 from tests.support.links import counted
 from tests.support.routers import Router
+from tests.support.thieves import notice_soon, stolen, zenoh_id
 from tests.support.waiting import until
 
 ROBOT = 7
@@ -136,8 +137,7 @@ async def test_a_session_that_fails_is_made_again(monkeypatch: pytest.MonkeyPatc
 
 async def test_who_takes_its_id_gets_no_stop_of_it(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Routers let a thief in and not this session: it goes on under another id, and serves the stop again."""
-    monkeypatch.setattr(locked_out, "PATIENCE_S", 0.5)
-    monkeypatch.setattr(locked_out, "AGAIN_S", 0.1)
+    notice_soon(monkeypatch)
     sessions: list[Mesh] = []
 
     def serve(mesh: Mesh) -> Handle:
@@ -147,11 +147,8 @@ async def test_who_takes_its_id_gets_no_stop_of_it(domain: int, monkeypatch: pyt
     async with Router() as router, counted(router.endpoint) as link:
         line = stop_line.StopLine(MeshSettings(connect=[link.endpoint], overrides=['id:"abc"']), serve)
         await until(lambda: line.is_open)
-        before = str(sessions[0]._session.zid())
-        link.cut()
-        await until(lambda: not sessions[0].linked)
-        async with await Mesh.open(MeshSettings(connect=[router.endpoint], overrides=[f'id:"{before}"'])):
-            link.mend()
+        before = zenoh_id(sessions[0])
+        async with stolen(sessions[0], link, router.endpoint):
             await until(lambda: len(sessions) == 2 and line.is_open, 60)
-            assert str(sessions[1]._session.zid()) != before
+            assert zenoh_id(sessions[1]) != before
         await line.close()
