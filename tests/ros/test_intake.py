@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -108,11 +109,19 @@ async def test_unsubscribing_while_messages_come_is_quiet(
         publisher.publish(String(data="x"))
         await session.run(lambda made=made: session.intake.unsubscribe(made))
     heard = Heard()
-    await session.run(lambda: session.intake.subscribe(String, "/t", heard.take, 10, events=events))
 
     def say() -> bool:
         publisher.publish(String(data="still here"))
         return bool(heard.texts)
 
-    await until(say)
+    for _ in range(5):
+        made = await session.run(lambda: session.intake.subscribe(String, "/t", heard.take, 10, events=events))
+        with suppress(AssertionError):
+            await until(say, 10)
+        if heard.texts:
+            break
+        # of so many that come and go at once Fast DDS sometimes does not tell the publisher of the last: not ours
+        assert publisher.get_subscription_count() == 0
+        await session.run(lambda made=made: session.intake.unsubscribe(made))
+    assert heard.texts
     assert not caplog.records
