@@ -65,6 +65,16 @@ class RawZenoh:
         publisher.undeclare()  # type: ignore[no-untyped-call]
         return {"began": began}
 
+    def drop(self, key: str) -> dict[str, Any]:
+        """Hear what comes on a key and do nothing with it, until `dropped`."""
+        self._dropping = self.declare(key, lambda sample: None, direct=True)
+        return {}
+
+    def dropped(self) -> dict[str, Any]:
+        """No more of it."""
+        self._dropping.undeclare()
+        return {}
+
     def save(self, key: str, path: str) -> dict[str, Any]:
         """Write the bytes of what comes on a key to a file, until `saved`."""
         file = open(path, "wb")  # noqa: PTH123, SIM115 - closed in saved
@@ -185,7 +195,7 @@ def main() -> None:
         serve({"port": tcp.port}, {"ping": tcp.ping, "echo": tcp.echo})
         return
     raw = RawZenoh(int(port[0]))
-    names = ("subscribe", "save", "saved", "publish", "expect", "receive", "ping", "echo")
+    names = ("subscribe", "drop", "dropped", "save", "saved", "publish", "expect", "receive", "ping", "echo")
     serve({}, {name: getattr(raw, name) for name in names})
     raw.session.close()  # type: ignore[no-untyped-call]
 

@@ -1,11 +1,12 @@
 """A headset's latency beside a recording of everything, against the same without one.
 
-What a recording takes is the router's and the processor's as well as its own: so the same run has a plain Zenoh
-subscriber in its place that hears the same and writes the bytes to a file, which no recording can cost less than.
+What a recording takes is the router's and the processor's as well as its own: so the same run has plain Zenoh
+subscribers in its place that hear the same. One does nothing with it, which no recording can cost less than, and one
+writes the bytes to a file.
 
-Without a recording the data of one robot goes through the router, since nobody looks at the others, and beside it
-that of all. ``recording_of_seen`` has headsets that look at the others all the time: what is left between the two is
-the way from the router to the recorder, and the recorder.
+All robots publish all the time. Without a recording the data of one goes through the router, as nobody looks at the
+others, and beside it that of all. ``recording_of_seen`` has headsets that look at the others all the time: what is
+left between the two is the way from the router to the recorder, and the recorder.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ BESIDE = 1.2
 """So many times as long a message may take beside a recording."""
 QUIET_S = 2.0
 READY_S = 20.0
-ALONE, RECORDED, SAVED = "without", "macs record", "a plain subscriber"
+ALONE, RECORDED, DROPPED, SAVED = "without", "macs record", "a subscriber that does nothing", "a plain subscriber"
 
 
 class Site:
@@ -67,12 +68,11 @@ class Site:
 
     def beside(self, what: str, seconds: float, plan: Plan) -> dict[str, float]:
         """The headset's p99 for both topics, in ms, while somebody else listens or nobody does."""
-        robots = self.robots[:1] if what == ALONE and not self._seen else self.robots
         path = self._folder / "recorded"
         listener = self._listen(what, path)
         began = self._used_by(what, listener)
         try:
-            found = self._measure(robots, seconds, plan)
+            found = self._measure(seconds, plan)
             if isinstance(listener, subprocess.Popen):
                 time.sleep(0.5)
         finally:
@@ -82,7 +82,7 @@ class Site:
                 said = listener.communicate(timeout=30)[0].decode()
                 print(f"  {said.splitlines()[-1]}", file=sys.stderr)
             elif listener is not None:
-                listener.ask("saved")
+                listener.ask("saved" if what == SAVED else "dropped")
         if what == RECORDED:
             self._check(path.with_suffix(".mcap"), seconds, plan)
         for file in self._folder.iterdir():
@@ -94,8 +94,9 @@ class Site:
     def _listen(self, what: str, path: Path) -> subprocess.Popen[bytes] | Program | None:
         if what == ALONE:
             return None
-        if what == SAVED:
-            self.plain.ask("save", key=STREAM.every(type=1), path=str(path))
+        if what in (SAVED, DROPPED):
+            where = {"path": str(path)} if what == SAVED else {}
+            self.plain.ask("save" if where else "drop", key=STREAM.every(type=1), **where)
             time.sleep(0.3)
             return self.plain
         endpoint, file = f"tcp/127.0.0.1:{self._port}", str(path.with_suffix(".mcap"))
@@ -113,16 +114,16 @@ class Site:
         fields = Path(f"/proc/{listener.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / 100
 
-    def _measure(self, robots: list[Program], seconds: float, plan: Plan) -> dict[str, float]:
+    def _measure(self, seconds: float, plan: Plan) -> dict[str, float]:
         counts = {"/image": int(IMAGE_HZ * seconds), "/small": int(SMALL_HZ * seconds)}
         self.small.tell("collect", count=counts["/small"], quiet_s=QUIET_S)
         self.large.tell("collect", count=counts["/image"], quiet_s=QUIET_S)
         for viewer in self._viewers:
             viewer.tell("look", quiet_s=QUIET_S)
-        for robot in robots:
+        for robot in self.robots:
             robot.ask("publish", topic="/image", size=IMAGE, hz=IMAGE_HZ, count=counts["/image"])
             robot.ask("publish", topic="/small", size=SMALL, hz=SMALL_HZ, count=counts["/small"])
-        for robot in robots:
+        for robot in self.robots:
             robot.tell("published")
             robot.answer(seconds)
         small, large = self.small.answer(), self.large.answer()
@@ -164,7 +165,7 @@ def recording_of_seen(stage: Stage, plan: Plan) -> Iterator[Figure]:
 def _recording(stage: Stage, plan: Plan, *, seen: bool) -> Iterator[Figure]:
     seconds = SECONDS * plan.scale
     folder = Path(tempfile.mkdtemp(prefix="macs-recording-"))
-    values: dict[str, list[dict[str, float]]] = {ALONE: [], RECORDED: [], SAVED: []}
+    values: dict[str, list[dict[str, float]]] = {ALONE: [], RECORDED: [], DROPPED: [], SAVED: []}
     try:
         site = Site(stage, folder, seen=seen)
         for _ in range(plan.rounds):
@@ -183,10 +184,12 @@ def _recording(stage: Stage, plan: Plan, *, seen: bool) -> Iterator[Figure]:
         bound = BESIDE if kind == "p99" else None
         title = " ".join(f"headset's {kind}, {said}, {where} beside".split())
         yield Figure(f"{title} a recording", of(RECORDED, name), of(ALONE, name), ALONE, "ms", at_most=bound)
-        yield Figure(f"{title} a plain subscriber", of(SAVED, name), of(ALONE, name), ALONE, "ms")
-        yield Figure(f"{title} a recording", of(RECORDED, name), of(SAVED, name), SAVED, "ms")
-    used = [site.used[what] / plan.rounds / seconds * 100 for what in (RECORDED, SAVED)]
-    yield Figure("a recording's processor", [used[0]], [used[1]], SAVED, "% of a core")
+        for other in (DROPPED, SAVED):
+            yield Figure(f"{title} {other}", of(other, name), of(ALONE, name), ALONE, "ms")
+            yield Figure(f"{title} a recording", of(RECORDED, name), of(other, name), other, "ms")
+    used = {what: site.used[what] / plan.rounds / seconds * 100 for what in (RECORDED, DROPPED, SAVED)}
+    for other in (DROPPED, SAVED):
+        yield Figure("a recording's processor", [used[RECORDED]], [used[other]], other, "% of a core")
 
 
 CASES: dict[str, Case] = {"recording": recording, "recording_of_seen": recording_of_seen}
