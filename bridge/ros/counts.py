@@ -96,9 +96,9 @@ def telling(
             asked = decode_data(StatusRequest, call.data).counts if call.data else ""
         except WireError:
             asked = ""
-        sender = Registrant(type_number(call.sender_type), call.sender_id)
-        if asked and may_ask(sender):
-            for node in nodes:
+        if asked:
+            sender = Registrant(type_number(call.sender_type), call.sender_id)
+            for node in nodes if may_ask(sender) else ():
                 node.tell_count(sender, again=asked == "all")
         return state()
 
