@@ -41,11 +41,11 @@ def run(args: argparse.Namespace) -> int:
 
 async def _serve(settings: Settings, ros_args: list[str], metrics: str | None) -> int:
     from bridge.doctor.first import told_while_waiting
-    from bridge.ros import agent
+    from bridge.ros import program
 
     memory.give_back()
     running.switch_soon()
-    await agent.run(
+    await program.run(
         settings,
         ros_args=ros_args,
         on_waiting=told_while_waiting(settings.mesh),

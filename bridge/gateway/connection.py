@@ -1,4 +1,7 @@
-"""One socket: bytes between a TCP agent and its `TcpAgent`, and the queue of an agent that reads too slowly."""
+"""One socket: bytes between a TCP agent and its `TcpAgent`, and the queue of an agent that reads too slowly.
+
+One class, though a long one: reading, turns, sleep and end change the same facts of one socket, in view of each other.
+"""
 
 from __future__ import annotations
 

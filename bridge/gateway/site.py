@@ -8,7 +8,7 @@ A module has a function that takes a `Site` and says which requests it answers::
 
         site.get("/metrics", answer)
 
-and `add_routes` below names it. Who asks has shown a valid token where one is wanted, in the header ``Authorization:
+and `gateway.pages` names it. Who asks has shown a valid token where one is wanted, in the header ``Authorization:
 Bearer`` or as the cookie of a login; what the token permits is the visitor's `Grant`.
 """
 
@@ -108,15 +108,3 @@ def _shown(request: web.Request) -> str | None:
     if scheme.lower() == "bearer":
         return token.strip()
     return request.cookies.get(COOKIE)
-
-
-def add_routes(site: Site) -> None:
-    """Let each module that has something to show add it."""
-    from bridge.page.recordings import add_recordings
-    from bridge.page.routes import add_page
-
-    from .figures import add_figures  # they take a `Site`
-
-    add_figures(site)
-    add_page(site)
-    add_recordings(site)

@@ -30,8 +30,9 @@ from .admission import is_in, networks
 from .connection import Connection
 from .door import Door, Entrance
 from .listener import Listener
+from .pages import add_routes
 from .shares import TURN_S, Share
-from .site import COOKIE, WRONG, Site, add_routes
+from .site import COOKIE, WRONG, Site
 from .websocket import WebSocketTransport
 
 if TYPE_CHECKING:

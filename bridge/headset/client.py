@@ -11,7 +11,8 @@
             print(message.sender_id, len(message.data))
 
 Messages of ROS are CDR bytes here; `macs_zenoh.typed` turns them into Python and back. One task reads the
-socket and never waits for a slow taker: every queue is bounded and counts what it drops.
+socket and never waits for a slow taker: every queue is bounded and counts what it drops. All that a headset can do is
+one object in its user's hands, so one class.
 
 Where the C# program is faulty this one is not: it takes groups off groups (the C# sends their numbers as
 agents), it survives bad messages (and counts them), it notices the end of a connection, and it can reconnect.

@@ -2,7 +2,7 @@
 
 `InterfaceNodes` belongs to the event loop; what is on the ROS graph is made and destroyed in the ROS thread. Commands
 come in Zenoh's threads (`macs_zenoh.protocol.guard`), so that nothing that the loop is busy with can hold them up, nor
-a stop.
+a stop. One table of nodes, and what waits for them, under one lock: so one module.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@
 The connection's own id is the truth. What the agent's JSON says about its sender is corrected where it differs:
 existing headsets send id 0 from nodes made before the handshake and old ids from nodes kept across a reconnect.
 Frames that come before the configuration are held until it is there, because headsets do send registrations first.
+One state machine, so one module: what each step may do depends on what the others have seen.
 """
 
 from __future__ import annotations

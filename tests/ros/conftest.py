@@ -20,7 +20,8 @@ os.environ.pop("ROS_STATIC_PEERS", None)
 import macs_zenoh
 from bridge import interfaces
 from bridge.interfaces import build
-from bridge.ros.agent import RobotAgent, open_robot
+from bridge.ros.agent import RobotAgent
+from bridge.ros.program import open_robot
 from bridge.ros.session import RosSession
 from bridge.ros.topics import PublisherNode
 from bridge.settings import RobotSettings, Settings

@@ -14,9 +14,10 @@ from std_msgs.msg import Bool, String
 
 import macs_zenoh
 from bridge.ros import counts, graph
-from bridge.ros.agent import RobotAgent, open_robot
+from bridge.ros.agent import RobotAgent
 from bridge.ros.graph import Offered, TopicQos
 from bridge.ros.interface import Registrant
+from bridge.ros.program import open_robot
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings

@@ -17,8 +17,9 @@ from std_srvs.srv import SetBool
 import macs_zenoh
 from bridge.headset import frames
 from bridge.headset.frames import NodeSpec
-from bridge.ros.agent import RobotAgent, open_robot
+from bridge.ros.agent import RobotAgent
 from bridge.ros.interface import InterfaceNode
+from bridge.ros.program import open_robot
 from bridge.settings import RobotSettings, Settings, TopicRule
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings

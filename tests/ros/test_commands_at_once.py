@@ -12,9 +12,9 @@ import pytest
 from geometry_msgs.msg import Twist
 from std_msgs.msg import Bool
 
-from bridge.ros.agent import open_robot
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
+from bridge.ros.program import open_robot
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from bridge.ros.topics import PublisherNode

@@ -7,7 +7,7 @@ import threading
 from contextlib import AsyncExitStack
 
 import macs_zenoh
-from bridge.ros.agent import open_robot
+from bridge.ros.program import open_robot
 from bridge.settings import RobotSettings, Settings, TopicRule
 from bridge.settings.robot import AsJpeg
 from tests.ros.driven import STOPPED, driving, hear, may_command

@@ -10,7 +10,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
 import macs_zenoh
-from bridge.ros.agent import RobotAgent, open_robot
+from bridge.ros.agent import RobotAgent
+from bridge.ros.program import open_robot
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from bridge.ros import agent
+from bridge.ros import program
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh import join, locked_out
 from macs_zenoh.agent import Agent
@@ -52,7 +52,7 @@ async def test_a_robot_goes_on_under_another_id(domain: int, monkeypatch: pytest
     async with Router() as router, counted(router.endpoint) as link:
         settings = Settings(mesh=MeshSettings(connect=[link.endpoint]), robot=RobotSettings(id=7))
         async with join("operator", id=5, settings=MeshSettings(connect=[router.endpoint])) as operator:
-            running = asyncio.create_task(agent.run(settings, on_ready=came.append, stop=stop))
+            running = asyncio.create_task(program.run(settings, on_ready=came.append, stop=stop))
             await until(lambda: came)
             before = zenoh_id(came[0].mesh)
             await operator.call("ros", 7, "stop", b"true")

@@ -13,7 +13,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 import macs_zenoh
-from bridge.ros.agent import open_robot
+from bridge.ros.program import open_robot
 from bridge.settings import RobotSettings, Settings
 from bridge.settings.mirror import MirrorRule
 from macs_zenoh.agent import Agent

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from bridge.ros.agent import open_robot
 from bridge.ros.mirrors import ROBOTS
+from bridge.ros.program import open_robot
 from bridge.settings import RobotSettings, Settings
 from bridge.settings.mirror import MirrorRule
 from macs_zenoh.config import MeshSettings

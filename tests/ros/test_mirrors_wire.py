@@ -9,7 +9,8 @@ import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
-from bridge.ros.agent import RobotAgent, open_robot
+from bridge.ros.agent import RobotAgent
+from bridge.ros.program import open_robot
 from bridge.settings import RobotSettings, Settings
 from bridge.settings.mirror import MirrorRule
 from macs_zenoh.config import MeshSettings

@@ -13,7 +13,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
-from bridge.ros.agent import RobotAgent, open_robot
+from bridge.ros.agent import RobotAgent
+from bridge.ros.program import open_robot
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings

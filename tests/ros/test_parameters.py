@@ -11,9 +11,9 @@ import pytest
 
 from bridge.cli import main
 from bridge.ros import parameters
-from bridge.ros.agent import open_robot
 from bridge.ros.interface import Robot
 from bridge.ros.nodes import InterfaceNodes
+from bridge.ros.program import open_robot
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from bridge.settings import RobotSettings, Settings

@@ -18,7 +18,8 @@ from sensor_msgs.msg import CompressedImage, Image
 
 import macs_zenoh
 from bridge.ros import jpeg
-from bridge.ros.agent import RobotAgent, open_robot
+from bridge.ros.agent import RobotAgent
+from bridge.ros.program import open_robot
 from bridge.ros.raw_image import NotAnImage, read_image, write_compressed
 from bridge.settings import RobotSettings, Settings, TopicRule
 from bridge.settings.robot import AsJpeg

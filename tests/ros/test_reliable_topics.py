@@ -14,9 +14,9 @@ from std_msgs.msg import String
 
 from bridge.gateway import Gateway
 from bridge.headset.client import Headset
-from bridge.ros.agent import open_robot
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
+from bridge.ros.program import open_robot
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession
 from bridge.settings import GatewaySettings, RobotSettings, Settings, TopicRule

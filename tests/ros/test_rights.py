@@ -15,9 +15,10 @@ from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
 import macs_zenoh
-from bridge.ros.agent import RobotAgent, open_robot
+from bridge.ros.agent import RobotAgent
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
+from bridge.ros.program import open_robot
 from bridge.ros.requests import control
 from bridge.ros.rules import Rules
 from bridge.ros.session import RosSession

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import macs_zenoh
-from bridge.ros.agent import open_robot
+from bridge.ros.program import open_robot
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh.config import MeshSettings
 from macs_zenoh.mesh import Mesh

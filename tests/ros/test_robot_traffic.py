@@ -12,7 +12,7 @@ from std_msgs.msg import String
 from zenoh import Priority
 
 import macs_zenoh
-from bridge.ros.agent import open_robot
+from bridge.ros.program import open_robot
 from bridge.settings import RobotSettings, Settings, TopicRule
 from macs_zenoh.agent import Agent
 from macs_zenoh.config import MeshSettings, TrafficRule

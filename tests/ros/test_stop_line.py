@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from bridge.ros import stop_line
-from bridge.ros.agent import open_robot
+from bridge.ros.program import open_robot
 from bridge.settings import RobotSettings, Settings
 from macs_zenoh import join
 from macs_zenoh.config import MeshSettings

@@ -21,9 +21,9 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from bridge.gateway import Gateway
 from bridge.headset.client import Headset
 from bridge.ros import types
-from bridge.ros.agent import open_robot
 from bridge.ros.interface import Registrant, Robot
 from bridge.ros.nodes import InterfaceNodes
+from bridge.ros.program import open_robot
 from bridge.ros.session import RosSession
 from bridge.ros.shapes import least_cdr_bytes
 from bridge.ros.types import shape_of
