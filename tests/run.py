@@ -9,6 +9,7 @@ pytest: ``make test ARGS=tests/unit``.
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import subprocess
@@ -68,14 +69,14 @@ def compile_once() -> None:
             each.wait()
 
 
-def run(words: list[str]) -> list[Part]:
+def run(asked: argparse.Namespace) -> list[Part]:
     """The parts that were asked for."""
-    order = ["--backwards"] if "--backwards" in words else []
-    if "--fast" in words:
+    order = ["--backwards"] if asked.backwards else []
+    if asked.fast:
         return [part("fast", "tests/unit", *order, workers=max(2, CORES))]
-    if "--all" in words:
+    if asked.all:
         os.environ[THOROUGH] = "1"
-    tier = TIERS if "--all" in words else f"{TIERS} and not soak"
+    tier = TIERS if asked.all else f"{TIERS} and not soak"
     compile_once()
     parts = [part("together", "-m", f"{tier} and not alone and not few", *order, workers=WORKERS)]
     os.environ.pop("MACS_NEED_ROS_TESTS", None)  # judged by the first part
@@ -84,7 +85,12 @@ def run(words: list[str]) -> list[Part]:
 
 
 def main() -> int:
-    parts = run(sys.argv[1:])
+    parser = argparse.ArgumentParser(prog="python -m tests.run", description=__doc__, allow_abbrev=False)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("--all", action="store_true", help="also those that take minutes, as CI")
+    parser.add_argument("--fast", action="store_true", help="those of single modules only")
+    parser.add_argument("--backwards", action="store_true", help="the last file first")
+    parts = run(parser.parse_args())
     if (advice := tools.advice()) is not None:
         print(advice)
     print("".join(line for each in parts for line in each.named), end="")
