@@ -7,6 +7,8 @@ import time
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from macs_zenoh.streams import TELL_S
+
 from .figures import Figure
 from .plan import Case, Plan
 from .processes import ProgramFailed, Stage
@@ -36,6 +38,7 @@ class Crowd:
         self.joined = self._counted("join", headsets=headsets)
         registered = self.headsets.ask("register", robots=robots)["registered"]
         self._wait(registered=registered)
+        self.robots.ask("settle")
 
     def leave(self) -> Cost:
         """All headsets go."""
@@ -127,6 +130,7 @@ def mixed(stage: Stage, plan: Plan) -> Iterator[Figure]:
         settled = settled or memory  # until then it takes what it needs once
         yield Figure("gateway, memory", [memory], [settled], "after 1", "MB", at_most=1.05, column=column)
         yield Figure("gateway, CPU", [percent], [100.0], "a core", "%", column=column)
+    time.sleep(TELL_S + REST_S)  # what was lost last the gateway knows by then, and says at its end
 
 
 CASES: dict[str, Case] = {"crowd": crowd, "mixed": mixed}

@@ -89,8 +89,10 @@ class Robot:
 
     def __init__(self, agent: macs_zenoh.Agent, times: Times) -> None:
         self.registrants: dict[str, set[int]] = {POSE.name: set(), IMAGE.name: set(), COMMAND.name: set()}
+        self.steady: dict[str, frozenset[int]] = {}
+        """Of these, by topic, who stays to the end: passers-by have others' former ids, but never theirs."""
         self.due: Counter[str] = Counter()
-        """How many messages those who registered are to get, by kind."""
+        """How many messages those who stay are to get, by kind."""
         self._agent = agent
         self._streams = Streams(agent)
         self._times = times
@@ -122,13 +124,13 @@ class Robot:
         self._times.note("command", sent, time.monotonic())
 
     async def publish(self, node: NodeSpec, kind: str, size: int, hz: float, until: float) -> None:
-        """Publish on one topic at a rate, to whoever is registered then; due are messages to those who are now. A late
+        """Publish on one topic at a rate, to whoever is registered then; due are messages to those who stay. A late
         one does not delay the next."""
         cdr = stamped(size)
         metadata = Metadata(ROS, self._agent.id, 0, StreamData.manager, int(NodeType.SUBSCRIBER), node.name, TYPE)
         began, number = time.monotonic() + self._agent.id / (hz * 61), 0
         registrants = self.registrants[node.name]
-        steady = frozenset(registrants)
+        steady = self.steady[node.name]
         while (due := began + number / hz) < until:
             await asyncio.sleep(due - time.monotonic())
             STAMP.pack_into(cdr, AT, time.monotonic(), number)
@@ -151,6 +153,12 @@ class Robots:
         """How many headsets are online, and how many registrations hold."""
         registered = sum(len(names) for robot in self._robots for names in robot.registrants.values())
         return {"headsets": len(self._first.directory.ids(UNITY)), "registered": registered}
+
+    async def settle(self) -> Report:
+        """Whoever is registered now stays."""
+        for robot in self._robots:
+            robot.steady = {name: frozenset(each) for name, each in robot.registrants.items()}
+        return {}
 
     async def run(self, until: float) -> Report:
         """Publish until then; how many messages were due to headsets, and the commands that came."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from macs_zenoh.protocol.least_bytes import TEXT_TYPE, is_whole
 from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, decode_management
 from macs_zenoh.protocol.recipient import subject
 from macs_zenoh.protocol.registrations import AgentKey
+from macs_zenoh.protocol.robot_state import StreamCount
 from macs_zenoh.protocol.routing import takes_group_copy
 from macs_zenoh.protocol.wire import Buffer, Frame, Frames, Layout, is_probe, parse_frame, parse_runs
 
@@ -31,6 +33,7 @@ from .agents import Agents
 from .backpressure import ROBOT_HOLD_S
 from .connection import Connection
 from .judged import JudgedFrames, Read
+from .on_the_way import OnTheWay, Stream
 from .shares import Rounds
 from .stead import Stead
 
@@ -54,24 +57,10 @@ KNOWN_BYTES = 4096
 SEEN = 512
 """How many messages are remembered by their beginnings."""
 
-SUBSCRIBER = int(NodeType.SUBSCRIBER)
-
 NOBODY: frozenset[AgentKey] = frozenset()
 
 Circle = tuple[AgentKey, list[Connection]]
 """Who sends, and all of ours that hear it."""
-
-
-class Stream(NamedTuple):
-    """Topic data of one robot under one node, and who of ours is registered there."""
-
-    robot: AgentKey
-    node: str
-    registrants: set[AgentKey]
-
-    def carries(self, metadata: Metadata) -> bool:
-        """Whether metadata is of this node; who sent it is looked at before."""
-        return metadata.node_name == self.node and metadata.node_type == SUBSCRIBER
 
 
 class Seen(NamedTuple):
@@ -101,11 +90,13 @@ class Delivery:
         directory: Directory,
         layout: Layout,
         stead: Stead,
+        session_drops: Counter[str],
         judged: JudgedFrames,
         afar: Afar,
         rounds: Rounds,
     ) -> None:
         self.drops = Losses(log)
+        self._on_the_way = OnTheWay(self.drops, session_drops)
         self._agents = agents
         self._directory = directory
         self._stead = stead
@@ -177,6 +168,7 @@ class Delivery:
             stream = self.streams.get(key)
             if stream is None:
                 continue  # the last registrant has just left
+            stream.came.samples += 1
             robot = self._agents.find(*stream.robot)
             may_hold: bool | None = None
             for frame, metadata in self._read(key, payload, stream.robot):
@@ -184,7 +176,10 @@ class Delivery:
                 data_type = metadata.data_exchange_type
                 fits = isinstance(frame, Frame) and _fits(frame, metadata)  # a run lists no registrants
                 messages = frame.messages
-                for registrant in self._registrants.get(frame.management) or self._read_registrants(key, frame):
+                registrants = self._registrants.get(frame.management) or self._read_registrants(key, frame)
+                if not registrants and metadata.message_manager == StreamCount.manager:
+                    self._told_how_much(key, stream, frame)
+                for registrant in registrants:
                     connection = self._agents.find(*registrant)
                     if connection is None:
                         continue
@@ -226,6 +221,7 @@ class Delivery:
                 if not connection.recipient.takes(stream.node, seen.data_type):
                     return False
                 receivers.append(connection)
+        stream.came.samples += 1
         message = bytes(payload[seen.message_at :])
         for connection in receivers:
             connection.send_now(message)
@@ -251,6 +247,12 @@ class Delivery:
             frame.beginning + CDR, frame.message_at, registrants, data_type, data_type == TEXT_TYPE
         )
         return seen
+
+    def _told_how_much(self, key: str, stream: Stream, frame: Frames) -> None:
+        try:
+            self._on_the_way.told(key, stream, bytes(frame.last.body))
+        except WireError as error:
+            self._bad(key, error)
 
     def _flush(self, began: float) -> None:
         """Write what was gathered since then, one write per connection."""

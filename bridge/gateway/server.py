@@ -61,7 +61,7 @@ from macs_zenoh.timeouts import within
 from .agents import Agents
 from .connection import Connection
 from .declarations import AgentDeclarations
-from .delivery import Delivery, Stream
+from .delivery import Delivery
 from .departures import Departures, Pieces
 from .door import Door, Entrance, entrances
 from .entry import Entry
@@ -74,6 +74,7 @@ from .listeners import Listeners
 from .managing import Managing
 from .memory import Memory
 from .node_registry import NodeRegistry
+from .on_the_way import Stream
 from .record import Record
 from .refusing import Refusing
 from .renumbering import Renumbering
@@ -141,7 +142,7 @@ class Gateway:
         stead, judged = Stead(mesh, self._layout), JudgedFrames()
         self._forwarding = Forwarding(mesh, self.agents, self.directory, judged, self._refusing.no_router)
         known, rounds = (self.agents, self.directory, self._layout), self.rounds
-        self._delivery = Delivery(*known, stead, judged, self._forwarding.afar, rounds)
+        self._delivery = Delivery(*known, stead, mesh.drops, judged, self._forwarding.afar, rounds)
         self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
         self._roll = Roll(self._presence, self.agents)
         self._groups = Groups(self.agents, self._presence, self._subscriptions, self._delivery, self._roll)
@@ -490,6 +491,7 @@ class Gateway:
 
     def _streams_wanted(self, changes: StreamChanges) -> None:
         """Listen to exactly those streams of robots on which somebody is registered."""
+        delivery = self._delivery
         for (robot_id, node), registrants in changes:
             try:
                 key = STREAM.of(type=ROS, id=robot_id, node=node)
@@ -498,14 +500,12 @@ class Gateway:
                 log.warning("a registration on robot %d is left out: %s", robot_id, error)
                 continue
             if registrants is None:
-                self._delivery.streams.pop(key, None)
+                delivery.streams.pop(key, None)
                 self._subscriptions.leave(key)
             else:
-                self._delivery.streams[key] = Stream((ROS, robot_id), node, registrants)
+                delivery.streams[key] = Stream.of((ROS, robot_id), node, registrants, delivery.streams.get(key))
                 # whether a robot keeps a stream for recovery is seen from its messages: others cost nothing more
-                self._subscriptions.add(
-                    key, self._delivery.stream, at_once=self._delivery.stream_at_once, reliable=True
-                )
+                self._subscriptions.add(key, delivery.stream, at_once=delivery.stream_at_once, reliable=True)
 
     # -- presence ------------------------------------------------------------------------------------------------
 

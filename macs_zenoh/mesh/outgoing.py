@@ -148,12 +148,13 @@ class Outgoing:
                 outlets.clear()
             self._apart.clear()
 
-    def put(self, key: str, payload: Payload, traffic: Traffic) -> None:
-        """`Mesh.put`."""
+    def put(self, key: str, payload: Payload, traffic: Traffic, *, ruled: bool = True) -> bool:
+        """`Mesh.put`; without ``ruled`` past all traffic rules. False: a rule drops it, or there is no router."""
         publisher, shape, kept = self._outlets[traffic].get(key) or self._declare(key, traffic)
-        if shape is not None and not self._passes(shape, len(payload)):
-            return
-        if not (self.linked or kept):
+        if shape is not None and ruled and not self._passes(shape, len(payload)):
+            return False
+        goes = self.linked or kept
+        if not goes:
             self.drops["no_route"] += 1
         if self._marked and (mark := self._tracing.mark(key, command=traffic is Traffic.COMMAND)) is not None:
             publisher = Marked(publisher, mark)
@@ -168,6 +169,7 @@ class Outgoing:
             self._loopback.put(publisher, payload)
         else:  # one publisher numbers them all
             self._put_later(publisher, payload)
+        return goes
 
     def put_by(self, sender: Sender, key: str, payload: Payload, traffic: Traffic) -> bool:
         """Give it to our own subscriptions now, and leave it to a sender if others listen. False: it keeps messages

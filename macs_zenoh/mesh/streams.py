@@ -44,6 +44,11 @@ class Streams:
         if not (by_thread and self._outgoing.put_by(self.sender, key, payload, Traffic.STREAM)):
             self._outgoing.put(key, payload, Traffic.STREAM)
 
+    def put_here(self, key: str, payload: Payload, *, ruled: bool = True) -> bool:
+        """Publish in this thread, whichever it is. False: it is lost already, and counted. Without ``ruled`` it passes
+        traffic rules, and uses up nothing of them."""
+        return self._outgoing.put(key, payload, Traffic.STREAM, ruled=ruled)
+
     @property
     def backlogged(self) -> bool:
         """Whether so much waits that who brings more should be held back; `on_room` tells when it is over."""

@@ -19,7 +19,15 @@ from bridge.ros.topics import PublisherNode
 from macs_zenoh.agent import Agent
 from macs_zenoh.mesh import Sample
 from macs_zenoh.protocol.keyexpr import STREAM
-from macs_zenoh.protocol.messages import AddNode, Metadata, NodeType, RemoveNode, node_name
+from macs_zenoh.protocol.messages import (
+    AddNode,
+    Metadata,
+    NodeType,
+    RemoveNode,
+    StreamData,
+    encode_management,
+    node_name,
+)
 from macs_zenoh.protocol.reading import Message
 from tests.support.waiting import get, until
 
@@ -87,8 +95,11 @@ async def known_action(robot: RosSession, action: str) -> None:
     await known(robot, *(f"{action}/_action/{part}" for part in ("send_goal", "get_result", "cancel_goal")))
 
 
+TO_NOBODY = encode_management(StreamData({}))
+
+
 class Streams:
-    """Everything that a robot streams, as an agent on the mesh gets it."""
+    """Everything that a robot streams, as an agent on the mesh gets it, but for the counts that are for gateways."""
 
     def __init__(self, agent: Agent, robot: int = ROBOT) -> None:
         self.frames: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue()
@@ -96,7 +107,8 @@ class Streams:
 
     def _take(self, batch: Iterator[Sample]) -> None:
         for key, payload in batch:
-            self.frames.put_nowait((key, payload))
+            if TO_NOBODY not in payload:
+                self.frames.put_nowait((key, payload))
 
     async def after(self, publish: Callable[[], None]) -> tuple[str, bytes]:
         """Key and frame of what comes when ``publish`` is done, again and again until something comes.

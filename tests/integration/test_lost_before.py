@@ -1,0 +1,94 @@
+"""What is lost of a robot's topic between the robot and a gateway: Zenoh tells nobody, so both count."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+import macs_zenoh
+from bridge.gateway.on_the_way import BEFORE
+from macs_zenoh import TrafficRule, streams
+from macs_zenoh.mesh import Mesh
+from macs_zenoh.protocol.keyexpr import STREAM
+from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, encode_management
+from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.streams import Streams
+from tests.support.given import Connect, StartGateway
+from tests.support.links import counted
+from tests.support.local import patient, router_apart
+from tests.support.waiting import until
+
+NODE, TYPE = "nd__camera", "std_msgs/UInt8MultiArray"
+KEY = STREAM.of(type=ROS, id=7, node=NODE)
+SIZE, MESSAGES = 100_000, 400
+"""40 MB: a link that stands still has room for a few."""
+
+
+@pytest.mark.megabytes
+async def test_what_a_full_link_drops_is_counted(
+    start_gateway: StartGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A gateway's link stands still while a robot goes on: what has come and what is counted as lost on the way are
+    together what the robot has put."""
+    monkeypatch.setattr(streams, "TELL_S", 0.05)
+    async with (
+        router_apart() as router,
+        macs_zenoh.join("ros", id=7, settings=patient(router)) as agent,
+        counted(router, buffer_bytes=65536) as link,
+    ):
+
+        async def add(call: macs_zenoh.Call) -> bytes:
+            return b""
+
+        agent.serve("add_node", add)
+        gateway = await start_gateway(link.endpoint)
+        headset = await connect(gateway)
+        taken: list[object] = []
+        await headset.subscribe("/camera", TYPE, agents=[7], callback=taken.append)
+        robot = Streams(agent)
+        listed = encode_management(StreamData({"2": [headset.id]}))
+        about = Metadata(ROS, 7, 0, StreamData.manager, NodeType.SUBSCRIBER, NODE, data_exchange_type=TYPE)
+
+        def publish(size: int = 12) -> None:
+            message = encode_message(about.encode(), b"\0\1\0\0" + bytes(size))
+            robot.publish(NODE, encode_frame(ROS, management=listed, message=message))
+
+        async def tell() -> None:
+            publish()
+            before, came = headset_told(), gateway._delivery.streams[KEY].came
+            await until(lambda: came._told > before)
+
+        def headset_told() -> int:
+            return gateway._delivery.streams[KEY].came._told
+
+        await until(lambda: KEY in gateway._delivery.streams)
+        while not taken:
+            publish()
+            await asyncio.sleep(0.01)
+        await until(lambda: headset_told() > 0)
+        for _ in range(2):
+            await tell()
+        lost_before = gateway._delivery.streams[KEY].came.lost
+        first, put = gateway._delivery.streams[KEY].came.samples, robot._put[NODE]
+        link.hold_down()
+        for _ in range(MESSAGES):
+            publish(SIZE)
+            await asyncio.sleep(0)
+        link.release()
+        await until(lambda: headset_told() > 3)
+        await tell()
+        came = gateway._delivery.streams[KEY].came
+        assert gateway.drops[BEFORE] == came.lost > 0
+        assert came.samples - first + came.lost - lost_before == robot._put[NODE] - put
+
+
+async def test_a_count_uses_up_nothing_of_a_rule(router: str) -> None:
+    """What a rule drops the robot counts itself, and did not put; a count passes."""
+    rule = TrafficRule(match="**", max_bytes=10)
+    async with await Mesh.open(patient(router), traffic=[rule]) as mesh:
+        await until(lambda: mesh.linked)
+        assert mesh.streams.put_here(KEY, bytes(10))
+        assert not mesh.streams.put_here(KEY, bytes(11))
+        assert mesh.streams.put_here(KEY, bytes(11), ruled=False)
+        assert mesh.drops == {"over_size": 1}
