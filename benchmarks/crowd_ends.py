@@ -175,6 +175,11 @@ class Robots:
             robot._times = self._times
         return {"due": due, "times": report}
 
+    async def dropped(self) -> Report:
+        """What the robots' agents have lost, by name."""
+        agents = [robot._agent for robot in self._robots]
+        return {"dropped": sum((agent.drops + agent.mesh.drops for agent in agents), Counter[str]())}
+
 
 async def robots(port: str, count: int) -> None:
     """Be the robots."""
