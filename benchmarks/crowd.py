@@ -131,6 +131,8 @@ def mixed(stage: Stage, plan: Plan) -> Iterator[Figure]:
         yield Figure("gateway, memory", [memory], [settled], "after 1", "MB", at_most=1.05, column=column)
         yield Figure("gateway, CPU", [percent], [100.0], "a core", "%", column=column)
     time.sleep(TELL_S + REST_S)  # what was lost last the gateway knows by then, and says at its end
+    if dropped := crowd.robots.ask("dropped")["dropped"]:
+        plan.lost_where.append(f"robots by name: {dropped}")
 
 
 CASES: dict[str, Case] = {"crowd": crowd, "mixed": mixed}
