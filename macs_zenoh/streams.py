@@ -6,7 +6,6 @@ import asyncio
 import logging
 import threading
 import time
-from collections import Counter
 from contextlib import suppress
 
 from .agent import Agent
@@ -19,10 +18,23 @@ from .protocol.wire import Layout, encode_frame, encode_message
 
 log = logging.getLogger("macs.streams")
 
+TO_NOBODY = encode_management(StreamData({}))
 KNOWN = 4096
 """Names of interface nodes whose keys are remembered."""
-TELL_S = 5.0
-"""So long after topic data it is told how much there was, to whoever counts what came of it."""
+FIRST_S, TELL_S = 1.0, 5.0
+"""While there is topic data, so often it is told how much there was, to whoever counts what came of it: the first time
+soon, later less often; and so long after the last."""
+
+
+class _Put:
+    """Frames of one node."""
+
+    __slots__ = ("count", "due", "first", "told")
+
+    def __init__(self, now: float) -> None:
+        self.count = self.told = 0
+        self.first = now
+        self.due = now + FIRST_S
 
 
 class Streams:
@@ -30,7 +42,8 @@ class Streams:
     thread.
 
     Zenoh drops topic data where a link is full, and tells nobody. So behind what was put goes how much it was, to
-    nobody who is registered: gateways know by that how much did not come.
+    nobody who is registered: gateways know by that how much did not come. It goes in the thread that puts, so that
+    nothing comes between the two, or from the loop when nothing is put any more.
     """
 
     def __init__(self, agent: Agent) -> None:
@@ -40,22 +53,28 @@ class Streams:
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()
         self._since = time.monotonic_ns()
-        self._put: Counter[str] = Counter()
-        """Frames of each node since then."""
-        self._untold: set[str] = set()
+        self._put: dict[str, _Put] = {}
+        """Of each node since then."""
+        self._looks = False
+        """Whether the loop will look for what was not told."""
         agent.on_id(self._id_changed)
 
     def publish(self, node: str, frame: bytes) -> None:
         """Put topic data. ``frame`` is a whole frame whose management data lists who gets it (StreamData)."""
         if not self._mesh.streams.put_here(self._keys.get(node) or self._key(node), frame):
             return
+        now = time.monotonic()
         with self._lock:
-            self._put[node] += 1
-            first = not self._untold
-            self._untold.add(node)
-        if first:
+            put = self._put.get(node)
+            if put is None:
+                put = self._put[node] = _Put(now)
+            put.count += 1
+            looks, self._looks = self._looks, True
+        if now >= put.due:
+            self._tell(node, put, now)
+        if not looks:
             with suppress(RuntimeError):  # the loop has ended
-                self._loop.call_soon_threadsafe(self._loop.call_later, TELL_S, self._tell)
+                self._loop.call_soon_threadsafe(self._loop.call_later, TELL_S, self._look)
 
     def prioritise(self, node: str, priority: Priority | None) -> None:
         """Put a node's topic data at this priority; None: at the usual one."""
@@ -66,22 +85,32 @@ class Streams:
         Returns whether any are kept."""
         return self._mesh.keep(self._key(node), frames)
 
-    def _tell(self) -> None:
-        """Behind what was put go the counts that have changed. On the loop."""
+    def _look(self) -> None:
+        """Tell of those that were put last a while ago; the others' threads do so. On the loop."""
+        now = time.monotonic()
         with self._lock:
-            since, put = self._since, {node: self._put[node] for node in self._untold}
-            self._untold.clear()
-        settings = self._mesh.settings
-        layout = Layout(settings.id_slots, settings.group_slots)
-        to_nobody = encode_management(StreamData({}))
-        about = self._agent.type_number, self._agent.id, 0, StreamCount.manager, int(NodeType.SUBSCRIBER)
+            untold = [(node, put) for node, put in self._put.items() if put.told != put.count]
+            self._looks = bool(untold)
         try:
-            for node, count in put.items():
-                message = encode_message(Metadata(*about, node).encode(), encode_data(StreamCount(since, count)))
-                frame = encode_frame(self._agent.type_number, management=to_nobody, message=message, layout=layout)
-                self._mesh.streams.put_here(self._key(node), frame, ruled=False)
+            for node, put in untold:
+                if now >= put.due:
+                    self._tell(node, put, now)
         except MacsError as error:  # the session is closed
             log.debug("nobody is told how much topic data was put: %s", error)
+            return
+        if untold:
+            self._loop.call_later(TELL_S, self._look)
+
+    def _tell(self, node: str, put: _Put, now: float) -> None:
+        """Behind what was put goes how much it was."""
+        put.told = put.count
+        put.due = now + min(max(now - put.first, FIRST_S), TELL_S)
+        settings = self._mesh.settings
+        layout = Layout(settings.id_slots, settings.group_slots)
+        about = self._agent.type_number, self._agent.id, 0, StreamCount.manager, int(NodeType.SUBSCRIBER), node
+        message = encode_message(Metadata(*about).encode(), encode_data(StreamCount(self._since, put.told)))
+        frame = encode_frame(self._agent.type_number, management=TO_NOBODY, message=message, layout=layout)
+        self._mesh.streams.put_here(self._key(node), frame, ruled=False)
 
     def _key(self, node: str) -> str:
         key = self._keys.get(node)
@@ -100,4 +129,3 @@ class Streams:
             self._keys = {}
             self._since = time.monotonic_ns()
             self._put.clear()
-            self._untold.clear()

@@ -25,29 +25,26 @@ class Came:
 
     Attributes:
         samples: that have come; whoever takes them counts them.
-        lost: of what was put since the robot told twice.
+        lost: of what was put since the robot told for the first time.
+        since: when the robot's counting began, by its own clock; None while it has told nothing.
+        before: how much it had put by then that did not count here.
     """
 
-    __slots__ = ("_before", "_since", "_told", "lost", "samples")
+    __slots__ = ("before", "lost", "samples", "since")
 
     def __init__(self) -> None:
         self.samples = 0
         self.lost = 0
-        self._since = -1
-        self._told = 0
-        self._before = 0
-        """How much the robot had put that did not count here."""
+        self.since: int | None = None
+        self.before = 0
 
     def count(self, told: StreamCount) -> int:
-        """The robot has told, behind all that it counts, but for what it was putting just then: how much more is known
-        to be lost. What it tells first, twice, says where its counting and ours begin."""
-        if told.since != self._since:
-            self._since, self._told, self._before = told.since, 0, told.put - self.samples - self.lost
-        self._told += 1
+        """The robot has told, behind all that it counts: how much more is known to be lost. What it tells first says
+        where its counting and ours begin."""
         ahead = told.put - self.samples - self.lost
-        if self._told <= 2:  # the more of the two: of what is being put one may have come that is not counted
-            self._before = max(self._before, ahead)
-        more = max(0, ahead - self._before)
+        if told.since != self.since:
+            self.since, self.before = told.since, ahead
+        more = max(0, ahead - self.before)
         self.lost += more
         return more
 
