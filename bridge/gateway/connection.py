@@ -70,6 +70,12 @@ MOST_READ_BYTES = FrameDecoder.SPACE_BYTES
 FIRST_READ_BYTES = 16 << 10
 """Of many that begin at once nobody knows yet that they take much."""
 LEAST_READ_BYTES = 1024
+"""Over TLS each byte may be a record of its own, which takes half a microsecond: so much is read of who begins."""
+OVER_READ_BYTES = 64
+"""Of who takes much, and has his turn in another round of the loop."""
+LATE_READ_BYTES = 512
+"""In a round of the loop that has been long already so much is read of anybody else until the next one: of many who
+begin to flood in the same moment each has his first turn before him."""
 
 
 class Connection(asyncio.BufferedProtocol):
@@ -110,6 +116,8 @@ class Connection(asyncio.BufferedProtocol):
     """How much is read at once: less, when little of it makes much work, more when much makes little."""
     _read_last: tuple[int, float] | None = None
     """How much was read that waits for its turn, and how long that took."""
+    _is_late = False
+    """Whether what is read comes late in a long round."""
     _asked_at = 0.0
     """When room for bytes was asked for last."""
     _unread = 0
@@ -193,6 +201,8 @@ class Connection(asyncio.BufferedProtocol):
         self.host = of_peer(str(peer_name[0])) if peer_name else "?"
         self.address = joined(self.host, peer_name[1]) if peer_name else "?"
         self._writer.attach(transport)
+        if self._writer.encrypts:
+            self._read_bytes = LEAST_READ_BYTES
         transport.pause_reading()  # until it is greeted
         self._pauses = 1
         if not self.owner.opened(self):
@@ -217,7 +227,13 @@ class Connection(asyncio.BufferedProtocol):
 
     def get_buffer(self, sizehint: int) -> memoryview:
         self._asked_at = time.monotonic()
-        return self.peer.space()[: self._read_bytes]
+        rounds, most = self._memory.rounds, self._read_bytes
+        self._is_late = rounds.long
+        if rounds.are_over(self.host):
+            most = OVER_READ_BYTES
+        elif self._is_late:
+            most = min(LATE_READ_BYTES, most)
+        return self.peer.space()[:most]
 
     def buffer_updated(self, nbytes: int) -> None:
         # from when it was asked for: what is small over TLS takes longer to decrypt, here and now, than to handle
@@ -244,6 +260,10 @@ class Connection(asyncio.BufferedProtocol):
         if (turn_s or rounds.are_over(self.host)) and not self._waits and not self._transport.is_closing():
             self.pause()
             rounds.enter(self.host, self._share, self.resume, turn_s or took_s)
+        elif self._is_late and nbytes >= LATE_READ_BYTES:  # libuv reads on, since there is more
+            self._is_late = False
+            self.pause()
+            self._loop.call_soon(self.resume)
 
     def _adapt(self, nbytes: int, took_s: float) -> None:
         """Read as much at once as a turn has time for: so many bytes took so long, if nothing of them waits."""

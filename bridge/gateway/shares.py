@@ -29,6 +29,10 @@ SHARE = 0.05
 """So much of the time anybody may take without waiting: a turn is used up by what is beyond it."""
 SHARE_OF_ADDRESS = 0.2
 """The same for all from one address together."""
+LONG_S = 2 * TURN_S
+"""A round that has had so much of anybody's work is long."""
+NOTED_S = TURN_S / 10
+"""Work that takes less begins no round, as it would cost more than it tells."""
 BUSY_S = 0.1
 """So long after it was last beyond its share an address counts as one that takes much."""
 RECENT_S = 1.0
@@ -88,6 +92,8 @@ class Rounds:
         self._of_address: OrderedDict[str, Share] = OrderedDict()
         self._round_s = 0.0
         """What this round has had of work for addresses that take much."""
+        self._all_s = 0.0
+        """What it has had of anybody's."""
         self._busy_until = -math.inf
         """So long there is any."""
         self._going = False
@@ -120,10 +126,20 @@ class Rounds:
             self._untimed, now = 0, self._clock()
             took_s, self._before = min(took_s, now - self._before), now
         over = together.spend(took_s, now)
+        if self._going:
+            self._all_s += took_s
+        elif took_s >= NOTED_S:
+            self._await_round()
+            self._all_s = took_s
         if now < together.busy_until:
             self._busy_until = max(self._busy_until, together.busy_until)
             self._round_s += took_s
         return took_s, now, over
+
+    @property
+    def long(self) -> bool:
+        """Whether this round has had much work already, whoever it was for."""
+        return self._all_s > LONG_S
 
     def are_over(self, host: str) -> bool:
         """Whether work for this address has to wait for another round: it takes much, and this round has had a turn's
@@ -161,7 +177,7 @@ class Rounds:
         await mine
 
     def _next(self) -> None:
-        self._going, self._round_s, left_s = False, 0.0, TURN_S
+        self._going, self._round_s, self._all_s, left_s = False, 0.0, 0.0, TURN_S
         if self._waiting:
             self._await_round()  # before those that go on: what they have read from now on is of that round
         for _ in range(sum(map(len, self._waiting.values()))):

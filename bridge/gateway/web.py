@@ -27,7 +27,7 @@ from macs_zenoh.protocol.origins import host_problem, origin_problem
 from macs_zenoh.protocol.websocket import MESSAGE_BYTES, SUBPROTOCOL, TOKEN_SUBPROTOCOL, WEBSOCKET_PATH
 
 from .admission import is_in, networks
-from .connection import Connection
+from .connection import OVER_READ_BYTES, Connection
 from .door import Door, Entrance
 from .listener import Listener
 from .pages import add_routes
@@ -49,7 +49,7 @@ HTTP_PER_ADDRESS = 128
 PIPELINED = 8
 """So many requests of one connection may wait to be answered; some releases of aiohttp know no limit."""
 CLOSE_S = 2.0
-LEAST_READ_BYTES = 4 << 10
+LEAST_READ_BYTES = 1 << 10
 MOST_READ_BYTES = 256 << 10
 COOKIE_S = 30 * 24 * 3600
 
@@ -277,6 +277,8 @@ class _Outer(asyncio.BufferedProtocol):
         self._counted = False
         self._timer: asyncio.TimerHandle | None = None
         self._read_bytes = LEAST_READ_BYTES
+        self._asked_at = 0.0
+        """When room for bytes was asked for last."""
         self._share = Share()
         self._full = False
         """Whether it is not read from, since so many of its requests wait."""
@@ -295,15 +297,17 @@ class _Outer(asyncio.BufferedProtocol):
         self._inner.connection_made(cast(asyncio.BaseTransport, self._shared))
 
     def get_buffer(self, sizehint: int) -> memoryview:
+        self._asked_at = time.monotonic()
         most = LEAST_READ_BYTES if self._stream is None else self._read_bytes
+        if self._port.rounds.are_over(self.host):
+            most = OVER_READ_BYTES
         return self._port.scratch[:most]
 
     def buffer_updated(self, nbytes: int) -> None:
         if not self._counted and self._stream is None:
             return  # it was not let in
-        began = time.monotonic()
         self._inner.data_received(bytes(self._port.scratch[:nbytes]))
-        took_s = time.monotonic() - began
+        took_s = time.monotonic() - self._asked_at  # with what it took to decrypt
         if took_s > TURN_S:
             self._read_bytes = max(LEAST_READ_BYTES, self._read_bytes // 2)
         elif took_s < TURN_S / 2 and nbytes == self._read_bytes:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import struct
+import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 from tests.attack import raw
 from tests.attack.inputs import HUGE, MIB
@@ -349,6 +352,28 @@ def status_requests(target: Target) -> None:
 def status_requests_of_many(target: Target) -> None:
     """RobotStatus at full rate from twenty headsets."""
     flood(target, request("RobotStatus"), agents=20)
+
+
+@attack(3, "headset")
+def status_requests_from_many_addresses(target: Target) -> None:
+    """RobotStatus at full rate from forty headsets, each of an address of its own, that begin in the same moment."""
+    asking = request("RobotStatus") * 1000
+    agents = [Agent(target.port, host=f"127.0.1.{1 + n}") for n in range(40)]
+    while target.running():
+        agents = [agent for agent in agents if agent.send(asking)]
+
+
+@attack(3, "headset")
+def registrations_of_every_type(target: Target) -> None:
+    """Subscribers, publishers and callers of every type that the robot's computer has, each on a topic of its own."""
+    frames = []
+    for share in os.environ.get("AMENT_PREFIX_PATH", sys.prefix).split(os.pathsep):
+        for at, found in enumerate(sorted(Path(share).glob("**/share/*/msg/*.msg"))):
+            kind = f"{found.parts[-3]}/{found.stem}"
+            frames += [registration(f"nd__t{at}_{n}", f"/t{at}_{n}", kind, node_type=n) for n in (1, 2)]
+            frames += [registration(f"nd__t{at}_{n}", f"/t{at}_{n}", kind, node_type=n, add=False) for n in (1, 2)]
+    assert frames, "there are no types here"
+    flood(target, *frames)
 
 
 @attack(3, "headset")

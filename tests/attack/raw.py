@@ -107,13 +107,20 @@ class Agent:
     """How all of them come in."""
 
     def __init__(
-        self, port: int, *, agent_type: int = UNITY, group: int = 0, configure: bool = True, read: bool = True
+        self,
+        port: int,
+        *,
+        agent_type: int = UNITY,
+        group: int = 0,
+        configure: bool = True,
+        read: bool = True,
+        host: str = FROM,
     ) -> None:
         connected = socket.socket()
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if not read:  # what the kernel would hold for it is not the gateway's
             connected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        connected.bind((FROM, 0))
+        connected.bind((host, 0))
         connected.settimeout(5)
         connected.connect(("127.0.0.1", port))
         self.socket: Stream = opened(self.way, connected)

@@ -10,10 +10,12 @@ import socket
 import ssl
 import struct
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
+from typing import Any
 
-from tests.attack.raw import FROM, Agent, frame, metadata
+from tests.attack.raw import FROM, Agent, frame, management, metadata, request
 from tests.attack.table import Target, attack
 
 MESSAGE, MORE = 0x02, 0x00
@@ -154,6 +156,63 @@ def tls_greetings(target: Target) -> None:
         opened.close()
 
     together(target, 8, greet)
+
+
+@attack(2, "headset", way="tls")
+def tls_records_of_a_byte(target: Target) -> None:
+    """Forty headsets that send RobotStatus without end, each byte encrypted for itself, from the same moment on."""
+    said = request("RobotStatus")
+    agents = [Bytewise(target) for _ in range(40)]
+    ready = [agent.encrypted(said * (CRUMBS // len(said))) for agent in agents]
+    while target.running():
+        for agent, records in zip(agents, ready, strict=True):
+            with suppress(OSError):
+                agent.plain.sendall(records)
+        ready = [agent.encrypted(said) for agent in agents]
+
+
+CRUMBS = 20_000
+
+
+class Bytewise:
+    """A headset over TLS that encrypts by hand."""
+
+    def __init__(self, target: Target) -> None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        self._came, self._goes = ssl.MemoryBIO(), ssl.MemoryBIO()
+        self._tls = context.wrap_bio(self._came, self._goes)
+        self.plain = connected(target)
+        self._until_done(self._tls.do_handshake)
+        greeting = struct.unpack("<I", self._exactly(4))[0]
+        self._exactly(greeting)
+        self._exactly(struct.unpack("<I", self._exactly(4))[0])
+        self._tls.write(frame(management("AgentclientConfigurer", agent_type=2, agent_id=1, group_id=0)))
+        self.plain.sendall(self._goes.read())
+        threading.Thread(target=_drain, args=(self.plain,), daemon=True).start()
+
+    def encrypted(self, data: bytes) -> bytes:
+        """A record for each byte."""
+        for at in range(len(data)):
+            self._tls.write(data[at : at + 1])
+        return self._goes.read()
+
+    def _exactly(self, count: int) -> bytes:
+        data = b""
+        while len(data) < count:
+            data += self._until_done(lambda: self._tls.read(count - len(data)))  # noqa: B023 - called at once
+        return data
+
+    def _until_done(self, step: Callable[[], Any]) -> Any:
+        while True:
+            try:
+                done = step()
+            except ssl.SSLWantReadError:
+                self.plain.sendall(self._goes.read())
+                self._came.write(self.plain.recv(1 << 16))
+            else:
+                self.plain.sendall(self._goes.read())
+                return done
 
 
 def _drain(opened: socket.socket) -> None:

@@ -12,7 +12,7 @@ from itertools import chain
 
 import pytest
 
-from bridge.gateway.connection import Connection
+from bridge.gateway.connection import LATE_READ_BYTES, OVER_READ_BYTES, Connection
 from bridge.gateway.memory import Memory
 from bridge.gateway.shares import TURN_S, Rounds, Share
 from macs_zenoh.protocol.kept import Kept, Room
@@ -352,8 +352,12 @@ async def test_who_was_read_from_in_a_round_that_is_over_waits_for_his_turn() ->
         await until(lambda: (1, 1) in busy.did)
         connection = busy.connections[0]
         _use_up(busy, memory, connection)
-        for piece in (question(2)[:10], question(2)[10:]):
-            connection.get_buffer(-1)[: len(piece)] = piece
+        asked = question(2)
+        while asked:
+            room = connection.get_buffer(-1)
+            assert len(room) <= OVER_READ_BYTES
+            piece, asked = asked[: len(room)], asked[len(room) :]
+            room[: len(piece)] = piece
             connection.buffer_updated(len(piece))
             assert connection._pauses == 1
             assert (1, 2) not in busy.did
@@ -376,10 +380,33 @@ async def test_more_is_read_at_once_of_what_costs_little_though_it_waits_for_its
         connection._read_bytes = 2048
         for _ in range(3):
             at_once = connection._read_bytes
-            _use_up(busy, memory, connection)
             data = said("x") * (at_once // len(said("x")))
-            connection.get_buffer(-1)[: len(data)] = data
+            room = connection.get_buffer(-1)
+            _use_up(busy, memory, connection)
+            room[: len(data)] = data
             connection.handle(len(data), time.monotonic())
             assert connection._waits
             await until(lambda: not connection._waits and not connection._pauses)
             assert connection._read_bytes == 2 * at_once
+
+
+async def test_late_in_a_long_round_little_is_read_of_anybody() -> None:
+    """Of many that begin in the same moment each has his turn before him; what is left comes in the next round."""
+    busy = Timed()
+    memory = Memory(64 << 20, 32 << 20)
+    memory.rounds = Rounds(lambda: busy.clock_s)
+    async with many(busy, memory, 2):
+        connection = busy.connections[0]
+        await until(lambda: connection.peer.state is State.ONLINE)
+        await asyncio.sleep(0)
+        for number in range(3):
+            busy.clock_s += TURN_S
+            memory.rounds.spend(f"10.0.0.{number}", Share(), 0.9 * TURN_S)
+        data = (said("x") * LATE_READ_BYTES)[:LATE_READ_BYTES]
+        room = connection.get_buffer(-1)
+        assert len(room) == LATE_READ_BYTES
+        room[:] = data
+        connection.buffer_updated(len(data))
+        assert connection._pauses
+        await until(lambda: not connection._pauses)
+        assert not memory.rounds.long

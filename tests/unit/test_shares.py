@@ -23,7 +23,7 @@ def test_a_share_is_used_up_by_what_is_beyond_it() -> None:
     assert not share.spend(TURN_S * 0.9, 5.0)
 
 
-def test_many_of_one_address_use_up_its_share_together() -> None:
+async def test_many_of_one_address_use_up_its_share_together() -> None:
     """Each takes less than a turn, and would for itself never wait."""
     clock = [100.0]
     rounds = Rounds(lambda: clock[0])
@@ -168,6 +168,20 @@ async def test_what_goes_on_in_its_turn_counts_in_its_round() -> None:
         asyncio.get_running_loop().call_soon(lambda: went.append(rounds.are_over("10.0.0.1")))
         await asyncio.sleep(0)
     assert went == [True, False]
+
+
+async def test_a_round_is_long_that_has_had_much_work_whoever_it_was_for() -> None:
+    """Each of them may have his turn, and nobody knows yet that he takes much; the next round is another one."""
+    clock = [100.0]
+    rounds = Rounds(lambda: clock[0])
+    assert not rounds.long
+    for number in range(3):
+        assert not rounds.long
+        clock[0] += TURN_S
+        assert not rounds.spend(f"10.0.0.{number}", Share(), 0.9 * TURN_S)
+    assert rounds.long
+    await asyncio.sleep(0)
+    assert not rounds.long
 
 
 async def test_what_is_handed_over_counts_while_any_address_takes_much() -> None:
