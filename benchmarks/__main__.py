@@ -20,7 +20,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from . import awareness, cases, crowd, differing, door, peers, ports, recording, rmw, robot_speed, scale, traces
+from . import awareness, burst, cases, crowd, differing, door, peers, ports, recording, rmw, robot_speed, scale, traces
 from .figures import Figure, markdown, table
 from .peer_ends import KINDS
 from .plan import Plan
@@ -32,6 +32,7 @@ WITHOUT_ROS = {
     **differing.CASES,
     **scale.CASES,
     **crowd.CASES,
+    **burst.CASES,
     **ports.CASES,
     **door.CASES,
     **recording.CASES,
@@ -39,8 +40,8 @@ WITHOUT_ROS = {
     **rmw.CASES,
 }
 CASES = {**WITHOUT_ROS, **WITH_ROS}
-ONLY_ASKED_FOR = ("mixed", "peers", "recording")
-"""What takes ten minutes, or programs that the user starts."""
+ONLY_ASKED_FOR = ("burst", "mixed", "peers", "recording")
+"""What takes minutes, or programs that the user starts."""
 ROUNDS = 5
 BEGIN, END = "<!-- figures: {} -->", "<!-- end of figures -->"
 """Around the table of a page."""
