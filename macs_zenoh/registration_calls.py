@@ -107,6 +107,8 @@ class RobotCalls:
         """Those of which calls may be made, with their robots."""
         self._goes_on = False
         """Whether they are in another round of the loop."""
+        self._follows = False
+        """Whether they are made behind answers, at the latest."""
         self._to_start: deque[Iterator[Task]] = deque()
         """Tasks whose calls are not wanted yet, since there are many."""
         self._message: tuple[AddNode | RemoveNode | None, bytes] = (None, b"")
@@ -327,7 +329,7 @@ class RobotCalls:
     def _make_calls(self) -> None:
         """As many as there is time for now, and the others in other rounds of the loop."""
         until = time.monotonic() + TURN_S
-        self._goes_on = False
+        self._goes_on = self._follows = False
         while self._ready:
             turns, robot_id = next(iter(self._ready.items()))
             turn = turns.take()
@@ -343,8 +345,12 @@ class RobotCalls:
                 return
 
     def _turn_over(self, robot_id: int, turns: Turns[CallKey, _Call], agent: AgentKey) -> None:
+        """Others may be asked, when all answers that came together are handled."""
         turns.done(agent)
-        self._next(robot_id, turns)
+        self._ready[turns] = robot_id
+        if not (self._goes_on or self._follows or self._closed):
+            self._follows = True
+            asyncio.get_running_loop().call_soon(self._make_calls)
 
     def _end(self, wanted: _Call) -> None:
         """A call is not wanted any more: its answer, should there be one, says nothing."""
@@ -378,9 +384,9 @@ class RobotCalls:
         answered = partial(self._answered, wanted, turns)
         try:
             self._listen(wanted.task)
-            self._mesh.ask(
-                *self._question(wanted.task), answered, timeout_s=CALL_TIMEOUT_S, traffic=Traffic.REGISTRATION
-            )
+            key, frame = self._question(wanted.task)
+            of, traffic = wanted.task.robot_id, Traffic.REGISTRATION
+            self._mesh.ask(key, frame, answered, of=of, timeout_s=CALL_TIMEOUT_S, traffic=traffic)
         except Exception as error:  # noqa: BLE001 - it is judged with those that come later
             asyncio.get_running_loop().call_soon(answered, error)
 

@@ -135,6 +135,8 @@ class NodeRegistry:
         self.named.set(connection, connection.host, self.robots.named(connection.key))
 
     def _note(self, connection: Connection, node: AddNode | RemoveNode, event: Registering) -> None:
+        if not self._record.is_kept:
+            return
         at = [f"robot {each}" for each in event.robot_ids] + [f"group {each}" for each in event.groups]
         name = node.tos_name if isinstance(node, AddNode) else node.node_name
         verb = "register" if isinstance(node, AddNode) else "deregister"

@@ -26,9 +26,14 @@ class Record:
             settings.audit_file, name, settings.audit_max_bytes, settings.audit_files, self._not_whole
         )
 
+    @property
+    def is_kept(self) -> bool:
+        """Whether there is an audit file."""
+        return self._audit is not NO_AUDIT
+
     def agent(self, event: str, connection: Connection, what: str = "", result: str = "done") -> None:
         """An agent did something, or something was done to it."""
-        if self._audit is NO_AUDIT:
+        if not self.is_kept:
             return
         by = who(str(AgentId(*connection.key)), connection.address, connection.peer.grant.name)
         self._audit.record(event, by, what, result)

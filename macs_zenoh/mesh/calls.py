@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from contextlib import suppress
 from functools import partial
+from typing import Any
 
 import msgspec
 import zenoh
 
-from macs_zenoh.errors import CallTimeout, HeldByAnother, MacsError, NotServed, OutOfRange, Refused, Unreachable
+from macs_zenoh.errors import HeldByAnother, MacsError, NotServed, OutOfRange, Refused
 from macs_zenoh.protocol.guard import Admits
-from macs_zenoh.protocol.limits import ASKED_BYTES, CALL_BYTES, REASON_CHARACTERS, REQUEST_BYTES
+from macs_zenoh.protocol.limits import ASKED_BYTES, CALL_BYTES
 
+from .answers import KEPT, Answers, OnAnswer, problem
 from .arrivals import Arrivals, now_s
 from .copies import copied
 from .declared import Handler, Payload, Subscription, Traffic
@@ -28,12 +29,6 @@ log = logging.getLogger("macs.mesh")
 
 WAITING = 1024
 """So many calls that no gate admits may wait to be looked at; what is more has no answer."""
-
-OnAnswer = Callable[[bytes | MacsError], None]
-"""Hears the answer to a call, or why there is none, on the loop."""
-
-HOLDER = re.compile(r"([0-9]{1,3})/([0-9]{1,5})")
-"""Who has what was refused: agent type and id."""
 
 
 class _Asked:
@@ -55,7 +50,7 @@ class _Asked:
         if (ok := reply.ok) is not None:
             self._from_thread(self._settle, ok.payload.to_bytes())
         elif reply.err is not None:
-            self._from_thread(self._settle, _problem(self._key, reply.err.payload.to_bytes(), self._timeout_s))
+            self._from_thread(self._settle, problem(self._key, reply.err.payload.to_bytes(), self._timeout_s))
 
     def end(self) -> None:
         """All have answered, in a thread of Zenoh's."""
@@ -80,6 +75,7 @@ class Calls:
         from_thread: Callable[..., None],
     ) -> None:
         self._session = session
+        self._session_get = session.get  # looked up once
         self._loop = asyncio.get_running_loop()
         self._arrivals = arrivals
         self._outgoing = outgoing
@@ -88,9 +84,11 @@ class Calls:
         self._asked_bytes = 0
         """Of large calls that wait or are being answered."""
         self._lock = threading.Lock()
+        self._answers = Answers()
 
     def close(self) -> None:
-        """Answer nothing any more."""
+        """Answer nothing any more, and hear of no answer."""
+        self._answers.close()
         for task in self._tasks:
             task.cancel()
 
@@ -106,19 +104,26 @@ class Calls:
             else:
                 done.set_result(answer)
 
-        self.ask(key, payload, settle, timeout_s=timeout_s, traffic=traffic)
+        asked = _Asked(key, timeout_s, settle, self._from_thread)
+        answer = zenoh.handlers.Callback(asked.reply, asked.end, indirect=False)
+        self._get(key, answer, payload, timeout_s, traffic)
         return await done
 
-    def ask(self, key: str, payload: Payload, on_answer: OnAnswer, *, timeout_s: float, traffic: Traffic) -> None:
+    def ask(
+        self, key: str, payload: Payload, on_answer: OnAnswer, *, of: Hashable, timeout_s: float, traffic: Traffic
+    ) -> None:
         """`Mesh.ask`."""
+        replies = self._get(key, zenoh.handlers.FifoChannel(KEPT), payload, timeout_s, traffic)
+        self._answers.expect(of, key, timeout_s, replies, on_answer)
+
+    def _get(self, key: str, answers: Any, payload: Payload, timeout_s: float, traffic: Traffic) -> Any:
         shape = self._outgoing.policer.of(key)
         if shape is not None and (overrun := shape.too_large(len(payload))) is not None:
             raise OutOfRange(f"size of {key}", len(payload), 0, int(overrun.limit))
-        asked = _Asked(key, timeout_s, on_answer, self._from_thread)
         priority, congestion, express = self._outgoing.way(key, traffic)
-        self._session.get(
+        return self._session_get(
             key,
-            zenoh.handlers.Callback(asked.reply, asked.end, indirect=False),
+            answers,
             payload=payload,
             timeout=timeout_s,
             priority=priority,
@@ -246,19 +251,3 @@ def _tried(first: Callable[[str, bytes], None], query: zenoh.Query) -> Refused |
         log.exception("call %s failed", query.key_expr)
         return Refused("internal error, see the log there")
     return None
-
-
-def _problem(key: str, payload: bytes, timeout_s: float) -> MacsError:
-    """What an error reply means: ours is JSON, Zenoh's own is the word ``Timeout``."""
-    if payload == b"Timeout":
-        return CallTimeout(key, timeout_s)
-    try:
-        answer = msgspec.json.decode(payload[:REQUEST_BYTES], type=dict[str, str])
-    except (msgspec.DecodeError, UnicodeDecodeError):
-        return Unreachable(key, payload[:200].decode(errors="replace"))
-    if "refused" in answer:
-        holder = HOLDER.fullmatch(answer.get("holder", ""))
-        if holder is None:
-            return Refused(answer["refused"][:REASON_CHARACTERS])
-        return HeldByAnother(answer["refused"][:REASON_CHARACTERS], (int(holder[1]), int(holder[2])))
-    return Unreachable(key, answer.get("failed", "unknown failure")[:REASON_CHARACTERS])

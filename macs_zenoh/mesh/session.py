@@ -6,7 +6,7 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from types import TracebackType
 
@@ -23,8 +23,9 @@ from macs_zenoh.protocol.keyexpr import PING
 from macs_zenoh.protocol.policing import Policer
 from macs_zenoh.versions import installed
 
+from .answers import OnAnswer
 from .arrivals import Arrivals, now_s
-from .calls import Calls, OnAnswer
+from .calls import Calls
 from .declared import AtOnce, Handler, OnAged, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
 from .leaving import leave
 from .link_log import LinkLog
@@ -417,11 +418,12 @@ class Mesh:
         return await self._calls.query(key, payload, timeout_s=timeout_s, traffic=traffic)
 
     def ask(
-        self, key: str, payload: Payload, on_answer: OnAnswer, *, timeout_s: float, traffic: Traffic = Traffic.CALL
+        self, key: str, payload: Payload, on_answer: OnAnswer, *, of: Hashable, timeout_s: float, traffic: Traffic
     ) -> None:
-        """The same for who asks hundreds, without a task for each: ``on_answer`` is called once, later, with the
-        answer or one of these errors. Raises OutOfRange itself."""
-        self._calls.ask(key, payload, on_answer, timeout_s=timeout_s, traffic=traffic)
+        """The same for who asks hundreds, and can wait a few milliseconds more: answers are looked for, together those
+        ``of`` one who is asked. ``on_answer`` is called once, later, with one or one of these errors. Raises
+        OutOfRange itself."""
+        self._calls.ask(key, payload, on_answer, of=of, timeout_s=timeout_s, traffic=traffic)
 
     async def ask_all(self, key: str, *, timeout_s: float) -> list[tuple[str, bytes]]:
         """Ask everybody who serves a key, as the routers' admin space (``@/*/router``), and return every answer with

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 from .keyexpr import BROADCAST, CALL, GROUP, STREAM, UNICAST
 from .messages import EVERYBODY, Metadata
-from .wire import MACS, Header, Layout, encode_frame, encode_message
+from .wire import MACS, Header, Layout, encode_message
 
 
 def keys_of(header: Header, from_type: int, from_id: int) -> list[str]:
@@ -50,9 +50,26 @@ def call(
 def call_of(
     to: tuple[int, int], verb: str, sender: tuple[int, int], message: bytes, layout: Layout = MACS
 ) -> tuple[str, bytes]:
-    """The same for a message that is made."""
-    key = CALL.of(type=to[0], id=to[1], verb=verb, from_type=sender[0], from_id=sender[1])
-    return key, encode_frame(to[0], (to[1],), message=message, layout=layout)
+    """The same for a message that is made. Where many ask for the same, all but who asks is worked out once."""
+    return _called(*to, verb) + _caller(*sender), _call_header(layout, *to, len(message)) + message
+
+
+@lru_cache(maxsize=4096)
+def _called(agent_type: int, agent_id: int, verb: str) -> str:
+    """How the keys of all calls of an agent's verb begin; behind it is who calls."""
+    return CALL.every(type=agent_type, id=agent_id, verb=verb).removesuffix("**")
+
+
+@lru_cache(maxsize=4096)
+def _caller(agent_type: int, agent_id: int) -> str:
+    """How the keys of all calls end that an agent makes."""
+    every = CALL.of(type=agent_type, id=agent_id, verb="ask", from_type=agent_type, from_id=agent_id)
+    return every.partition("/ask/")[2]
+
+
+@lru_cache(maxsize=4096)
+def _call_header(layout: Layout, agent_type: int, agent_id: int, message_bytes: int) -> bytes:
+    return layout.pack(agent_type, (agent_id,), message_bytes=message_bytes)
 
 
 def inbox(agent_type: int, agent_id: int) -> str:

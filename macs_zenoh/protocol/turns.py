@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Hashable
 from typing import Generic, TypeVar
 
@@ -21,7 +20,7 @@ class Turns(Generic[K, V]):
         self._each = each
         self._total = total
         self._waiting: dict[Caller, dict[K, V]] = {}
-        self._open: Counter[Caller] = Counter()
+        self._open: dict[Caller, int] = {}
         self.open = 0
 
     def __len__(self) -> int:
@@ -38,7 +37,8 @@ class Turns(Generic[K, V]):
         if self.open >= self._total:
             return None
         for caller in self._waiting:
-            if self._open[caller] < self._each:
+            opened = self._open.get(caller, 0)
+            if opened < self._each:
                 break
         else:
             return None
@@ -47,7 +47,7 @@ class Turns(Generic[K, V]):
         call = waiting.pop(key)
         if waiting:
             self._waiting[caller] = waiting  # to the back
-        self._open[caller] += 1
+        self._open[caller] = opened + 1
         self.open += 1
         return caller, key, call
 
