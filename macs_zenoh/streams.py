@@ -24,15 +24,17 @@ KNOWN = 4096
 FIRST_S, TELL_S = 1.0, 5.0
 """While there is topic data, so often it is told how much there was, to whoever counts what came of it: the first time
 soon, later less often; and so long after the last."""
+TIMES = 3
+"""So often after the last: a link that drops topic data drops counts."""
 
 
 class _Put:
     """Frames of one node."""
 
-    __slots__ = ("count", "due", "first", "told")
+    __slots__ = ("count", "due", "first", "left")
 
     def __init__(self, now: float) -> None:
-        self.count = self.told = 0
+        self.count = self.left = 0
         self.first = now
         self.due = now + FIRST_S
 
@@ -69,6 +71,7 @@ class Streams:
             if put is None:
                 put = self._put[node] = _Put(now)
             put.count += 1
+            put.left = TIMES
             looks, self._looks = self._looks, True
         if now >= put.due:
             self._tell(node, put, now)
@@ -89,11 +92,12 @@ class Streams:
         """Tell of those that were put last a while ago; the others' threads do so. On the loop."""
         now = time.monotonic()
         with self._lock:
-            untold = [(node, put) for node, put in self._put.items() if put.told != put.count]
+            untold = [(node, put) for node, put in self._put.items() if put.left]
             self._looks = bool(untold)
         try:
             for node, put in untold:
                 if now >= put.due:
+                    put.left -= 1
                     self._tell(node, put, now)
         except MacsError as error:  # the session is closed
             log.debug("nobody is told how much topic data was put: %s", error)
@@ -103,12 +107,11 @@ class Streams:
 
     def _tell(self, node: str, put: _Put, now: float) -> None:
         """Behind what was put goes how much it was."""
-        put.told = put.count
         put.due = now + min(max(now - put.first, FIRST_S), TELL_S)
         settings = self._mesh.settings
         layout = Layout(settings.id_slots, settings.group_slots)
         about = self._agent.type_number, self._agent.id, 0, StreamCount.manager, int(NodeType.SUBSCRIBER), node
-        message = encode_message(Metadata(*about).encode(), encode_data(StreamCount(self._since, put.told)))
+        message = encode_message(Metadata(*about).encode(), encode_data(StreamCount(self._since, put.count)))
         frame = encode_frame(self._agent.type_number, management=TO_NOBODY, message=message, layout=layout)
         self._mesh.streams.put_here(self._key(node), frame, ruled=False)
 
