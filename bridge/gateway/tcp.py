@@ -17,7 +17,7 @@ def waiting_bytes(sock: socket.socket) -> int:
     """How much has come that nobody has read."""
     try:
         return int.from_bytes(fcntl.ioctl(sock.fileno(), termios.FIONREAD, bytes(4)), sys.byteorder)
-    except OSError:  # it is closed
+    except (OSError, ValueError):  # it is closed: asyncio's own sockets have no number then, which is no OSError
         return 0
 
 
