@@ -60,6 +60,12 @@ def test_its_frames_are_those_of_the_vectors() -> None:
 
 
 @needs_node
+def test_a_command_goes_before_the_question_whether_its_connection_is_fresh() -> None:
+    """One question at a time, behind all that is sent at that moment."""
+    assert ran("fresh.mjs", None) == ["command", "command", "question"]
+
+
+@needs_node
 def test_a_goal_that_its_robot_does_not_know_is_not_asked_for_again() -> None:
     """Its result is why, and that was the last word."""
     assert ran("goals.mjs", None) == {"asked": 1, "askedAfter": 0, "why": "no such goal"}

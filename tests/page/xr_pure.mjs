@@ -51,7 +51,9 @@ const parts = {
     assert.deepEqual(made, { position: { x: -3, y: -1, z: 2 }, orientation: { x: 0, y: 0, z: 0, w: 1 } });
     assert.deepEqual(stamp(1500.25), { sec: 1, nanosec: 500250000 });
     assert.ok(stamp(1999.9999999).nanosec <= 999999999);
-    assert.equal(wallTime(1000, 1250, 5e12), 5e12 - 250, "made 250 ms ago");
+    assert.equal(wallTime(1000, 1250, 5e12, 0), 5e12 - 250, "made 250 ms ago");
+    assert.equal(wallTime(1000, 1250.75, 5e12, 5e12 - 1250), 5e12 - 250, "within the millisecond that the clock says");
+    assert.equal(wallTime(1000, 1250, 5e12, 6e12), 5e12 - 249, "the clock was set back");
   },
 
   async turns() {

@@ -303,7 +303,8 @@ export class Headset extends EventTarget {
     if (!this.#pulse.open) {
       const pulse = (this.#pulse = { askedAt: now, open: true });
       const answered = () => (pulse.open = false);
-      this.online({ timeoutMs: 60000 }).then(answered, answered);
+      // behind what is sent now, and not before it
+      queueMicrotask(() => this.online({ timeoutMs: 60000 }).then(answered, answered));
     }
     return true;
   }

@@ -8,10 +8,11 @@ export function stamp(ms) {
 
 /**
  * When something was done that was done at `at` of performance.now(), in ms since 1970 by the clock on the wall, as it is now. What
- * performance.timeOrigin has was so when the page began: it follows no step of that clock, and no machine that slept.
+ * performance.timeOrigin has was so when the page began: it follows no step of that clock, and no machine that slept. But Date.now()
+ * has whole milliseconds, cut off: within that one the other clock says where.
  */
-export function wallTime(at, now = performance.now(), wall = Date.now()) {
-  return wall - (now - at);
+export function wallTime(at, now = performance.now(), wall = Date.now(), began = performance.timeOrigin) {
+  return Math.min(Math.max(began + now, wall), wall + 1) - (now - at);
 }
 
 /** Type → a message of it; `ms` is its time since 1970. */
