@@ -22,6 +22,8 @@ class Agents:
     def __init__(self) -> None:
         self._by_id: dict[int, Connection] = {}
         self._tokens: dict[Connection, Token] = {}
+        self._ended: list[Token] = []
+        """Of those who have left just now."""
         self._groups: dict[Group, set[Connection]] = {}
         self._group_of: dict[Connection, Group] = {}
         self.former: dict[AgentKey, Connection] = {}
@@ -92,12 +94,20 @@ class Agents:
         return connection is not None and connection.peer.agent_type in (0, UNITY)
 
     def leave(self, connection: Connection) -> tuple[bool, Group | None]:
-        """A connection ended. Returns whether it was online, and a group that lost its last member."""
+        """A connection ended; its presence does with `end_presences`. Returns whether it was online, and a group that
+        lost its last member."""
         self._by_id.pop(connection.agent_id, None)
         token, emptied = self._unjoin(connection)
         if token is not None:
-            token.close()
+            self._ended.append(token)
         return token is not None, emptied
+
+    def end_presences(self) -> None:
+        """Those of all who have left end, together: one by itself wakes Zenoh's sending thread, and is a
+        packet of its own."""
+        ended, self._ended = self._ended, []
+        for token in ended:
+            token.close()
 
     def never_mind(self, agent_id: int) -> None:
         """Who was given this id is an agent that has another one."""

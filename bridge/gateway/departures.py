@@ -7,6 +7,7 @@ thousand that leave together are a second, in which the event loop does nothing 
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -23,10 +24,12 @@ GATHER_S = 0.02
 
 
 class Pieces:
-    """Connections for each of which something is done, in the order in which they came: the first at once."""
+    """Connections for each of which something is done, in the order in which they came: the first at once. Then
+    ``then`` is called, once for all whose turn it was."""
 
-    def __init__(self, do: Callable[[Connection], None]) -> None:
+    def __init__(self, do: Callable[[Connection], None], then: Callable[[], None]) -> None:
         self._do = do
+        self._then = then
         self._waiting: deque[Connection] = deque()
         self._turn: asyncio.Handle | None = None
 
@@ -41,14 +44,18 @@ class Pieces:
         if not self._waiting:
             return
         self._turn = asyncio.get_running_loop().call_soon(self._go_on)  # whatever becomes of this one
-        until = time.monotonic() + PIECE_S
-        while self._waiting and time.monotonic() < until:
-            self._do(self._waiting.popleft())
+        self._do_until(time.monotonic() + PIECE_S)
+
+    def _do_until(self, until: float) -> None:
+        try:
+            while self._waiting and time.monotonic() < until:
+                self._do(self._waiting.popleft())
+        finally:
+            self._then()
 
     def finish(self) -> None:
         """Do all that is left now."""
-        while self._waiting:
-            self._do(self._waiting.popleft())
+        self._do_until(math.inf)
 
 
 class Departures:

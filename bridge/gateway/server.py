@@ -122,7 +122,7 @@ class Gateway:
         """Of connections that have ended."""
         self._requests = together(settings.max_requests_per_s, time.monotonic())
         """Of all who send robots much."""
-        self._leaving = Pieces(self._has_closed)
+        self._leaving = Pieces(self._has_closed, self.agents.end_presences)
         self._departures = Departures(self.agents.online, lambda gone: self._roll.telling(gone))
         self._subscriptions = Subscriptions(mesh)
         self._record = record = Record(self._drops)

@@ -62,8 +62,10 @@ async def test_who_comes_under_the_id_of_one_who_left_comes_after_that_is_known(
 
 
 async def test_work_for_many_is_done_in_pieces_and_in_order() -> None:
-    """The first at once; others have their turn before all is done; what fails costs itself only."""
+    """The first at once; others have their turn before all is done; what fails costs itself only. What is done once
+    for several is done behind each of them, also behind one that fails."""
     done: list[int] = []
+    together: list[int] = []
     turns = 0
 
     def work(number: int) -> None:
@@ -74,7 +76,7 @@ async def test_work_for_many_is_done_in_pieces_and_in_order() -> None:
         if number == 3:
             raise ValueError
 
-    pieces = Pieces(work)  # type: ignore[arg-type]
+    pieces = Pieces(work, lambda: together.append(len(done)))  # type: ignore[arg-type]
     for number in range(30):
         pieces.put(number)  # type: ignore[arg-type]
     assert done[:1] == [0]
@@ -85,6 +87,9 @@ async def test_work_for_many_is_done_in_pieces_and_in_order() -> None:
         turns += 1
     assert done == list(range(30))
     assert turns >= 5
+    assert together[0] == 1
+    assert together[-1] == 30
+    assert 4 in together
 
 
 async def test_who_has_left_is_told_of_nobody(
