@@ -28,8 +28,9 @@ TURN_S = 0.003
 UNANSWERED = 4
 """Who is asked answers nearly in order: behind so many unanswered questions a look goes no further, unless the one
 before it has found nothing anywhere."""
-KEPT = 64
-"""So many answers to one question wait before Zenoh's thread does: the first counts, and then others are let go."""
+KEPT = 1024
+"""So many answers to one question wait before Zenoh's thread does: the first counts, and then others are let go. They
+are taken nevertheless, until there can be no more: Zenoh logs each that nobody takes."""
 
 OnAnswer = Callable[[bytes | MacsError], None]
 """Hears the answer to a call, or why there is none, on the loop."""
@@ -56,6 +57,16 @@ class _Question(NamedTuple):
             return ok.payload.to_bytes()
         return problem(self.key, reply.err.payload.to_bytes() if reply.err is not None else b"", self.timeout_s)
 
+    def rest(self) -> int | None:
+        """Let go what else was answered: how much that was, None when there can be no more."""
+        try:
+            for count in range(KEPT):
+                if self.replies.try_recv() is None:
+                    return count
+        except zenoh.ZError:
+            return None
+        return KEPT
+
 
 class Answers:
     """Those of one session."""
@@ -64,12 +75,13 @@ class Answers:
         self._loop = asyncio.get_running_loop()
         self._open: dict[Hashable, list[_Question]] = {}
         """By who is asked: in the order in which they were."""
+        self._answered: list[_Question] = []
+        """Those to which more answers may come."""
         self._pause_s = FIRST_S
         self._looking: asyncio.TimerHandle | None = None
 
     def close(self) -> None:
         """Look no more."""
-        self._open.clear()
         if self._looking is not None:
             self._looking.cancel()
 
@@ -94,7 +106,7 @@ class Answers:
 
     def _look(self) -> None:
         self._looking = None
-        until, thorough, found = time.monotonic() + TURN_S, self._pause_s > FIRST_S, False
+        until, thorough, found = time.monotonic() + TURN_S, self._pause_s > FIRST_S, self._let_go()
         for of in list(self._open):
             for on_answer, answer in self._take(of, thorough=thorough):
                 found = True
@@ -104,8 +116,14 @@ class Answers:
                     log.exception("an answer was not handled")
             if time.monotonic() > until:
                 break
-        if self._open and (self._looking is None or self._pause_s > FIRST_S):
+        if (self._open or self._answered) and (self._looking is None or self._pause_s > FIRST_S):
             self._look_after(FIRST_S if found else min(2 * self._pause_s, LAST_S))
+
+    def _let_go(self) -> bool:
+        """What was answered behind a first answer; whether there was anything."""
+        rests = [(question, question.rest()) for question in self._answered]
+        self._answered = [question for question, rest in rests if rest is not None]
+        return any(rest for _, rest in rests)
 
     def _take(self, of: Hashable, *, thorough: bool) -> list[tuple[OnAnswer, bytes | MacsError]]:
         """The answers that there are of one; who is looked at again behind all others."""
@@ -117,6 +135,8 @@ class Answers:
             answer = question.answer()
             if answer is not None:
                 answered.append((question.on_answer, answer))
+                if question.rest() is not None:
+                    self._answered.append(question)
                 continue
             unanswered.append(question)
             if len(unanswered) == UNANSWERED and not thorough:
