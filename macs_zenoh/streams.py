@@ -29,14 +29,17 @@ TIMES = 3
 
 
 class _Put:
-    """Frames of one node."""
+    """Frames of one node. Who puts one has the lock until it is counted, so that a count is behind no frame that it
+    leaves out: a gateway would take it for lost later."""
 
-    __slots__ = ("count", "due", "first", "left")
+    __slots__ = ("count", "due", "first", "left", "lock", "since")
 
-    def __init__(self, now: float) -> None:
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
         self.count = self.left = 0
-        self.first = now
-        self.due = now + FIRST_S
+        self.since = time.monotonic_ns()
+        self.first = time.monotonic()
+        self.due = self.first + FIRST_S
 
 
 class Streams:
@@ -54,27 +57,25 @@ class Streams:
         self._keys: dict[str, str] = {}
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()
-        self._since = time.monotonic_ns()
         self._put: dict[str, _Put] = {}
-        """Of each node since then."""
         self._looks = False
         """Whether the loop will look for what was not told."""
         agent.on_id(self._id_changed)
 
     def publish(self, node: str, frame: bytes) -> None:
         """Put topic data. ``frame`` is a whole frame whose management data lists who gets it (StreamData)."""
-        if not self._mesh.streams.put_here(self._keys.get(node) or self._key(node), frame):
-            return
-        now = time.monotonic()
-        with self._lock:
-            put = self._put.get(node)
-            if put is None:
-                put = self._put[node] = _Put(now)
+        key = self._keys.get(node) or self._key(node)
+        put = self._put.get(node) or self._begin(node)
+        with put.lock:
+            if not self._mesh.streams.put_here(key, frame):
+                return
             put.count += 1
             put.left = TIMES
+            now = time.monotonic()
+            if now >= put.due:
+                self._tell(node, put, now)
+        with self._lock:
             looks, self._looks = self._looks, True
-        if now >= put.due:
-            self._tell(node, put, now)
         if not looks:
             with suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self._loop.call_later, TELL_S, self._look)
@@ -96,9 +97,12 @@ class Streams:
             self._looks = bool(untold)
         try:
             for node, put in untold:
-                if now >= put.due:
-                    put.left -= 1
-                    self._tell(node, put, now)
+                if now >= put.due and put.lock.acquire(blocking=False):
+                    try:
+                        put.left -= 1
+                        self._tell(node, put, now)
+                    finally:
+                        put.lock.release()
         except MacsError as error:  # the session is closed
             log.debug("nobody is told how much topic data was put: %s", error)
             return
@@ -106,14 +110,18 @@ class Streams:
             self._loop.call_later(TELL_S, self._look)
 
     def _tell(self, node: str, put: _Put, now: float) -> None:
-        """Behind what was put goes how much it was."""
+        """Behind what was put goes how much it was. With its lock held."""
         put.due = now + min(max(now - put.first, FIRST_S), TELL_S)
         settings = self._mesh.settings
         layout = Layout(settings.id_slots, settings.group_slots)
         about = self._agent.type_number, self._agent.id, 0, StreamCount.manager, int(NodeType.SUBSCRIBER), node
-        message = encode_message(Metadata(*about).encode(), encode_data(StreamCount(self._since, put.count)))
+        message = encode_message(Metadata(*about).encode(), encode_data(StreamCount(put.since, put.count)))
         frame = encode_frame(self._agent.type_number, management=TO_NOBODY, message=message, layout=layout)
         self._mesh.streams.put_here(self._key(node), frame, ruled=False)
+
+    def _begin(self, node: str) -> _Put:
+        with self._lock:
+            return self._put.setdefault(node, _Put())
 
     def _key(self, node: str) -> str:
         key = self._keys.get(node)
@@ -130,5 +138,4 @@ class Streams:
         """Begin anew, also to count."""
         with self._lock:
             self._keys = {}
-            self._since = time.monotonic_ns()
             self._put.clear()

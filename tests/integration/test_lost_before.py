@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 
 import pytest
 
@@ -11,13 +12,14 @@ from bridge.gateway.on_the_way import BEFORE
 from macs_zenoh import TrafficRule, streams
 from macs_zenoh.mesh import Mesh
 from macs_zenoh.protocol.keyexpr import STREAM
-from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, encode_management
-from macs_zenoh.protocol.wire import encode_frame, encode_message
+from macs_zenoh.protocol.messages import ROS, Metadata, NodeType, StreamData, decode_data, encode_management
+from macs_zenoh.protocol.robot_state import StreamCount
+from macs_zenoh.protocol.wire import encode_frame, encode_message, parse_frame
 from macs_zenoh.streams import Streams
 from tests.support.given import Connect, StartGateway
 from tests.support.links import counted
 from tests.support.local import patient, router_apart
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 NODE, TYPE = "nd__camera", "std_msgs/UInt8MultiArray"
 KEY = STREAM.of(type=ROS, id=7, node=NODE)
@@ -77,6 +79,39 @@ async def test_what_a_full_link_drops_is_counted(
         await until(settled, every_s=0.1)
         assert gateway.drops[BEFORE] == came.lost > 0
         assert taken
+
+
+async def test_no_count_is_behind_a_message_that_it_leaves_out(router: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What another thread is putting just then is told with it; the loop does not wait for that."""
+    for name in ("FIRST_S", "TELL_S"):
+        monkeypatch.setattr(streams, name, 0.0)
+    went: list[bytes] = []
+    putting, goes_on = threading.Event(), threading.Event()
+    async with macs_zenoh.join("ros", id=7, settings=patient(router)) as agent:
+        await until(lambda: agent.mesh.linked)
+        put_here = agent.mesh.streams.put_here
+
+        def noted(key: str, payload: bytes, *, ruled: bool = True) -> bool:
+            is_put = put_here(key, payload, ruled=ruled)
+            went.append(payload)
+            if payload == b"slow":
+                putting.set()
+                assert goes_on.wait(PATIENCE_S)
+            return is_put
+
+        monkeypatch.setattr(agent.mesh.streams, "put_here", noted)
+        robot = Streams(agent)
+        robot.publish(NODE, b"first")
+        slow = asyncio.ensure_future(asyncio.to_thread(robot.publish, NODE, b"slow"))
+        try:
+            await until(putting.is_set)
+            robot._look()
+            assert went[-1] == b"slow"
+        finally:
+            goes_on.set()
+            await slow
+        at = went.index(b"slow")
+        assert decode_data(StreamCount, bytes(parse_frame(went[at + 1]).body)).put == 2
 
 
 async def test_a_count_uses_up_nothing_of_a_rule(router: str) -> None:
