@@ -27,7 +27,7 @@ from macs_zenoh.protocol.origins import host_problem, origin_problem
 from macs_zenoh.protocol.websocket import MESSAGE_BYTES, SUBPROTOCOL, TOKEN_SUBPROTOCOL, WEBSOCKET_PATH
 
 from .admission import is_in, networks
-from .connection import OVER_READ_BYTES, Connection
+from .connection import LATE_READ_BYTES, OVER_READ_BYTES, Connection
 from .door import Door, Entrance
 from .listener import Listener
 from .pages import add_routes
@@ -279,6 +279,8 @@ class _Outer(asyncio.BufferedProtocol):
         self._read_bytes = LEAST_READ_BYTES
         self._asked_at = 0.0
         """When room for bytes was asked for last."""
+        self._is_late = False
+        """Whether what is read comes late in a long round."""
         self._share = Share()
         self._full = False
         """Whether it is not read from, since so many of its requests wait."""
@@ -299,8 +301,12 @@ class _Outer(asyncio.BufferedProtocol):
     def get_buffer(self, sizehint: int) -> memoryview:
         self._asked_at = time.monotonic()
         most = LEAST_READ_BYTES if self._stream is None else self._read_bytes
-        if self._port.rounds.are_over(self.host):
+        rounds = self._port.rounds
+        self._is_late = rounds.long
+        if rounds.are_over(self.host):
             most = OVER_READ_BYTES
+        elif self._is_late:
+            most = LATE_READ_BYTES
         return self._port.scratch[:most]
 
     def buffer_updated(self, nbytes: int) -> None:
@@ -316,9 +322,15 @@ class _Outer(asyncio.BufferedProtocol):
             self._full = True
             self._shared.hold()
         rounds = self._port.rounds
-        if (turn_s := rounds.spend(self.host, self._share, took_s)) and not self.transport.is_closing():
+        turn_s = rounds.spend(self.host, self._share, took_s)
+        if self.transport.is_closing():
+            return
+        if turn_s:
             self._shared.hold()
             rounds.enter(self.host, self._share, self._shared.let_go, turn_s)
+        elif self._is_late and nbytes >= LATE_READ_BYTES:
+            self._shared.hold()
+            asyncio.get_running_loop().call_soon(self._shared.let_go)
 
     def eof_received(self) -> bool | None:
         return self._inner.eof_received() if self._counted or self._stream is not None else None

@@ -1,11 +1,12 @@
-"""Requests of one connection to the web port that wait to be answered, whatever aiohttp allows."""
+"""How much is read at once of a connection to the web port, and when none is, whatever aiohttp allows."""
 
 from __future__ import annotations
 
 import asyncio
 from typing import Any, cast
 
-from bridge.gateway.shares import Rounds
+from bridge.gateway.connection import LATE_READ_BYTES
+from bridge.gateway.shares import TURN_S, Rounds, Share
 from bridge.gateway.web import LEAST_READ_BYTES, PIPELINED, _Outer
 
 
@@ -68,4 +69,25 @@ async def test_no_more_requests_are_read_while_many_wait() -> None:
     inner.answer()
     outer.wait()
     assert transport.reads
+    outer._stop_waiting()
+
+
+async def test_late_in_a_long_round_little_is_read() -> None:
+    """Whoever the round's work was for; what is left comes in the next one."""
+    clock = [100.0]
+    transport, inner, port = Transport(), Inner(), Port()
+    port.rounds = Rounds(lambda: clock[0])
+    outer = _Outer(cast(asyncio.Protocol, inner), cast(Any, port))
+    outer.connection_made(cast(asyncio.BaseTransport, transport))
+    for number in range(3):
+        clock[0] += TURN_S
+        port.rounds.spend(f"10.0.0.{number}", Share(), 0.9 * TURN_S)
+    for size in (LATE_READ_BYTES - 1, LATE_READ_BYTES):
+        assert transport.reads
+        assert len(outer.get_buffer(-1)) == LATE_READ_BYTES
+        outer.buffer_updated(size)
+    assert not transport.reads
+    await asyncio.sleep(0)
+    assert transport.reads
+    assert len(outer.get_buffer(-1)) == LEAST_READ_BYTES
     outer._stop_waiting()
