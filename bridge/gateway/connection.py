@@ -72,7 +72,8 @@ FIRST_READ_BYTES = 16 << 10
 LEAST_READ_BYTES = 1024
 """Over TLS each byte may be a record of its own, which takes half a microsecond: so much is read of who begins."""
 OVER_READ_BYTES = 64
-"""Of who takes much, and has his turn in another round of the loop."""
+"""Of who takes much himself, and has his turn in another round of the loop. Who only shares his address does not have
+a command read in such pieces, each in its own turn: it may be a stop."""
 LATE_READ_BYTES = 512
 """In a round of the loop that has been long already so much is read of anybody else until the next one: of many who
 begin to flood in the same moment each has his first turn before him."""
@@ -229,9 +230,10 @@ class Connection(asyncio.BufferedProtocol):
         self._asked_at = time.monotonic()
         rounds, most = self._memory.rounds, self._read_bytes
         self._is_late = rounds.long
-        if rounds.are_over(self.host):
+        is_over = rounds.are_over(self.host)
+        if is_over and not rounds.had_little(self._share):
             most = OVER_READ_BYTES
-        elif self._is_late:
+        elif is_over or self._is_late:
             most = min(LATE_READ_BYTES, most)
         return self.peer.space()[:most]
 

@@ -39,6 +39,8 @@ RECENT_S = 1.0
 """What anybody had is forgotten after so long."""
 MUCH_S = RECENT_S / 50
 """Who had so much waits longest."""
+LITTLE_HAD_S = 2 * TURN_S
+"""Who has had less of late has had little."""
 LATEST_S = 1.0
 """So much longer at most he waits for others of his address, who have had less: nobody waits for ever."""
 ADDRESSES = 4096
@@ -140,6 +142,10 @@ class Rounds:
     def long(self) -> bool:
         """Whether this round has had much work already, whoever it was for."""
         return self._all_s > LONG_S
+
+    def had_little(self, share: Share) -> bool:
+        """Whether who has this share has had little of late, as who sends commands: one of them may be a stop."""
+        return share.had_s(self._before) < LITTLE_HAD_S
 
     def are_over(self, host: str) -> bool:
         """Whether work for this address has to wait for another round: it takes much, and this round has had a turn's

@@ -303,9 +303,10 @@ class _Outer(asyncio.BufferedProtocol):
         most = LEAST_READ_BYTES if self._stream is None else self._read_bytes
         rounds = self._port.rounds
         self._is_late = rounds.long
-        if rounds.are_over(self.host):
+        is_over = rounds.are_over(self.host)
+        if is_over and not rounds.had_little(self._share):
             most = OVER_READ_BYTES
-        elif self._is_late:
+        elif is_over or self._is_late:
             most = LATE_READ_BYTES
         return self._port.scratch[:most]
 

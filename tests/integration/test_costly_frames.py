@@ -14,7 +14,7 @@ import pytest
 
 from bridge.gateway.connection import LATE_READ_BYTES, OVER_READ_BYTES, Connection
 from bridge.gateway.memory import Memory
-from bridge.gateway.shares import TURN_S, Rounds, Share
+from bridge.gateway.shares import LITTLE_HAD_S, TURN_S, Rounds, Share
 from macs_zenoh.protocol.kept import Kept, Room
 from macs_zenoh.protocol.messages import (
     ROS,
@@ -355,7 +355,7 @@ async def test_who_was_read_from_in_a_round_that_is_over_waits_for_his_turn() ->
         asked = question(2)
         while asked:
             room = connection.get_buffer(-1)
-            assert len(room) <= OVER_READ_BYTES
+            assert len(room) <= LATE_READ_BYTES
             piece, asked = asked[: len(room)], asked[len(room) :]
             room[: len(piece)] = piece
             connection.buffer_updated(len(piece))
@@ -364,6 +364,20 @@ async def test_who_was_read_from_in_a_round_that_is_over_waits_for_his_turn() ->
             await until(lambda: not connection._pauses)
             _use_up(busy, memory, connection)
         await until(lambda: (1, 2) in busy.did)
+
+
+async def test_a_stop_is_read_whole_of_who_has_had_little_himself() -> None:
+    """Whatever others of his address take; of these next to nothing is read."""
+    busy = Timed()
+    memory = Memory(64 << 20, 32 << 20)
+    memory.rounds = Rounds(lambda: busy.clock_s)
+    async with many(busy, memory, 1):
+        connection = busy.connections[0]
+        await until(lambda: connection.peer.state is State.ONLINE and not connection._pauses)
+        _use_up(busy, memory, connection)
+        assert len(connection.get_buffer(-1)) == LATE_READ_BYTES > len(said("stop"))
+        connection._share.spend(LITTLE_HAD_S, busy.clock_s)
+        assert len(connection.get_buffer(-1)) == OVER_READ_BYTES
 
 
 async def test_more_is_read_at_once_of_what_costs_little_though_it_waits_for_its_turn(
