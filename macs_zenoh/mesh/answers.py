@@ -10,6 +10,7 @@ import asyncio
 import logging
 import re
 import time
+from collections import deque
 from collections.abc import Callable, Hashable
 from typing import NamedTuple
 
@@ -75,7 +76,7 @@ class Answers:
         self._loop = asyncio.get_running_loop()
         self._open: dict[Hashable, list[_Question]] = {}
         """By who is asked: in the order in which they were."""
-        self._answered: list[_Question] = []
+        self._answered: deque[_Question] = deque()
         """Those to which more answers may come."""
         self._pause_s = FIRST_S
         self._looking: asyncio.TimerHandle | None = None
@@ -106,7 +107,8 @@ class Answers:
 
     def _look(self) -> None:
         self._looking = None
-        until, thorough, found = time.monotonic() + TURN_S, self._pause_s > FIRST_S, self._let_go()
+        until, thorough = time.monotonic() + TURN_S, self._pause_s > FIRST_S
+        found = self._let_go(time.monotonic() + TURN_S / 2)
         for of in list(self._open):
             for on_answer, answer in self._take(of, thorough=thorough):
                 found = True
@@ -119,11 +121,19 @@ class Answers:
         if (self._open or self._answered) and (self._looking is None or self._pause_s > FIRST_S):
             self._look_after(FIRST_S if found else min(2 * self._pause_s, LAST_S))
 
-    def _let_go(self) -> bool:
-        """What was answered behind a first answer; whether there was anything."""
-        rests = [(question, question.rest()) for question in self._answered]
-        self._answered = [question for question, rest in rests if rest is not None]
-        return any(rest for _, rest in rests)
+    def _let_go(self, until: float) -> bool:
+        """What was answered behind a first answer, as much as there is time for: who answers and does not end it can
+        have thousands of these open. Whether there was anything."""
+        found = False
+        for _ in range(len(self._answered)):
+            question = self._answered.popleft()
+            rest = question.rest()
+            if rest is not None:
+                self._answered.append(question)
+            found = found or bool(rest)
+            if time.monotonic() > until:
+                break
+        return found
 
     def _take(self, of: Hashable, *, thorough: bool) -> list[tuple[OnAnswer, bytes | MacsError]]:
         """The answers that there are of one; who is looked at again behind all others."""

@@ -99,6 +99,20 @@ async def test_all_answers_are_taken_until_there_can_be_no_more() -> None:
     await until(lambda: replies.looked > looked and answers._looking is None)
 
 
+async def test_who_never_ends_his_answers_does_not_hold_up_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of those to which more may come a look takes as many as there is time for, each in its turn."""
+    answers, told = Answers(), Told()
+    replies = asked(answers, told, 1, "a", "b", "c")
+    for each in replies:
+        each.ok = Payload(b"1")
+    monkeypatch.setattr("macs_zenoh.mesh.answers.TURN_S", -1.0)  # time is always over
+    await until(lambda: len(told) == 3)
+    for wanted in range(1, 4):
+        await until(lambda wanted=wanted: all(each.looked > 2 + wanted for each in replies))  # type: ignore[misc]
+        assert max(each.looked for each in replies) <= min(each.looked for each in replies) + 1
+    answers.close()
+
+
 async def test_an_answer_that_cannot_be_handled_costs_no_other(caplog: pytest.LogCaptureFixture) -> None:
     """It is logged, and the next one told; who asks again at once hears of that too."""
     answers, told = Answers(), Told()
