@@ -28,7 +28,7 @@ TURN_S = 0.003
 """After so long of handling answers everything else has its turn."""
 UNANSWERED = 4
 """Who is asked answers nearly in order: behind so many unanswered questions a look goes no further, unless the one
-before it has found nothing anywhere."""
+before it has found nothing anywhere, or none has for ``LAST_S``."""
 KEPT = 1024
 """So many answers to one question wait before Zenoh's thread does: the first counts, and then others are let go. They
 are taken nevertheless, until there can be no more: Zenoh logs each that nobody takes."""
@@ -79,6 +79,8 @@ class Answers:
         self._answered: deque[_Question] = deque()
         """Those to which more answers may come."""
         self._pause_s = FIRST_S
+        self._thorough_s = 0.0
+        """When all were looked at last."""
         self._looking: asyncio.TimerHandle | None = None
 
     def close(self) -> None:
@@ -107,8 +109,12 @@ class Answers:
 
     def _look(self) -> None:
         self._looking = None
-        until, thorough = time.monotonic() + TURN_S, self._pause_s > FIRST_S
-        found = self._let_go(time.monotonic() + TURN_S / 2)
+        now = time.monotonic()
+        until = now + TURN_S
+        thorough = self._pause_s > FIRST_S or now > self._thorough_s + LAST_S
+        if thorough:
+            self._thorough_s = now
+        found = self._let_go(now + TURN_S / 2)
         for of in list(self._open):
             for on_answer, answer in self._take(of, thorough=thorough):
                 found = True

@@ -86,6 +86,25 @@ async def test_an_answer_is_found_behind_many_that_do_not_come() -> None:
     answers.close()
 
 
+async def test_an_answer_is_found_behind_such_while_others_are_answered() -> None:
+    """However busy it is with others' answers, somebody who has left many questions open is heard."""
+    answers, told = Answers(), Told()
+    many = asked(answers, told, 1, *(f"{number}" for number in range(3 * UNANSWERED)))
+    going = True
+
+    def ask_again(answer: bytes | MacsError) -> None:
+        if going:
+            other = Replies()
+            other.ok, other.ended = Payload(b""), True
+            answers.expect(2, "other", 1.0, other, ask_again)  # type: ignore[arg-type]
+
+    ask_again(b"")
+    many[-1].ok = Payload(b"")
+    await until(lambda: bool(told))
+    going = False
+    answers.close()
+
+
 async def test_all_answers_are_taken_until_there_can_be_no_more() -> None:
     """The first one is told; those behind it are taken from Zenoh, which logs each that nobody takes."""
     answers, told = Answers(), Told()
