@@ -64,10 +64,17 @@ class Streams:
 
     def publish(self, node: str, frame: bytes) -> None:
         """Put topic data. ``frame`` is a whole frame whose management data lists who gets it (StreamData)."""
+        self._publish(node, frame, traced=True)
+
+    def tell(self, node: str, frame: bytes) -> None:
+        """Put something beside a node's topic data, which no trace takes for it."""
+        self._publish(node, frame, traced=False)
+
+    def _publish(self, node: str, frame: bytes, *, traced: bool) -> None:
         key = self._keys.get(node) or self._key(node)
         put = self._put.get(node) or self._begin(node)
         with put.lock:
-            if not self._mesh.streams.put_here(key, frame):
+            if not self._mesh.streams.put_here(key, frame, traced=traced):
                 return
             put.count += 1
             put.left = TIMES
@@ -117,7 +124,7 @@ class Streams:
         about = self._agent.type_number, self._agent.id, 0, StreamCount.manager, int(NodeType.SUBSCRIBER), node
         message = encode_message(Metadata(*about).encode(), encode_data(StreamCount(put.since, put.count)))
         frame = encode_frame(self._agent.type_number, management=TO_NOBODY, message=message, layout=layout)
-        self._mesh.streams.put_here(self._key(node), frame, ruled=False)
+        self._mesh.streams.put_here(self._key(node), frame, ruled=False, traced=False)
 
     def _begin(self, node: str) -> _Put:
         with self._lock:

@@ -106,6 +106,7 @@ class RobotAgent:
             stop=emergency_stop or EmergencyStop(),
             group_of=self._group_of,
             is_online=lambda agent: agent in self.agent.directory,
+            tell_stream=self.streams.tell,
             prioritise_stream=self.streams.prioritise,
             keep_stream=self.streams.keep,
             tracing=agent.mesh.tracing,

@@ -72,6 +72,7 @@ class Robot:
         session: the ROS graph, and our node in it.
         agent_id: the robot's id on the mesh now.
         publish_stream: puts a frame on the mesh.
+        tell_stream: puts one that is no topic data beside it.
         prioritise_stream: sets the priority of a node's frames; None: the usual one.
         keep_stream: sets how many of a node's frames are kept for recovery; None: as the traffic rules say. Returns
             whether any are.
@@ -102,6 +103,7 @@ class Robot:
     stop: EmergencyStop = field(default_factory=EmergencyStop)
     trips: Trips = field(default_factory=Trips)
     no_stop: str = ""
+    tell_stream: PublishStream = lambda node, frame: None
     prioritise_stream: Callable[[str, Priority | None], None] = lambda node, priority: None
     keep_stream: Callable[[str, int | None], bool] = lambda node, frames: False
     alarms: Alarms = field(default_factory=Alarms)

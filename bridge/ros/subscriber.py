@@ -75,7 +75,7 @@ class SubscriberNode(TopicNode):
             return
         framed = StreamFraming(self.metadata(StreamCount.manager), [registrant], self.robot.layout)
         try:
-            self.robot.publish_stream(self.key.node_name, framed(encode_data(count)))
+            self.robot.tell_stream(self.key.node_name, framed(encode_data(count)))
         except MacsError as error:
             log.debug("%s: %s is not told how much was put: %s", self.topic, registrant, error)
 

@@ -148,15 +148,20 @@ class Outgoing:
                 outlets.clear()
             self._apart.clear()
 
-    def put(self, key: str, payload: Payload, traffic: Traffic, *, ruled: bool = True) -> bool:
-        """`Mesh.put`; without ``ruled`` past all traffic rules. False: a rule drops it, or there is no router."""
+    def put(self, key: str, payload: Payload, traffic: Traffic, *, ruled: bool = True, traced: bool = True) -> bool:
+        """`Mesh.put`; without ``ruled`` past all traffic rules, without ``traced`` never marked. False: a rule drops
+        it, or there is no router."""
         publisher, shape, kept = self._outlets[traffic].get(key) or self._declare(key, traffic)
         if shape is not None and ruled and not self._passes(shape, len(payload)):
             return False
         goes = self.linked or kept
         if not goes:
             self.drops["no_route"] += 1
-        if self._marked and (mark := self._tracing.mark(key, command=traffic is Traffic.COMMAND)) is not None:
+        if (
+            self._marked
+            and traced
+            and (mark := self._tracing.mark(key, command=traffic is Traffic.COMMAND)) is not None
+        ):
             publisher = Marked(publisher, mark)
         if traffic is COMMAND and self._is_for_thread(key, payload):
             if not self._commands.put(publisher, payload, key):

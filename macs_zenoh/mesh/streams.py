@@ -44,10 +44,10 @@ class Streams:
         if not (by_thread and self._outgoing.put_by(self.sender, key, payload, Traffic.STREAM)):
             self._outgoing.put(key, payload, Traffic.STREAM)
 
-    def put_here(self, key: str, payload: Payload, *, ruled: bool = True) -> bool:
+    def put_here(self, key: str, payload: Payload, *, ruled: bool = True, traced: bool = True) -> bool:
         """Publish in this thread, whichever it is. False: it is lost already, and counted. Without ``ruled`` it passes
-        traffic rules, and uses up nothing of them."""
-        return self._outgoing.put(key, payload, Traffic.STREAM, ruled=ruled)
+        traffic rules, and uses up nothing of them; without ``traced`` it is in no trace."""
+        return self._outgoing.put(key, payload, Traffic.STREAM, ruled=ruled, traced=traced)
 
     @property
     def backlogged(self) -> bool:

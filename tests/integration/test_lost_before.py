@@ -91,8 +91,8 @@ async def test_no_count_is_behind_a_message_that_it_leaves_out(router: str, monk
         await until(lambda: agent.mesh.linked)
         put_here = agent.mesh.streams.put_here
 
-        def noted(key: str, payload: bytes, *, ruled: bool = True) -> bool:
-            is_put = put_here(key, payload, ruled=ruled)
+        def noted(key: str, payload: bytes, **how: bool) -> bool:
+            is_put = put_here(key, payload, **how)
             went.append(payload)
             if payload == b"slow":
                 putting.set()

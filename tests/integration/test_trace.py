@@ -226,6 +226,11 @@ async def test_one_in_so_many_is_always_traced_if_wanted(router: str) -> None:
         reports = trace.decode_answer(other.tracing.answer(trace.encode_request(TraceRequest()))).reports
         assert len(reports) - before == 10
         assert {report.key for report in reports} == {"macs/from/ros/7/nd__x"}
+        for _ in range(20):  # what tells how much there was is no topic data
+            await until(lambda: mesh.streams.put_here("macs/from/ros/7/nd__x", b"z", traced=False))
+        await until(lambda: mesh.put("macs/to/ros/0/7/unity/2", b"end", Traffic.COMMAND) or b"end" in came)
+        again = trace.decode_answer(other.tracing.answer(trace.encode_request(TraceRequest()))).reports
+        assert len(again) == len(reports)
         subscription.close()
 
 
