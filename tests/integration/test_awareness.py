@@ -73,10 +73,14 @@ async def test_delivery_is_known(meet: Meet) -> None:
     assert a.send("nobody", "t", b"") is Outcome.NO_SUCH_AGENT
     assert a.send("a", "t", b"") is Outcome.TO_ITSELF
     assert await a.deliver("nobody", "t", b"", deadline_s=0.1) is Outcome.NO_SUCH_AGENT
-    assert await a.deliver("b", "t", b"", deadline_s=0.1) is Outcome.NOT_REGISTERED
+    outcome, deadline_s = Outcome.LATE, 0.1
+    while outcome is Outcome.LATE:  # it may be busy
+        outcome, deadline_s = await a.deliver("b", "t", b"", deadline_s=deadline_s), 2 * deadline_s
+    assert outcome is Outcome.NOT_REGISTERED
     Module(b, "t")
     assert await a.deliver("b", "t", b"x", deadline_s=PATIENCE_S) is Outcome.DELIVERED
-    assert a.counters == {"not_registered": 3, "no_such_agent": 2, "to_itself": 1, "delivered": 1}
+    counted = {name: count for name, count in a.counters.items() if name != "late"}
+    assert counted == {"not_registered": 3, "no_such_agent": 2, "to_itself": 1, "delivered": 1}
 
 
 async def test_an_unregistered_type_is_warned_of_once(meet: Meet, caplog: pytest.LogCaptureFixture) -> None:

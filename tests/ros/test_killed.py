@@ -19,6 +19,8 @@ from tests.support.waiting import PATIENCE_S
 
 BACK_S = PATIENCE_S
 """How long the stream may take to be back before the test gives up; it takes well under a second, see the output."""
+DEPTH = 2000
+"""Nobody loses a message by standing still for a while on a busy machine."""
 
 
 @dataclass
@@ -30,7 +32,7 @@ class Listener:
     heard: list[tuple[int, float]] = field(default_factory=list)
 
     async def listen(self) -> None:
-        topic = await self.headset.subscribe("/count", "std_msgs/String", agents=[1], buffer_size=50)
+        topic = await self.headset.subscribe("/count", "std_msgs/String", agents=[1], buffer_size=DEPTH)
         async for message in topic:
             self.heard.append((int(message.data[8:].rstrip(b"\0")), time.monotonic()))
 
@@ -80,7 +82,7 @@ async def fleet(domain: int, peer: Peer) -> AsyncIterator[Fleet]:
         for number in range(10):
             headset = await Headset.connect("127.0.0.1", ports[number % 2], reconnect=True)
             listeners.append(Listener(number % 2, await stack.enter_async_context(headset)))
-        publisher = await peer.publisher(String, "/count", 100)
+        publisher = await peer.publisher(String, "/count", DEPTH)
         tasks = [asyncio.create_task(listener.listen()) for listener in listeners]
         tasks.append(asyncio.create_task(_count(publisher)))
         fleet = Fleet(programs, listeners)
