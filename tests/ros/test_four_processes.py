@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 
@@ -14,11 +14,10 @@ from std_msgs.msg import String
 
 import macs_zenoh
 from bridge.headset.client import Headset
-from bridge.headset.nodes import Incoming
 from macs_zenoh.protocol.messages import Functionality, decode_data
 from tests.support.programs import Program, free_port, macs
 from tests.support.ros_peer import Peer
-from tests.support.waiting import PATIENCE_S, get
+from tests.support.waiting import PATIENCE_S, first_of, get
 
 
 @dataclass
@@ -139,12 +138,3 @@ async def test_a_killed_gateway_takes_only_its_own_headsets(site: Site, peer: Pe
     await sees(second, robots=[1], headsets=[second.id])
     await first_of(subscription.__anext__(), lambda: publisher.publish(String(data="after")))
     assert await asyncio.wait_for(first.wait_ended(), PATIENCE_S)
-
-
-async def first_of(coming: Awaitable[Incoming], act: Callable[[], None]) -> Incoming:
-    """Repeat an action until what it brings about has come."""
-    task = asyncio.ensure_future(coming)
-    while not task.done():
-        act()
-        await asyncio.wait([task], timeout=0.05)
-    return task.result()

@@ -12,13 +12,15 @@ import builtins
 import inspect
 import textwrap
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any, TypeVar
 
 PATIENCE_S = 60.0
 """How long something may take that takes a moment on a machine with nothing else to do."""
 SHOWN = 400
 """How many characters of a value are shown."""
+
+T = TypeVar("T")
 
 
 async def until(condition: Callable[[], Any], timeout_s: float = PATIENCE_S, *, every_s: float = 0.005) -> Any:
@@ -33,6 +35,16 @@ async def until(condition: Callable[[], Any], timeout_s: float = PATIENCE_S, *, 
             return seen
         assert time.monotonic() < deadline, f"not within {timeout_s:g} s: {described(condition, seen)}"
         await asyncio.sleep(every_s)
+
+
+async def first_of(coming: Awaitable[T], act: Callable[[], None], *, every_s: float = 0.05) -> T:
+    """Repeat an action until what it brings about has come, as a message: a busy link drops topic data."""
+    task, deadline = asyncio.ensure_future(coming), time.monotonic() + PATIENCE_S
+    while not task.done():
+        assert time.monotonic() < deadline, "nothing has come"
+        act()
+        await asyncio.wait([task], timeout=every_s)
+    return task.result()
 
 
 async def get(queue: asyncio.Queue[Any], timeout_s: float = PATIENCE_S) -> Any:
