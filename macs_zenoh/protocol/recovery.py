@@ -359,6 +359,7 @@ class Recovery:
         freed = [self._take(state, number) for number in there]
         state.next = to
         freed += self._in_turn(state)
+        state.stranger = state.stranger and not freed
         if state.complete and state.lost:
             self._misses.append((state.key, state.lost))
             state.lost = 0

@@ -243,6 +243,33 @@ def test_a_source_that_does_not_answer_is_given_up() -> None:
     assert 1.0 < now < 10.0
 
 
+def test_a_stranger_that_does_not_answer_is_none_when_something_of_it_was_delivered() -> None:
+    """What was before its first message is not counted; what is missing behind that is, however soon."""
+    source, to = Source(100), Recovery()
+    to.settled = True
+    now = 0.0
+
+    def given_up() -> list[int]:
+        nonlocal now
+        delivered: list[int] = []
+        while not delivered:
+            now += 0.05
+            to.heartbeat(source.name, KEY, source.number - 1, now)  # it is heard, and does not answer
+            for ask in to.asks(now):
+                delivered += values(to.ended(ask, now))
+        return delivered
+
+    for _ in range(5):
+        source.put()
+    assert take(to, source, source.put(), now) == []
+    assert given_up() == [5]
+    assert to.misses() == []
+    source.put()
+    assert take(to, source, source.put(), now) == []
+    assert given_up() == [7]
+    assert to.misses() == [(KEY, 1)]
+
+
 def test_a_source_out_of_reach_is_waited_for() -> None:
     """While nothing is heard of a source its gap stays open; once it is heard, the question comes at once."""
     source, to = Source(100), Recovery()
