@@ -510,8 +510,7 @@ async def test_nothing_of_an_agent_is_its_successors(router: str, domain: int, p
 
         lodging.next(2)
         await until(lambda: len(robot.nodes) == 0)
-        found = robot.agent.directory.get(2, Lodging.ID)
-        assert found is not None
+        found = await until(lambda: robot.agent.directory.get(2, Lodging.ID))
         assert found.epoch == 2
         answer.set()
         await asyncio.sleep(0.3)
