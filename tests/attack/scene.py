@@ -55,6 +55,8 @@ TALK_EVERY_S = 0.01
 DRIVE_EVERY_S = 0.02
 NO_EFFECT_S = 4.0
 """A stop or a dead-man that has done nothing by then counts as none."""
+FAULT_LINES = 40
+"""So many lines of a program's log are shown from its first fault on."""
 STOPS_TO_A_LETTING_GO = 5
 HOLDS_S = 0.15
 """How long after each stop the driver is watched driving in vain."""
@@ -438,10 +440,12 @@ class Scene:
             broken.append(f"{missing} of the neighbours' messages were lost")
         broken += await self._newcomer_is_served()
         for name in ("gateway", "robot"):
-            tracebacks = [line for line in self.site.programs[name].log if "Traceback" in line or " E macs" in line]
-            if tracebacks:
-                broken.append(f"the {name} has a fault in its log: {tracebacks[0][:200]}")
-                self.site.programs[name].log.clear()
+            log = self.site.programs[name].log
+            faults = [at for at, line in enumerate(log) if "Traceback" in line or " E macs" in line]
+            if faults:
+                broken.append(f"the {name} has a fault in its log: {log[faults[0]][:200]}")
+                print(f"the {name}'s log:", *log[faults[0] : faults[0] + FAULT_LINES], sep="\n", file=sys.stderr)
+                log.clear()
         return broken
 
     async def _newcomer_is_served(self) -> list[str]:
