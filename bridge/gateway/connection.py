@@ -34,7 +34,7 @@ from .backpressure import Backpressure, Patience
 from .door import OPEN_TO_ALL, Entrance
 from .memory import Memory
 from .owner import Owner
-from .shares import TURN_S, Share
+from .shares import LATE_READ_BYTES, TURN_S, Share
 from .tcp import is_gone, waiting_bytes
 from .writer import BUFFER_BYTES, ENDED, NOBODY, Writer
 
@@ -71,12 +71,6 @@ FIRST_READ_BYTES = 16 << 10
 """Of many that begin at once nobody knows yet that they take much."""
 LEAST_READ_BYTES = 1024
 """Over TLS each byte may be a record of its own, which takes half a microsecond: so much is read of who begins."""
-OVER_READ_BYTES = 64
-"""Of who takes much himself, and has his turn in another round of the loop. Who only shares his address does not have
-a command read in such pieces, each in its own turn: it may be a stop."""
-LATE_READ_BYTES = 512
-"""In a round of the loop that has been long already so much is read of anybody else until the next one: of many who
-begin to flood in the same moment each has his first turn before him."""
 
 
 class Connection(asyncio.BufferedProtocol):
@@ -228,14 +222,9 @@ class Connection(asyncio.BufferedProtocol):
 
     def get_buffer(self, sizehint: int) -> memoryview:
         self._asked_at = time.monotonic()
-        rounds, most = self._memory.rounds, self._read_bytes
+        rounds = self._memory.rounds
         self._is_late = rounds.long
-        is_over = rounds.are_over(self.host)
-        if is_over and not rounds.had_little(self._share):
-            most = OVER_READ_BYTES
-        elif is_over or self._is_late:
-            most = min(LATE_READ_BYTES, most)
-        return self.peer.space()[:most]
+        return self.peer.space()[: rounds.most_bytes(self.host, self._share, self._read_bytes)]
 
     def buffer_updated(self, nbytes: int) -> None:
         # from when it was asked for: what is small over TLS takes longer to decrypt, here and now, than to handle

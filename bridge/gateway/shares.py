@@ -41,6 +41,12 @@ MUCH_S = RECENT_S / 50
 """Who had so much waits longest."""
 LITTLE_HAD_S = 2 * TURN_S
 """Who has had less of late has had little."""
+OVER_READ_BYTES = 64
+"""Of who takes much himself, and has his turn in another round of the loop. Who only shares his address does not have
+a command read in such pieces, each in its own turn: it may be a stop."""
+LATE_READ_BYTES = 512
+"""In a round of the loop that has been long already so much is read of anybody else until the next one: of many who
+begin to flood in the same moment each has his first turn before him."""
 LATEST_S = 1.0
 """So much longer at most he waits for others of his address, who have had less: nobody waits for ever."""
 ADDRESSES = 4096
@@ -146,6 +152,13 @@ class Rounds:
     def had_little(self, share: Share) -> bool:
         """Whether who has this share has had little of late, as who sends commands: one of them may be a stop."""
         return share.had_s(self._before) < LITTLE_HAD_S
+
+    def most_bytes(self, host: str, share: Share, usual: int) -> int:
+        """How much to read at once of who has this share, of whom it is as much as is usual in other rounds."""
+        is_over = self.are_over(host)
+        if is_over and not self.had_little(share):
+            return OVER_READ_BYTES
+        return min(LATE_READ_BYTES, usual) if is_over or self.long else usual
 
     def are_over(self, host: str) -> bool:
         """Whether work for this address has to wait for another round: it takes much, and this round has had a turn's

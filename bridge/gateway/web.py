@@ -27,11 +27,11 @@ from macs_zenoh.protocol.origins import host_problem, origin_problem
 from macs_zenoh.protocol.websocket import MESSAGE_BYTES, SUBPROTOCOL, TOKEN_SUBPROTOCOL, WEBSOCKET_PATH
 
 from .admission import is_in, networks
-from .connection import LATE_READ_BYTES, OVER_READ_BYTES, Connection
+from .connection import Connection
 from .door import Door, Entrance
 from .listener import Listener
 from .pages import add_routes
-from .shares import TURN_S, Share
+from .shares import LATE_READ_BYTES, TURN_S, Share
 from .site import COOKIE, WRONG, Site
 from .websocket import WebSocketTransport
 
@@ -300,15 +300,10 @@ class _Outer(asyncio.BufferedProtocol):
 
     def get_buffer(self, sizehint: int) -> memoryview:
         self._asked_at = time.monotonic()
-        most = LEAST_READ_BYTES if self._stream is None else self._read_bytes
+        usual = LEAST_READ_BYTES if self._stream is None else self._read_bytes
         rounds = self._port.rounds
         self._is_late = rounds.long
-        is_over = rounds.are_over(self.host)
-        if is_over and not rounds.had_little(self._share):
-            most = OVER_READ_BYTES
-        elif is_over or self._is_late:
-            most = LATE_READ_BYTES
-        return self._port.scratch[:most]
+        return self._port.scratch[: rounds.most_bytes(self.host, self._share, usual)]
 
     def buffer_updated(self, nbytes: int) -> None:
         if not self._counted and self._stream is None:

@@ -12,9 +12,9 @@ from itertools import chain
 
 import pytest
 
-from bridge.gateway.connection import LATE_READ_BYTES, OVER_READ_BYTES, Connection
+from bridge.gateway.connection import Connection
 from bridge.gateway.memory import Memory
-from bridge.gateway.shares import LITTLE_HAD_S, TURN_S, Rounds, Share
+from bridge.gateway.shares import LATE_READ_BYTES, LITTLE_HAD_S, OVER_READ_BYTES, TURN_S, Rounds, Share
 from macs_zenoh.protocol.kept import Kept, Room
 from macs_zenoh.protocol.messages import (
     ROS,

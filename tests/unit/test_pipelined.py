@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any, cast
 
-from bridge.gateway.connection import LATE_READ_BYTES
-from bridge.gateway.shares import TURN_S, Rounds, Share
+from bridge.gateway.shares import LATE_READ_BYTES, TURN_S, Rounds, Share
 from bridge.gateway.web import LEAST_READ_BYTES, PIPELINED, _Outer
 
 
