@@ -1,7 +1,8 @@
 """Answers that are looked for, since nobody waits for one so much that it must wake the loop. Asyncio.
 
 To be called for each answer, a thread of Zenoh's takes Python's lock from the loop, which then waits to have it back,
-and is woken for what one look finds together with others. Answers wait in Zenoh until then.
+and is woken for what one look finds together with others. What comes behind over the same link, as a stop may, waits
+as well. So answers wait in Zenoh.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import re
 import time
 from collections import deque
 from collections.abc import Callable, Hashable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import zenoh
@@ -33,11 +34,37 @@ KEPT = 1024
 """So many answers to one question wait before Zenoh's thread does: the first counts, and then others are let go. They
 are taken nevertheless, until there can be no more: Zenoh logs each that nobody takes."""
 
+WAITING = 1 << 16
+"""The same where all of them count."""
+
+AT_ONCE = 500
+"""So many of those are taken without a break."""
+
 OnAnswer = Callable[[bytes | MacsError], None]
 """Hears the answer to a call, or why there is none, on the loop."""
 
 HOLDER = re.compile(r"([0-9]{1,3})/([0-9]{1,5})")
 """Who has what was refused: agent type and id."""
+
+
+async def all_answers(ask: Callable[[zenoh.handlers.FifoChannel[zenoh.Reply]], Any]) -> list[zenoh.Sample]:
+    """Whatever a question is answered with, but for refusals: ``ask`` puts it, and gives back Zenoh's handler."""
+    replies: zenoh.handlers.Handler[zenoh.Reply] = ask(zenoh.handlers.FifoChannel(WAITING))
+    answers: list[zenoh.Sample] = []
+    pause_s = FIRST_S
+    while True:
+        try:
+            for _ in range(AT_ONCE):
+                reply = replies.try_recv()
+                if reply is None:
+                    break
+                if reply.ok is not None:
+                    answers.append(reply.ok)
+                pause_s = FIRST_S / 2
+        except zenoh.ZError:  # all have answered
+            return answers
+        await asyncio.sleep(pause_s)
+        pause_s = min(2 * pause_s, LAST_S)
 
 
 class _Question(NamedTuple):

@@ -17,7 +17,7 @@ from macs_zenoh.errors import HeldByAnother, MacsError, NotServed, OutOfRange, R
 from macs_zenoh.protocol.guard import Admits
 from macs_zenoh.protocol.limits import ASKED_BYTES, CALL_BYTES
 
-from .answers import KEPT, Answers, OnAnswer, problem
+from .answers import KEPT, Answers, OnAnswer, all_answers, problem
 from .arrivals import Arrivals, now_s
 from .copies import copied
 from .declared import Handler, Payload, Subscription, Traffic
@@ -133,24 +133,10 @@ class Calls:
 
     async def ask_all(self, key: str, *, timeout_s: float) -> list[tuple[str, bytes]]:
         """`Mesh.ask_all`."""
-        answers: list[tuple[str, bytes]] = []
-        ended = asyncio.Event()
-
-        def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                answers.append((str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
-
-        def on_end() -> None:
-            self._from_thread(ended.set)
-
-        self._session.get(
-            key,
-            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
-            target=zenoh.QueryTarget.ALL,
-            timeout=timeout_s,
+        answers = await all_answers(
+            lambda replies: self._session.get(key, replies, target=zenoh.QueryTarget.ALL, timeout=timeout_s)
         )
-        await ended.wait()
-        return answers
+        return [(str(answer.key_expr), answer.payload.to_bytes()) for answer in answers]
 
     def serve(
         self,

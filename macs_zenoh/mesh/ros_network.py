@@ -13,7 +13,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -41,6 +40,7 @@ from macs_zenoh.protocol.rmw_zenoh.keyexpr import (
 )
 from macs_zenoh.protocol.rmw_zenoh.qos import SERVICES, Durability, History, Qos, Reliability
 
+from .answers import all_answers
 from .copies import copied
 from .declared import Subscription
 from .followed import Followed, OnToken
@@ -49,6 +49,7 @@ from .leaving import leave
 from .opening import open_session
 from .panics import call, unwatched, watched
 from .threads import keep_attached
+from .token_news import TokenChange, watch
 
 log = logging.getLogger("macs.rmw_zenoh")
 
@@ -163,21 +164,9 @@ class RosNetwork:
 
     async def tokens(self, domain: int | None, *, timeout_s: float = 2.0) -> list[str]:
         """The tokens of a domain, or of all, that exist now."""
-        loop, ended = asyncio.get_running_loop(), asyncio.Event()
-        found: list[str] = []
-
-        def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                found.append(str(reply.ok.key_expr))
-
-        def on_end() -> None:
-            with suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(ended.set)
-
-        callback = zenoh.handlers.Callback(on_reply, on_end, indirect=False)
-        self.session.liveliness().get(every_token(domain), callback, timeout=timeout_s)
-        await ended.wait()
-        return found
+        key, liveliness = every_token(domain), self.session.liveliness()
+        found = await all_answers(lambda replies: liveliness.get(key, replies, timeout=timeout_s))
+        return [str(token.key_expr) for token in found]
 
     async def follow_tokens(self, domain: int | None, receive: OnToken, *, timeout_s: float = 2.0) -> Handle:
         """Call ``receive(token, alive)``, from any thread, for each token of a domain, or of all, until the handle is
@@ -195,12 +184,11 @@ class RosNetwork:
     def watch_tokens(self, domain: int | None, receive: OnToken) -> Subscription:
         """Call ``receive(token, alive)`` for each token of a domain, or of all."""
 
-        def on_sample(sample: zenoh.Sample) -> None:
-            keep_attached()
-            receive(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+        def told(tokens: list[TokenChange]) -> None:
+            for token, alive in tokens:
+                receive(token, alive)
 
-        callback = zenoh.handlers.Callback(on_sample, indirect=False)
-        return Subscription(self.session.liveliness().declare_subscriber(every_token(domain), callback, history=True))
+        return watch(self.session.liveliness(), every_token(domain), told)
 
     def on_change(self, callback: OnChange) -> Handle:
         """Call back for whoever comes and goes in the graphs that are followed."""

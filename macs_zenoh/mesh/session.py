@@ -23,7 +23,7 @@ from macs_zenoh.protocol.keyexpr import PING
 from macs_zenoh.protocol.policing import Policer
 from macs_zenoh.versions import installed
 
-from .answers import OnAnswer
+from .answers import OnAnswer, all_answers
 from .arrivals import Arrivals, now_s
 from .calls import Calls
 from .declared import AtOnce, Handler, OnAged, OnBatch, OnMiss, Payload, Subscription, Token, Traffic
@@ -35,7 +35,7 @@ from .outgoing import Outgoing
 from .panics import call, end_on_panics, last_words, watched
 from .reliable import Recovered
 from .streams import Streams
-from .token_news import TokenNews
+from .token_news import TokenNews, watch
 from .tracing import Tracing
 from .zenoh_config import check_files, first_line, id_is_chosen, insert, warn_of_lowered, zenoh_config
 
@@ -485,28 +485,13 @@ class Mesh:
     def watch_tokens(self, key: str, on_change: Callable[[str, bool], None]) -> Subscription:
         """Call ``on_change(key, alive)`` for every token that exists, comes or goes."""
         news = TokenNews(self._loop, self._from_thread, on_change)
-        return Subscription(
-            self._liveliness.declare_subscriber(
-                key, zenoh.handlers.Callback(news.receive, indirect=False), history=True
-            )
-        )
+        return watch(self._liveliness, key, news.receive)
 
     async def tokens(self, key: str, *, timeout_s: float = 2.0) -> list[str]:
         """The tokens that exist now, as the routers know them: this session's own for certain, what another one has
         declared a few milliseconds ago perhaps not yet. Where routers do not answer in time, those known by then."""
-        found: list[str] = []
-        ended = asyncio.Event()
-
-        def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                found.append(str(reply.ok.key_expr))
-
-        def on_end() -> None:
-            self._from_thread(ended.set)
-
-        self._liveliness.get(key, zenoh.handlers.Callback(on_reply, on_end, indirect=False), timeout=timeout_s)
-        await ended.wait()
-        return sorted(found)
+        found = await all_answers(lambda replies: self._liveliness.get(key, replies, timeout=timeout_s))
+        return sorted(str(token.key_expr) for token in found)
 
     # -- threads -------------------------------------------------------------------------------------------------
 
