@@ -271,19 +271,25 @@ async def next_with(headset: Headset, data: bytes) -> Incoming:
 
 
 async def heard(robot: Robot, stream: Subscription, text: bytes) -> None:
-    """Publish until the headset hears it: a registration may be on its way; nothing may come twice."""
-    arriving = asyncio.ensure_future(stream.__anext__())
+    """Publish until the headset hears it: a registration may be on its way; nothing may come twice. No other text that
+    it may have heard begins like this."""
+
+    async def next_number() -> int:
+        while not (data := (await stream.__anext__()).data).startswith(text):
+            pass
+        return int(data.rpartition(b" ")[2])
+
+    arriving = asyncio.ensure_future(next_number())
     number = 0
     while not arriving.done():
         number += 1
         robot.chatter(b"%s %d" % (text, number))
         await asyncio.wait([arriving], timeout=0.1)
-    first = int((await arriving).data.rpartition(b" ")[2])
-    robot.chatter(b"last")
-    rest: list[bytes] = []
-    while not rest or rest[-1] != b"last":
-        rest.append((await asyncio.wait_for(stream.__anext__(), PATIENCE_S)).data)
-    assert rest == [*(b"%s %d" % (text, n) for n in range(first + 1, number + 1)), b"last"]
+    came = [await arriving]
+    robot.chatter(b"%s %d" % (text, number + 1))
+    while came[-1] <= number:
+        came.append(await asyncio.wait_for(next_number(), PATIENCE_S))
+    assert came == list(range(came[0], number + 2))
 
 
 async def test_gateways_with_different_blocks_part_and_meet(sites: Sites) -> None:
@@ -324,8 +330,8 @@ async def test_both_sites_have_leased_the_same_block(sites: Sites, later_keeps: 
         for site in "ab"
     }
     for site in "ab":
-        for stream in streams[site]:
-            await asyncio.wait_for(heard(robots[site], stream, b"parted"), PATIENCE_S)
+        for stream, text in zip(streams[site], (b"parted, one", b"parted, other"), strict=True):
+            await asyncio.wait_for(heard(robots[site], stream, text), PATIENCE_S)
         await headsets[site][0].send(b"inside", to=UNITY, ids=[2])
         assert (await headsets[site][1].receive(PATIENCE_S)).data == b"inside"
 
@@ -339,8 +345,8 @@ async def test_both_sites_have_leased_the_same_block(sites: Sites, later_keeps: 
     assert gateways[moves].blocks == [1]
     for site in "ab":
         robot, (first, second) = robots[site], headsets[site]
-        for stream in streams[site]:
-            await asyncio.wait_for(heard(robot, stream, b"together"), PATIENCE_S)
+        for stream, text in zip(streams[site], (b"together, one", b"together, other"), strict=True):
+            await asyncio.wait_for(heard(robot, stream, text), PATIENCE_S)
         assert robot.registrants == {(NodeType.SUBSCRIBER, "nd__chatter"): {first.id, second.id}}
         await first.send(b"by id", to=UNITY, ids=[second.id])
         assert (await next_with(second, b"by id")).sender_id == first.id
@@ -408,8 +414,8 @@ async def test_the_winner_keeps_what_it_registered_at_the_other_site(sites: Site
     await asyncio.wait_for(heard(robot, streams[1], b"parted"), PATIENCE_S)
     await sites.right(await sites.meet(), [(1, 1002), (2, 1), (2, 256)], [here, there])
     await until(lambda: robot.registrants == {(NodeType.SUBSCRIBER, "nd__chatter"): {1, 256}})
-    for each in streams:
-        await asyncio.wait_for(heard(robot, each, b"together"), PATIENCE_S)
+    for each, text in zip(streams, (b"together, one", b"together, other"), strict=True):
+        await asyncio.wait_for(heard(robot, each, text), PATIENCE_S)
 
 
 async def test_two_agents_have_leased_the_same_id(sites: Sites, caplog: pytest.LogCaptureFixture) -> None:
