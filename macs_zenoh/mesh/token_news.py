@@ -30,7 +30,7 @@ WAITING = 1 << 16
 """So many wait in the channel before Zenoh's thread does."""
 GATHER_S = 0.001
 """Pause before the next look for tokens: those that come in a burst wake nobody one by one."""
-END_S = 1.0
+END_S = 5.0
 """How long the end of a program waits for these threads, which must not be in Zenoh then."""
 
 TokenChange = tuple[str, bool]

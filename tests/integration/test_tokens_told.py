@@ -51,20 +51,18 @@ async def test_who_is_told_of_tokens_holds_up_no_message(router: str) -> None:
         await until(lambda: bool(heard))
         for each in (token, listening, watching):
             each.close()
-    assert heard == [True]
+    assert heard[0]
 
 
 LEFT_OPEN = """
-import asyncio, sys
-from macs_zenoh.mesh import Mesh
+import sys
+import zenoh
+from macs_zenoh.mesh.token_news import watch
+from macs_zenoh.mesh.zenoh_config import zenoh_config
 from tests.support.local import patient
 
-async def main():
-    mesh = await Mesh.open(patient(sys.argv[1]))
-    mesh.watch_tokens("some/**", print)
-    return mesh
-
-mesh = asyncio.run(main())
+session = zenoh.open(zenoh_config(patient(sys.argv[1])))
+watching = watch(session.liveliness(), "some/**", print)
 """
 
 

@@ -125,7 +125,7 @@ async def test_stop_holds_until_it_is_released(site: Site) -> None:
     code, out, _ = await ended("stop", "-e", site.endpoint, "--timeout", "5")
     assert (code, out) == (1, "robot 7 is NOT stopped: operator/0 may not stop this robot\n")
 
-    (stopped,) = await macs("stop", "--as", "operator/5", "--json", "-e", site.endpoint)
+    (stopped,) = await macs("stop", "--as", "operator/5", "--json", "--timeout", "30", "-e", site.endpoint)
     assert stopped == {"id": 7, "done": True, "stopped": True, "by": "operator/5", "problem": ""}
     assert (await get(site.driven)).linear.z == -1.0
     await site.drive(0.6)
@@ -143,7 +143,7 @@ async def test_stop_holds_until_it_is_released(site: Site) -> None:
     )
     assert code == 1
     assert "may not release" in out
-    code, out, _ = await ended("stop", "7", "--release", "--as", "operator/5", "-e", site.endpoint)
+    code, out, _ = await ended("stop", "7", "--release", "--as", "operator/5", "--timeout", "30", "-e", site.endpoint)
     assert (code, out) == (0, "robot 7 is released\n")
     await site.drive(0.7)
     assert (await get(site.driven)).linear.x == 0.7

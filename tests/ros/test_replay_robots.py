@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -274,17 +275,20 @@ async def test_commands_go_only_to_a_robot_that_was_named_twice(
             "replay", str(recording), "-e", router.endpoint, "--commands-to", "7", "--confirm", "7"
         )
         assert code == 0, errors
-        assert "10 messages" in out
+        sent = re.search(r"^(\d+) messages", out, re.MULTILINE)
+        late = re.search(r"(\d+) left out, as they were too late", out)  # on a busy machine
+        assert sent
+        assert int(sent[1]) + (int(late[1]) if late else 0) == 10
         speeds: list[float] = []
 
-        def are_all() -> bool:
+        def enough() -> bool:
             while not driven.empty():
                 speeds.append(driven.get_nowait().linear.x)
-            return speeds[-1:] == [9.0]
+            return len(speeds) > int(sent[1]) - 3  # the first may come before ROS has found the subscription
 
-        await until(are_all)
-        assert speeds == [float(number) for number in range(10)][-len(speeds) :]
-        assert len(speeds) > 7  # the first may come before ROS has found the subscription
+        await until(enough)
+        assert speeds == sorted(set(speeds))
+        assert set(speeds) <= set(range(10))
 
 
 @pytest.fixture
