@@ -162,7 +162,7 @@ async def come_back(scene: Scene, secret: str) -> int:
     assert Metadata.decode(metadata).message_manager == SessionResumed.manager
     own_id = int(json.loads(bytes(data))["agentId"])
     stream.write(frames.online_request(own_id, 5))
-    while b"unityAgentIds" not in bytes(messages[-1]):
+    while not any(b"unityAgentIds" in bytes(message) for message in messages):  # news may come behind it
         messages += decoder.feed(await stream.read())
     stream.abort()
     await until(lambda: len(scene.gateway._sleepers) == 1)
