@@ -19,6 +19,7 @@ from functools import partial
 
 from msgspec import structs
 
+from .calls_together import CallsTogether, Question, Told, in_order
 from .errors import HeldByAnother, OutOfRange, Refused, Unreachable
 from .mesh import Mesh, Traffic
 from .protocol.agent_id import AgentId
@@ -31,13 +32,13 @@ from .protocol.messages import (
     NodeRefused,
     NodeType,
     RemoveNode,
-    encode_data,
     node_name,
 )
 from .protocol.registrations import AgentKey, Registrations, Robots, StreamKey, Task, removal
 from .protocol.routing import call_of
+from .protocol.together import MOST
 from .protocol.turns import Turns
-from .protocol.wire import Layout, encode_message
+from .protocol.wire import Layout
 
 log = logging.getLogger("macs.registrations")
 
@@ -68,10 +69,11 @@ StreamChanges = list[tuple[StreamKey, set[AgentKey] | None]]
 class _Call:
     """One call, and how far it is."""
 
-    __slots__ = ("again", "asked", "attempt", "over", "task")
+    __slots__ = ("again", "asked", "attempt", "over", "task", "told")
 
-    def __init__(self, task: Task, attempt: int) -> None:
+    def __init__(self, task: Task, told: Told, attempt: int) -> None:
         self.task = task
+        self.told = told
         self.attempt = attempt
         self.asked = False
         """Whether the robot was asked, and has not answered yet."""
@@ -92,8 +94,10 @@ class RobotCalls:
         on_streams: Callable[[StreamChanges], None],
         on_refused: Callable[[AgentKey, NodeRefused], None],
         on_done: Callable[[Task], None] = lambda task: None,
+        together: bool = False,
     ) -> None:
-        """``on_done`` hears of each task that a robot has confirmed."""
+        """``on_done`` hears of each task that a robot has confirmed; ``together``: their blocks are ours, so robots
+        may be asked for several agents in one query."""
         self._mesh = mesh
         self._layout = layout
         self._on_streams = on_streams
@@ -106,13 +110,12 @@ class RobotCalls:
         self._ready: dict[Turns[CallKey, _Call], int] = {}
         """Those of which calls may be made, with their robots."""
         self._goes_on = False
-        """Whether they are in another round of the loop."""
-        self._follows = False
-        """Whether they are made behind answers, at the latest."""
+        """Whether they are made behind all that is wanted, or answered, in this round of the loop."""
+        self._together = CallsTogether(mesh, CALL_TIMEOUT_S) if together else None
         self._to_start: deque[Iterator[Task]] = deque()
         """Tasks whose calls are not wanted yet, since there are many."""
-        self._message: tuple[AddNode | RemoveNode | None, bytes] = (None, b"")
-        """What robots were told last, as a message."""
+        self._told: Told | None = None
+        """The last one."""
         self._closed = False
 
     def close(self) -> None:
@@ -184,6 +187,8 @@ class RobotCalls:
             if not online:
                 self._start_all(self._registrations.holder_left(agent.key, self._online))
             return
+        if self._together is not None:
+            self._together.forget(agent.id)
         if not online:
             self._online.pop(agent.id, None)
             return
@@ -312,7 +317,7 @@ class RobotCalls:
         if len(calls) >= CALLS_EACH:
             self.refuse(task.node, task.robot_id, f"{CALLS_EACH} registrations wait already; try again")
             return
-        wanted = calls[key] = _Call(task, attempt)
+        wanted = calls[key] = _Call(task, self._telling(task.node), attempt)
         turns = self._turns.get(task.robot_id)
         if turns is None:
             turns = self._turns[task.robot_id] = Turns(OPEN_CALLS_EACH, OPEN_CALLS)
@@ -323,34 +328,56 @@ class RobotCalls:
         if self._closed:
             return
         self._ready[turns] = robot_id
-        if not self._goes_on:
+        if not self._goes_on:  # the first at once, and what else is wanted now together
             self._make_calls()
+            self._go_on()
+
+    def _go_on(self) -> None:
+        if not self._goes_on and not self._closed:
+            self._goes_on = True
+            asyncio.get_running_loop().call_soon(self._make_calls)
 
     def _make_calls(self) -> None:
         """As many as there is time for now, and the others in other rounds of the loop."""
         until = time.monotonic() + TURN_S
-        self._goes_on = self._follows = False
+        self._goes_on = False
         while self._ready:
             turns, robot_id = next(iter(self._ready.items()))
-            turn = turns.take()
-            if turn is not None:
-                self._run(turn[2], turns)
+            if questions := self._take(turns, until):
+                self._run(questions, turns)
             else:
                 del self._ready[turns]
                 if not turns.open and self._turns.get(robot_id) is turns:
                     del self._turns[robot_id]
             if self._ready and time.monotonic() > until:
-                self._goes_on = True
-                asyncio.get_running_loop().call_soon(self._make_calls)
+                self._go_on()
                 return
+
+    def _take(self, turns: Turns[CallKey, _Call], until: float) -> list[Question[_Call]]:
+        """The next calls of a robot: some, or as many as there is time for."""
+        questions: list[Question[_Call]] = []
+        most = MOST if self._together is not None else 1
+        while len(questions) < most and (turn := turns.take()) is not None:
+            wanted = turn[2]
+            wanted.asked = True
+            try:
+                self._listen(wanted.task)
+                key, frame = self._question(wanted.task, wanted.told)
+                alone = self._together is None or wanted.attempt > 0
+                questions.append(
+                    Question(wanted, turn[0], wanted.task.robot_id, _verb(wanted.task.node), key, frame, alone)
+                )
+            except Exception as error:  # noqa: BLE001 - it is judged with those that come later
+                asyncio.get_running_loop().call_soon(self._answered, wanted, turns, error)
+            if time.monotonic() > until:
+                break
+        return questions
 
     def _turn_over(self, robot_id: int, turns: Turns[CallKey, _Call], agent: AgentKey) -> None:
         """Others may be asked, when all answers that came together are handled."""
         turns.done(agent)
         self._ready[turns] = robot_id
-        if not (self._goes_on or self._follows or self._closed):
-            self._follows = True
-            asyncio.get_running_loop().call_soon(self._make_calls)
+        self._go_on()
 
     def _end(self, wanted: _Call) -> None:
         """A call is not wanted any more: its answer, should there be one, says nothing."""
@@ -379,16 +406,18 @@ class RobotCalls:
         if not calls:
             self._calls.pop(agent, None)
 
-    def _run(self, wanted: _Call, turns: Turns[CallKey, _Call]) -> None:
-        wanted.asked = True
-        answered = partial(self._answered, wanted, turns)
-        try:
-            self._listen(wanted.task)
-            key, frame = self._question(wanted.task)
-            of, traffic = wanted.task.robot_id, Traffic.REGISTRATION
-            self._mesh.ask(key, frame, answered, of=of, timeout_s=CALL_TIMEOUT_S, traffic=traffic)
-        except Exception as error:  # noqa: BLE001 - it is judged with those that come later
-            asyncio.get_running_loop().call_soon(answered, error)
+    def _run(self, questions: list[Question[_Call]], turns: Turns[CallKey, _Call]) -> None:
+        for some in in_order(questions):
+            if self._together is not None and len(some) > 1 and self._together.takes(some[0]):
+                self._together.ask(some, lambda each, answer: self._answered(each.of, turns, answer))
+                continue
+            for each in some:
+                answered = partial(self._answered, each.of, turns)
+                try:
+                    of, traffic = each.robot_id, Traffic.REGISTRATION
+                    self._mesh.ask(each.key, each.frame, answered, of=of, timeout_s=CALL_TIMEOUT_S, traffic=traffic)
+                except Exception as error:  # noqa: BLE001 - it is judged with those that come later
+                    asyncio.get_running_loop().call_soon(answered, error)
 
     def _answered(self, wanted: _Call, turns: Turns[CallKey, _Call], answer: bytes | Exception) -> None:
         if wanted.over or self._closed:
@@ -438,24 +467,28 @@ class RobotCalls:
 
     async def _ask(self, task: Task) -> None:
         self._listen(task)
-        await self._mesh.query(*self._question(task), timeout_s=CALL_TIMEOUT_S, traffic=Traffic.REGISTRATION)
+        question = self._question(task, self._telling(task.node))
+        await self._mesh.query(*question, timeout_s=CALL_TIMEOUT_S, traffic=Traffic.REGISTRATION)
 
-    def _question(self, task: Task) -> tuple[str, bytes]:
-        """Key and frame of a call. The message is made once for the robots that one registration names."""
+    def _telling(self, node: AddNode | RemoveNode) -> Told:
+        if self._told is None or self._told.node is not node:
+            self._told = Told(node)
+        return self._told
+
+    def _question(self, task: Task, told: Told) -> tuple[str, bytes]:
+        """Key and frame of a call."""
         node = task.node
         sender = (node.registrant_agent_type, node.registrant_agent_id)
-        told, message = self._message
-        if told is not node:
-            metadata = Metadata(*sender, message_manager=node.manager)
-            message = encode_message(metadata.encode(), encode_data(node))
-            self._message = node, message
-        verb = "add_node" if isinstance(node, AddNode) else "remove_node"
-        return call_of((ROS, task.robot_id), verb, sender, message, self._layout)
+        return call_of((ROS, task.robot_id), _verb(node), sender, told.message, self._layout)
 
 
 def _keys(task: Task) -> tuple[AgentKey, CallKey]:
     node = task.node
     return (node.registrant_agent_type, node.registrant_agent_id), (task.robot_id, node.node_type, node.node_name)
+
+
+def _verb(node: AddNode | RemoveNode) -> str:
+    return "add_node" if isinstance(node, AddNode) else "remove_node"
 
 
 class _What:

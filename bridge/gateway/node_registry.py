@@ -52,7 +52,9 @@ class NodeRegistry:
         self._agents = agents
         self._record = record
         self._tell = tell
-        self.robots = RobotCalls(mesh, directory, layout, on_streams=on_streams, on_refused=self.refused)
+        self.robots = RobotCalls(
+            mesh, directory, layout, on_streams=on_streams, on_refused=self.refused, together=True
+        )
         self.nodes = Budget("interface nodes", each=NODES_EACH, per_address=NODES_PER_ADDRESS, total=NODES_IN_ALL)
         named = "robots and groups named in registrations"
         self.named = Budget(named, each=NAMED_EACH, per_address=NAMED_PER_ADDRESS, total=NAMED_IN_ALL)

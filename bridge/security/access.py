@@ -24,6 +24,7 @@ from macs_zenoh.protocol.keyexpr import (
     BLOCK_SIZE,
     BROADCAST,
     CALL,
+    CALLS,
     EVERYTHING,
     GROUP,
     LAST,
@@ -45,11 +46,15 @@ from macs_zenoh.protocol.keyexpr import (
 )
 from macs_zenoh.protocol.messages import NOBODY, OPERATOR, ROS, UNITY
 from macs_zenoh.protocol.rmw_zenoh.keyexpr import session_keys
+from macs_zenoh.protocol.together import VERBS
 
 TYPES = {"robots": ROS, "gateways": UNITY, "operators": OPERATOR}
 
 VISITOR: dict[str, FieldValue] = {"from_type": UNITY, "from_id": 0}
 """As whom a gateway asks for its page: a headset that has not joined, which has no id of any block."""
+
+ANY = ""
+"""A callee whose every verb may be called."""
 
 INGRESS, EGRESS = "ingress", "egress"
 
@@ -278,6 +283,7 @@ class _Outbound:
     def queries(self) -> Iterator[str]:
         for sender in self._as:
             yield from _every(CALL, self._callees(), sender)
+        yield from self._together()
         if isinstance(self._client, Gateway) and self._client.blocks:
             yield from _every(CALL, self._looked_at(), VISITOR)
         if self._name is not None:
@@ -287,6 +293,18 @@ class _Outbound:
         if isinstance(self._client, Operator):
             yield PING.every()
             yield from ADMIN
+
+    def _together(self) -> Iterator[str]:
+        """Calls for several of its headsets at once: one of whom somebody speaks for is not enough."""
+        if isinstance(self._client, Gateway):
+            for callee in self._called_together():
+                for block in self._client.blocks:
+                    yield CALLS.every(**callee, from_type=UNITY, from_block=block)
+                if not self._client.blocks:
+                    yield CALLS.every(**callee, from_type=UNITY)
+
+    def _called_together(self) -> Iterator[Fields]:
+        return (each for each in self._callees() if each["type"] == ROS and each.get("verb", ANY) in (ANY, *VERBS))
 
     def _looked_at(self) -> Iterator[Fields]:
         """What its page asks of robots, whoever looks at it."""
@@ -338,6 +356,8 @@ class _Outbound:
 
     def answerers(self) -> Iterator[str]:
         yield from _every(CALL, self._callees())
+        if isinstance(self._client, Gateway):
+            yield from _every(CALLS, self._called_together())
         for name in self._friends:
             yield NAMED.every(name=name)
             yield LAST.every(name=name)
@@ -348,6 +368,8 @@ class _Outbound:
         """Answers go to who asked, and to nobody else, so the type of the asking agent is enough."""
         if self._callees():
             yield CALL.every(from_type=self._as[0]["from_type"])
+        if isinstance(self._client, Gateway) and any(self._called_together()):
+            yield CALLS.every(from_type=UNITY)
         if self._name is not None and self._friends:
             yield NAMED.every(from_name=self._name)
             yield LAST.every(from_name=self._name)
@@ -421,6 +443,8 @@ class _Inbound:
     def queryables(self) -> Iterator[str]:
         if not isinstance(self._client, Gateway):
             yield from _every(CALL, agents(self._client))
+        if isinstance(self._client, Robot):
+            yield CALLS.every(type=ROS, id=self._client.id)
         if self._name is not None:
             yield NAMED.every(name=self._name)
             yield LAST.every(name=self._name)

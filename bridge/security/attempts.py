@@ -9,10 +9,11 @@ from typing import NamedTuple
 from bridge.security import access
 from bridge.security.expected import Expected, agent_of, presence_of, sender_of
 from bridge.security.policy import LOOK_VERBS, Client, Gateway, Operator, Policy, Robot
-from macs_zenoh.protocol import keyexpr
+from macs_zenoh.protocol import keyexpr, together
 from macs_zenoh.protocol.keyexpr import (
     BROADCAST,
     CALL,
+    CALLS,
     GROUP,
     LAST,
     LEASE,
@@ -201,6 +202,8 @@ class Attempts:
                 key = CALL.of(**agent_of(callee), verb=verb, **sender_of(name))
                 what = f"{client.name} calls {verb} of {callee.name}{pretending}"
                 yield Question(client.name, what, key, really and (verbs is None or verb in verbs))
+            if isinstance(name, Gateway) and isinstance(callee, Robot):
+                yield from self._calls_together(client, name, callee)
             if name is client and verbs is None:
                 for impostor in self._here:
                     if impostor is not callee:
@@ -208,6 +211,17 @@ class Attempts:
                         what = f"{impostor.name} answers {client.name} as {callee.name}"
                         permitted = self._expected.speaks_as(impostor, callee)
                         yield Question(client.name, what, key, permitted, impostor.name)
+
+    def _calls_together(self, client: Client, name: Gateway, callee: Robot) -> Iterator[Question]:
+        """Calls for all headsets of one of a gateway's blocks."""
+        pretending = "" if name is client else f" as {name.name}"
+        verbs = self._policy.verbs(name, callee)
+        for verb in (MARK, *self._verbs):
+            block = keyexpr.block_of(int(agent_of(name)["id"]))
+            key = CALLS.of(**agent_of(callee), verb=verb, from_type=UNITY, from_block=block)
+            what = f"{client.name} calls {verb} of {callee.name} for many{pretending}"
+            may = verbs is None or (verb in verbs and verb in together.VERBS)
+            yield Question(client.name, what, key, may and self._expected.speaks_as(client, name))
 
     def _looks(self, client: Client) -> Iterator[Question]:
         """What gateways ask for their pages, and nobody else may."""

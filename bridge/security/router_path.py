@@ -24,6 +24,7 @@ from macs_zenoh.protocol import keyexpr
 from macs_zenoh.protocol.keyexpr import (
     BROADCAST,
     CALL,
+    CALLS,
     GROUP,
     LAST,
     LEASE,
@@ -177,6 +178,8 @@ class RouterPath:
                 real = mark in self._verbs  # calls of others may come: they are for the robot, if it is there
                 if not isinstance(other, Gateway):
                     serve(CALL.every(**agent_of(other), verb=mark), stand_in=real)
+                if isinstance(other, Robot):
+                    serve(CALLS.every(**agent_of(other), verb=mark), stand_in=real)
                 if (called := access.awareness_name(other)) is not None and not real:
                     serve(NAMED.every(name=called, message_type=mark))
                     serve(LAST.every(name=called, message_type=mark))

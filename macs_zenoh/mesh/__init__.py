@@ -14,6 +14,7 @@ the log says of links; `declared` the words that all of them use, `gathered` tok
 which our programs are ROS nodes.
 """
 
+from .answers import FAILED, said, understood
 from .arrivals import now_s
 from .declared import Aged, AtOnce, Handler, OnBatch, OnMiss, Payload, Sample, Subscription, Token, Traffic
 from .gathered import GatheredTokens
@@ -22,6 +23,7 @@ from .tracing import Tracing
 from .zenoh_config import configuration
 
 __all__ = [
+    "FAILED",
     "Aged",
     "AtOnce",
     "GatheredTokens",
@@ -37,4 +39,6 @@ __all__ = [
     "Traffic",
     "configuration",
     "now_s",
+    "said",
+    "understood",
 ]

@@ -197,6 +197,22 @@ def problem(key: str, payload: bytes, timeout_s: float) -> MacsError:
         answer = msgspec.json.decode(payload[:REQUEST_BYTES], type=dict[str, str])
     except (msgspec.DecodeError, UnicodeDecodeError):
         return Unreachable(key, payload[:200].decode(errors="replace"))
+    return understood(key, answer)
+
+
+def said(error: MacsError) -> dict[str, str]:
+    """What is answered to a call instead of what was asked."""
+    if isinstance(error, HeldByAnother):
+        return {"refused": error.reason, "holder": "{}/{}".format(*error.holder)}
+    return {"refused": error.reason if isinstance(error, Refused) else str(error)}
+
+
+FAILED = {"failed": "internal error, see the log there"}
+"""The same where the fault is ours."""
+
+
+def understood(key: str, answer: dict[str, str]) -> MacsError:
+    """What that means to who asked."""
     if "refused" in answer:
         holder = HOLDER.fullmatch(answer.get("holder", ""))
         if holder is None:

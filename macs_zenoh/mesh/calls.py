@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Awaitable, Callable, Hashable
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -13,11 +13,11 @@ from typing import Any
 import msgspec
 import zenoh
 
-from macs_zenoh.errors import HeldByAnother, MacsError, NotServed, OutOfRange, Refused
+from macs_zenoh.errors import MacsError, NotServed, OutOfRange, Refused
 from macs_zenoh.protocol.guard import Admits
 from macs_zenoh.protocol.limits import ASKED_BYTES, CALL_BYTES
 
-from .answers import KEPT, Answers, OnAnswer, all_answers, problem
+from .answers import FAILED, KEPT, Answers, OnAnswer, all_answers, problem, said
 from .arrivals import Arrivals, now_s
 from .copies import copied
 from .declared import Handler, Payload, Subscription, Traffic
@@ -142,41 +142,38 @@ class Calls:
         self,
         key: str,
         handler: Handler,
-        *,
         stand_in: bool,
         first: Callable[[str, bytes], None] | None,
         gate: Admits | None,
         most_bytes: int | None,
+        in_order: bool,
     ) -> Subscription:
         """`Mesh.serve`."""
 
-        async def answer(query: zenoh.Query, problem: Refused | None) -> None:
+        async def answer(query: zenoh.Query, problem: Refused | None, begun: Awaitable[bytes | None] | None) -> None:
             self._arrivals.asked.popleft()
             with query:
                 name = str(query.key_expr)
                 try:
                     if problem is not None:
                         raise problem
-                    payload = copied(query.payload) if query.payload is not None else b""
-                    reply = await handler(name, payload)
+                    reply = await (begun if begun is not None else handler(name, _payload(query)))
                     if reply is not None:
                         query.reply(query.key_expr, reply)
-                except HeldByAnother as refusal:
-                    holder = "{}/{}".format(*refusal.holder)
-                    query.reply_err(msgspec.json.encode({"refused": refusal.reason, "holder": holder}))
-                except Refused as refusal:
-                    query.reply_err(msgspec.json.encode({"refused": refusal.reason}))
                 except MacsError as error:
-                    query.reply_err(msgspec.json.encode({"refused": str(error)}))
+                    query.reply_err(msgspec.json.encode(said(error)))
                 except Exception:
                     log.exception("call %s failed", name)
-                    query.reply_err(msgspec.json.encode({"failed": "internal error, see the log there"}))
+                    query.reply_err(msgspec.json.encode(FAILED))
                 except BaseException as error:
                     end_if_panic(error)
                     raise
 
         def spawn(query: zenoh.Query, problem: Refused | None, counted: int) -> None:
-            task = self._loop.create_task(answer(query, problem))
+            begun = None
+            if in_order and problem is None:
+                begun = handler(str(query.key_expr), _payload(query))
+            task = self._loop.create_task(answer(query, problem, begun))
             self._tasks.add(task)
             task.add_done_callback(partial(self._answered, counted))
 
@@ -225,10 +222,14 @@ class Calls:
             self._asked_bytes -= counted
 
 
+def _payload(query: zenoh.Query) -> bytes:
+    return copied(query.payload) if query.payload is not None else b""
+
+
 def _tried(first: Callable[[str, bytes], None], query: zenoh.Query) -> Refused | None:
     """Why what had to be done at once was not."""
     try:
-        first(str(query.key_expr), copied(query.payload) if query.payload is not None else b"")
+        first(str(query.key_expr), _payload(query))
     except Refused as refusal:
         return refusal
     except MacsError as error:

@@ -439,15 +439,16 @@ class Mesh:
         first: Callable[[str, bytes], None] | None = None,
         gate: Admits | None = None,
         most_bytes: int | None = None,
+        in_order: bool = False,
     ) -> Subscription:
         """Answer queries on ``key`` with ``await handler(key, payload)``; raise Refused in it to refuse. What brings
         more than ``most_bytes`` is refused unread.
-
         With ``stand_in`` it is asked only where nobody else serves the key. ``first`` is called at once with every
         query, in a thread of Zenoh's; unless it raises Refused, the answer is the handler's, on the loop. What the
-        ``gate`` does not admit has no answer.
+        ``gate`` does not admit has no answer. A handler ``in_order`` is no coroutine: it is called before anybody does
+        anything about later queries, raises nothing, and returns what is awaited.
         """
-        return self._calls.serve(key, handler, stand_in=stand_in, first=first, gate=gate, most_bytes=most_bytes)
+        return self._calls.serve(key, handler, stand_in, first, gate, most_bytes, in_order)
 
     def answer_pings(self) -> Subscription:
         """Let `macs doctor` measure the way to this program, and learn its clock and version."""

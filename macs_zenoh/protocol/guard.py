@@ -22,7 +22,7 @@ from .agent_id import AgentId
 from .command_clock import CommandClocks
 from .credit import Credit
 from .halts import halts
-from .keyexpr import GROUP, UNICAST, sender_of, type_number
+from .keyexpr import CALLS, GROUP, UNICAST, sender_of, type_number
 from .messages import ROS, Metadata, NodeType
 from .reading import Message, Reader
 from .wire import Layout
@@ -40,6 +40,11 @@ AGED_S = 0.01
 SINGLE_BYTES = 2048
 RUN_BYTES = 384
 """What is larger than a usual message costs as much as many small ones: a sample may hold several frames."""
+
+
+BLOCKS = 16
+"""Who calls for all agents of a block at once may bring as much as so many of them, before it is looked whose calls
+they are: each of these has its own credit."""
 
 
 class Allowances:
@@ -297,6 +302,7 @@ class Guard:
         self._urgent = Allowances(limits.commands_per_s)
         self._requests = Allowances(limits.requests_per_s)
         self._rescued = Allowances(limits.commands_per_s)
+        self._together = Allowances(BLOCKS * limits.requests_per_s)
         self._ages = Ages()
         self._fresh = Fresh(limits.max_command_age_s)
         self.clocks = CommandClocks(limits.max_timed_command_age_s)
@@ -321,7 +327,8 @@ class Guard:
         """Whether a sample may be looked at."""
         sender = sender_of(key)
         with self._counting:
-            admitted = (self._urgent if urgent else self._requests).take(sender, size, now)
+            requests = self._together if key.startswith(CALLS_KEYS) else self._requests
+            admitted = (self._urgent if urgent else requests).take(sender, size, now)
         if admitted:
             return True
         self.on_dropped("flooded", sender, FLOODED)
@@ -448,7 +455,7 @@ def _aged(message: Message, age_s: float, at_most_s: float) -> Message:
     return message._replace(age_s=age_s, at_most_s=at_most_s)
 
 
-INBOX_KEYS, GROUP_KEYS = UNICAST.prefix, GROUP.prefix
+INBOX_KEYS, GROUP_KEYS, CALLS_KEYS = UNICAST.prefix, GROUP.prefix, CALLS.prefix
 
 
 def presses(data: bytes) -> bool:

@@ -86,6 +86,16 @@ class CallFields(NamedTuple):
         return self.from_type, self.from_id
 
 
+class CallsFields(NamedTuple):
+    """Of a key of `CALLS`."""
+
+    type: int
+    id: int
+    verb: str
+    from_type: int
+    from_block: int
+
+
 class NameFields(NamedTuple):
     """Of a key of `NAME`."""
 
@@ -153,6 +163,7 @@ Fields = (
     | PresenceFields
     | LeaseFields
     | CallFields
+    | CallsFields
     | NameFields
     | WantedFields
     | NamedFields

@@ -17,6 +17,7 @@ from ..errors import UsageError
 from .key_fields import (
     BroadcastFields,
     CallFields,
+    CallsFields,
     Fields,
     GroupFields,
     LastFields,
@@ -56,6 +57,7 @@ _RANGES = {
     "from_id": (0, 0xFFFF),
     "group": (0, 255),
     "block": (0, 255),
+    "from_block": (0, 255),
 }
 _SAFE = "".join({chr(c) for c in range(32, 127)} - set("/*$?#%"))
 
@@ -374,6 +376,13 @@ CALL = Key(
     subscriber="the agent that is called (queryable)",
     payload="one frame; the reply is one message",
 )
+CALLS = Key(
+    "macs/calls/{type}/{id}/{verb}/{from_type}/block/{from_block}",
+    CallsFields,
+    publisher="who calls for several agents of one block at once, as its gateway may (query)",
+    subscriber="the agent that is called (queryable)",
+    payload="such calls as frames back to back, each with its caller; the reply is a JSON list: what came of each",
+)
 
 NAME = Key(
     "macs/name/{name}/{type}/{id}/{zid}",
@@ -434,6 +443,7 @@ KEYS: dict[str, Key[Fields]] = {
     "presence": PRESENCE,
     "lease": LEASE,
     "call": CALL,
+    "calls": CALLS,
     "name": NAME,
     "wanted": WANTED,
     "named": NAMED,

@@ -22,6 +22,7 @@ from macs_zenoh.config import MeshSettings
 from macs_zenoh.protocol.keyexpr import (
     BROADCAST,
     CALL,
+    CALLS,
     GROUP,
     LAST,
     LEASE,
@@ -135,6 +136,7 @@ class Rights:
         yield from _each(GROUP, groups, me)
         yield from _each(BROADCAST, me)
         yield from _each(CALL, agents, verbs, me)
+        yield from _each(CALLS, agents, verbs, [{"from_type": UNITY, "from_block": block} for block in range(4)])
         yield from _each(PRESENCE, own, [{"group": 0}, {"group": 3}], [zid])
         yield from _each(LEASE, [{"block": block} for block in range(5)], [zid])
         yield from (PING.of(**zid), f"{router('a' * 32)}/linkstate/routers")

@@ -8,7 +8,7 @@ import pytest
 
 from macs_zenoh.protocol.keyexpr import KEYS
 
-NUMBERS = {"type", "from_type", "id", "from_id", "group", "block"}
+NUMBERS = {"type", "from_type", "id", "from_id", "group", "block", "from_block"}
 
 
 @pytest.mark.parametrize("space_name", KEYS)

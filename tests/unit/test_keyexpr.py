@@ -44,6 +44,7 @@ NUMBERS: dict[str, st.SearchStrategy[int | str]] = {
     "from_id": st.integers(1, 0xFFFF),
     "group": st.integers(0, 255),
     "block": st.integers(0, 255),
+    "from_block": st.integers(0, 255),
 }
 """Fields that are numbers; all others are text."""
 
