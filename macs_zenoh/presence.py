@@ -124,14 +124,15 @@ class Presence:
         """Be online under this id, until the token is closed. Subscribe the inbox before: who is seen is sent to.
 
         ``epoch`` is another one than that of who had the id in this session before, ``asleep`` for each time that its
-        connection has ended. ``gather``: together with others that come within moments, or with `declare_now`.
+        connection has ended. ``gather``: when it is its turn among many that come within moments, or with
+        `declare_now`.
         """
         key = AgentInfo(agent_type, agent_id, group, self._mesh.zid, epoch, asleep).presence
         return self._gathered.declare(key) if gather else self._mesh.declare_token(key)
 
-    def declare_now(self) -> None:
-        """Let all be online whose tokens are being gathered."""
-        self._gathered.declare_now()
+    def declare_now(self, token: Token) -> None:
+        """Let the agent with this token be online before its turn."""
+        self._gathered.declare_now(token)
 
     def elsewhere(self, agent_type: int) -> list[AgentInfo]:
         """The online agents of a type whose token is not only ours."""

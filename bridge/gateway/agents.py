@@ -78,6 +78,10 @@ class Agents:
         self._by_id[agent_id] = connection
         connection.peer.renumber(agent_id)
 
+    def presence(self, connection: Connection) -> Token | None:
+        """Of an online agent."""
+        return self._tokens.get(connection)
+
     def replace_token(self, connection: Connection, token: Token) -> Token:
         """The presence of an online agent is ``token`` now. Returns the one before, for the caller to close."""
         before, self._tokens[connection] = self._tokens[connection], token

@@ -50,14 +50,16 @@ class Groups:
         loop = asyncio.get_running_loop()
         connection.grouped_at = loop.time()
         if before is not None:
+            self.show(connection)
             loop.call_later(OVERLAP_S, before.close)
         self._delivery.forget()
         self._roll.changed()
 
     def show(self, connection: Connection) -> None:
-        """What an agent says comes behind its presence, however many have just come with it."""
+        """What an agent says comes behind its presence, however many have come just before it."""
         connection.unseen = False
-        self._presence.declare_now()
+        if (token := self._agents.presence(connection)) is not None:
+            self._presence.declare_now(token)
 
     def change(self, connection: Connection) -> None:
         """An agent is in another group. Of many changes others see the first at once, and then the last."""

@@ -56,7 +56,7 @@ async def test_who_is_gone_before_is_never_declared(monkeypatch: pytest.MonkeyPa
     first = tokens.declare("a")
     tokens.declare("b").close()
     second = tokens.declare("b")
-    tokens.declare_now()
+    tokens.declare_now(second)
     assert zenoh.now == ["a", "b"]
     second.close()
     first.close()
@@ -78,10 +78,35 @@ async def test_one_that_cannot_be_declared_costs_itself(
 
     tokens = GatheredTokens(declare)
     kept = [tokens.declare(key) for key in "abc"]
-    tokens.declare_now()
+    for token in kept:
+        tokens.declare_now(token)
     assert zenoh.now == ["a", "c"]
     assert "b cannot be declared" in caplog.text
     for token in kept:
         token.close()
     assert zenoh.now == []
+    tokens.close()
+
+
+async def test_of_many_only_some_are_declared_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A router takes its time for each, and commands wait behind them. Who says something is there before its turn,
+    who has gone takes nobody's."""
+    zenoh = Declared()
+    tokens = GatheredTokens(zenoh.declare)
+    keys = [str(number) for number in range(30)]
+    kept = dict(zip(keys, [tokens.declare(key) for key in keys], strict=True))
+    tokens.declare_now(kept["20"])
+    assert zenoh.now == ["0", "20"]
+    for key in keys[1:4]:
+        kept.pop(key).close()
+    sizes = {len(zenoh.now)}
+
+    def all_there() -> bool:
+        sizes.add(len(zenoh.now))
+        return sizes >= {27}
+
+    await until(all_there, every_s=0.001)
+    assert sizes <= {2, *range(2, 27, gathered.AT_ONCE), 27}
+    assert zenoh.now == ["0", "20", *keys[4:20], *keys[21:]]
+    assert not len(tokens)
     tokens.close()
