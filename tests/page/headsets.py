@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from rclpy.qos import qos_profile_sensor_data
@@ -22,7 +22,11 @@ from tests.page.conftest import Act, Gate, Site
 from tests.page.driving import Heard
 from tests.page.polls import until
 from tests.support.browser import ROOT, SCREENSHOTS, SLOWER, Watched, opened
+from tests.support.devtools import LonePage
 from tests.support.ros_peer import Peer
+
+if TYPE_CHECKING:
+    from playwright.async_api import Page
 
 IWER = ROOT / "build" / "npm" / "node_modules" / "iwer" / "build" / "iwer.min.js"
 needs_headset = pytest.mark.skipif(not IWER.is_file(), reason="the WebXR emulator is missing: make page")
@@ -98,9 +102,10 @@ PLACE = """([name, [x, y, z], q]) => {
 class Headset:
     """One of them, at a page."""
 
-    def __init__(self, watched: Watched) -> None:
+    def __init__(self, page: Page | LonePage, watched: Watched | None = None) -> None:
+        self.page = page
         self.watched = watched
-        self.page = watched.page
+        """Whoever takes note of what goes wrong in it."""
 
     async def value(self, script: str, argument: Any = None) -> Any:
         """What JavaScript gives in the page."""
@@ -207,17 +212,19 @@ async def headset_at(
     """A headset that has opened the scene, with these settings, and of this size, `UNDRAWN` for who looks at no pixel;
     ``wanted``: where a token is; ``rate``: how often it has a frame, empty for as often as the browser can."""
     context = await (await site.chromium()).new_context(viewport={"width": 640, "height": 420})
-    await context.add_init_script(path=IWER)
-    for script in (size, rate):
-        await context.add_init_script(script=f"{{{script}}}")
-    kept = json.dumps(json.dumps({**PATIENT, **(settings or {})}))
-    await context.add_init_script(
-        script=f"{DEVICE}\nlocalStorage.getItem('macs.xr') ?? localStorage.setItem('macs.xr', {kept})"
-    )
+    for script in scripts(settings, size=size, rate=rate):
+        await context.add_init_script(script=script)
     url = site.url if isinstance(site, Site) else site.url_of(wanted=wanted)
     watched = await opened(context, f"{url}xr")
     site.pages.append(watched)
-    return Headset(watched)
+    return Headset(watched.page, watched)
+
+
+def scripts(settings: dict[str, Any] | None = None, *, size: str = SMALL, rate: str = SLOWER) -> list[str]:
+    """What runs in a page before its own scripts, for a headset as `headset_at` has it."""
+    kept = json.dumps(json.dumps({**PATIENT, **(settings or {})}))
+    first = f"localStorage.getItem('macs.xr') ?? localStorage.setItem('macs.xr', {kept})"
+    return [IWER.read_text(encoding="utf-8"), f"{{{size}}}", f"{{{rate}}}", f"{DEVICE}\n{first}"]
 
 
 def by_grip(headset: Headset) -> tuple[Act, Act]:

@@ -5,6 +5,11 @@ each, in a process that stands back for all others, so that what a headset has g
 nothing. All else is as it is there: main thread and workers, the decoding and uploading of pictures of full size,
 sockets, gateway, robot and ROS. What such hardware would add is not in the figures.
 
+Nobody watches the browser meanwhile. Playwright would have each message of a WebSocket told to it as JSON: beside raw
+pictures that took half a core and doubled what was measured. So this Chromium is asked by DevTools alone, and is
+asked nothing while it is measured (`tests.support.devtools`). Nor are messages taken in the process of the test: a
+node of its own does that.
+
 On a shared machine no time decides a test, but what is measured has to have come."""
 
 from __future__ import annotations
@@ -12,7 +17,6 @@ from __future__ import annotations
 import asyncio
 import base64
 import itertools
-import json
 import os
 import statistics
 import sys
@@ -25,21 +29,34 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from geometry_msgs.msg import PoseStamped, TwistStamped
-
 from tests.page.conftest import Site
-from tests.page.headsets import PATIENT_ROBOT, UNDRAWN, Headset, headset_at, needs_headset
+from tests.page.headsets import PATIENT_ROBOT, UNDRAWN, Headset, needs_headset, scripts
 from tests.page.polls import until
 from tests.support.browser import needs_browser
+from tests.support.devtools import LonePage, lone_page
 from tests.support.processes import Process
-from tests.support.ros_peer import Peer
 
 pytestmark = [needs_browser, needs_headset, pytest.mark.alone, pytest.mark.soak, pytest.mark.timeout(280)]
 RULES = PATIENT_ROBOT
 """The robot is patient."""
 
 MEASURED_S = 8.0
-DRIVEN = "/test/drive"
+TRACED_S = 5.0
+SETTLED_S = 3.0
+"""What is done for the first time takes longer: programs for the graphics are made, and JavaScript is compiled."""
+NAMES = ("bridge.cli.demo_robot", "tests.page.camera", "tests.page.lateness", "gateway", "agent", "router")
+"""Words by which programs of the site are told apart."""
+DRIVEN, HEAD = "/test/drive", "/xr/head"
+HOLD_ON = """(() => {
+  const grip = (value) => device.controllers.right.updateButtonValue('squeeze', value);
+  window.holding = setInterval(() => {
+    if (macsXr.telling.state.held) return;
+    grip(0);
+    setTimeout(() => grip(1), 60);
+  }, 300);
+})()"""
+"""Hold the grip, anew where a busy machine let the scene stand still."""
+LET_GO = "(() => { clearInterval(holding); device.controllers.right.updateButtonValue('squeeze', 0) })()"
 CLOCK = "(() => { const now = performance.timeOrigin + performance.now(); return Date.now() - now })()"
 JPEG = """async ([shade]) => {
   const canvas = new OffscreenCanvas(640, 480);
@@ -69,18 +86,21 @@ def told(name: str, values: Sequence[float], unit: str = "ms") -> str:
     )
 
 
-class Late:
-    """How late messages with a stamp are that a ROS node gets."""
+class Late(Process):
+    """How late messages with a stamp are that a ROS node gets, and that its middleware has before it."""
 
-    def __init__(self) -> None:
-        self.ms: list[float] = []
+    def __init__(self, site: Site) -> None:
+        topics = (f"{DRIVEN}=TwistStamped", f"{HEAD}=PoseStamped")
+        super().__init__(sys.executable, "-m", "tests.page.lateness", *topics, env=ros(site))
+        self.ms: dict[str, list[tuple[float, float]]] = {DRIVEN: [], HEAD: []}
 
-    async def listen(self, peer: Peer, kind: type[Any], topic: str) -> None:
-        def take(message: Any) -> None:
-            stamp = message.header.stamp
-            self.ms.append(time.time() * 1000 - (stamp.sec * 1000 + stamp.nanosec / 1e6))
-
-        await peer.session.run(lambda: peer.session.node.create_subscription(kind, topic, take, 1000))
+    def _heard(self, line: str, *, is_log: bool) -> bool:
+        topic, *ages = line.split(" ")
+        if topic not in self.ms:
+            return super()._heard(line, is_log=is_log)
+        node_ms, middleware_ms = map(float, ages)
+        self.ms[topic].append((node_ms, middleware_ms))
+        return False
 
 
 async def pictures(headset: Headset, folder: Path) -> None:
@@ -89,65 +109,106 @@ async def pictures(headset: Headset, folder: Path) -> None:
         (folder / f"{shade}.jpg").write_bytes(base64.b64decode(await headset.value(JPEG, [40 * shade])))
 
 
-async def measured(late: Late) -> list[float]:
-    await until(lambda: len(late.ms) > 20)
-    late.ms.clear()
+async def measured(late: Late, topic: str, what: str) -> list[str]:
+    """Of a topic what comes for a while, in words."""
+    ages = late.ms[topic]
+    await until(lambda: len(ages) > 20)
+    await asyncio.sleep(SETTLED_S)
+    ages.clear()
+    load = Load()
     await asyncio.sleep(MEASURED_S)
-    return list(late.ms)
+    taken = list(ages)
+    assert len(taken) > 20
+    node, middleware = zip(*taken, strict=True)
+    return [told(f"{what} to a ROS node", node), told("  to its middleware", middleware), load.told()]
+
+
+class Load:
+    """What programs took of the processor since it was made."""
+
+    def __init__(self) -> None:
+        self._before = self._taken()
+        self._began = time.monotonic()
+
+    def told(self) -> str:
+        """In words, those that took most first."""
+        took_s = time.monotonic() - self._began
+        all_s = {name: s - self._before.get(name, 0.0) for name, s in self._taken().items()}
+        most = sorted(all_s.items(), key=lambda each: -each[1])[:9]
+        shares = ", ".join(f"{name} {s / took_s:.2f}" for name, s in most)
+        return f"  cores taken: {sum(all_s.values()) / took_s:.2f} ({shares})"
+
+    @staticmethod
+    def _taken() -> dict[str, float]:
+        """Program → seconds."""
+        found: dict[str, float] = {}
+        for pid in of_mine():
+            if not (fields := stat(Path(f"/proc/{pid}/stat"))):
+                continue
+            # Chromium's have theirs as one word
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").replace("\0", " ").split()
+            if not words:
+                continue  # it has just ended
+            kind = next((word[7:] for word in words if word.startswith("--type=")), "")
+            name = kind or next((each for each in NAMES if each in words), Path(words[0]).name)
+            found[name] = found.get(name, 0.0) + (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return found
 
 
 def camera(site: Site, folder: Path, hz: float, raw_hz: float) -> Process:
-    environment = {"ROS_DOMAIN_ID": str(site.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     words = ("-m", "tests.page.camera", str(folder), str(hz), str(raw_hz))
-    return Process(sys.executable, *words, env=environment)
+    return Process(sys.executable, *words, env=ros(site))
+
+
+def ros(site: Site) -> dict[str, str]:
+    """For a program of the site's ROS domain."""
+    return {"ROS_DOMAIN_ID": str(site.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
 async def test_how_late_and_how_dear(site: Site, tmp_path: Path) -> None:
     """Commands and poses to a ROS node, alone and beside raw pictures that fill the other socket; pictures of two
     cameras from their stamp to the scene; the main thread's work per frame, as Chromium traces it."""
-    peer, drives, poses = Peer(site.domain), Late(), Late()
     lines = [f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"]
-    settings = {"head": "/xr/head", "poseHz": 90, "hz": 30, "driveTopic": DRIVEN, "cameras": []}
-    try:
-        await drives.listen(peer, TwistStamped, DRIVEN)
-        await poses.listen(peer, PoseStamped, "/xr/head")
-        headset = await headset_at(site, settings=settings, size=UNDRAWN, rate="")
-        await headset.ready(pictures=False)
-        await pictures(headset, tmp_path)
-        await headset.enter()
-        await headset.page.set_viewport_size({"width": 160, "height": 120})  # the page around it is not drawn in XR
+    settings = {"head": HEAD, "poseHz": 90, "hz": 30, "driveTopic": DRIVEN, "cameras": []}
+    async with Late(site) as late, lone_page(tmp_path / "browser", width=160, height=120) as page:
+        headset = Headset(page)
+        async with page.watched():
+            await page.open(f"{site.url}xr", *scripts(settings, size=UNDRAWN, rate=""))
+            await headset.ready(pictures=False)
+            await pictures(headset, tmp_path)
+            await headset.enter()
+            await headset.stick("right", 0, -1)
         stand_back()
-        offset = float(await headset.value(CLOCK))
-        await headset.stick("right", 0, -1)
-        holding = asyncio.create_task(hold_on(headset))
-        commands = await measured(drives)
-        holding.cancel()
-        await asyncio.gather(holding, return_exceptions=True)
-        lines.append(told("command, browser to ROS node", commands))
-        await headset.squeeze("right", held=False)
-        lines.append(told("pose, browser to ROS node", await measured(poses)))
+        await page.evaluate(HOLD_ON)
+        lines += await measured(late, DRIVEN, "command, from a browser")
+        await page.evaluate(LET_GO)
+        lines += await measured(late, HEAD, "pose, from a browser")
         async with camera(site, tmp_path, 0, 30):
             await show(headset, ["/test/raw"])
-            beside = await measured(poses)
-            raw_hz = await headset.value("[...macsXr.links.rates.values()].find(each => each.key.includes('raw')).hz")
-            lines.append(told(f"pose beside {raw_hz:.0f} raw pictures of 0.9 MB a second", beside))
+            beside = await measured(late, HEAD, "pose beside raw pictures of 0.9 MB,")
+            raw_hz = await page.evaluate("[...macsXr.links.rates.values()].find(each => each.key.includes('raw')).hz")
+            lines += [*beside, f"  {raw_hz:.0f} of these pictures a second"]
         async with camera(site, tmp_path, 30, 0):
             await show(headset, ["/test/jpeg", "/test/jpeg2"])
-            lines += await with_two_cameras(site, headset, offset, tmp_path)
-    finally:
-        peer.session.close()
+            lines += await with_two_cameras(page)
+        assert await page.evaluate("problems") == []
     print("\n".join(["", *lines]))
 
 
-def stand_back() -> None:
-    """Let the process that draws run when nothing else wants to; Chromium begins it with more right than others."""
+def of_mine() -> set[int]:
+    """This process, and all that it has started."""
     mine = {os.getpid()}
     parents = {
         int(path.parent.name): int(fields[1]) for path in Path("/proc").glob("[0-9]*/stat") if (fields := stat(path))
     }
     while more := {pid for pid, parent in parents.items() if parent in mine} - mine:
         mine |= more
-    drawing = [pid for pid in mine if b"--type=gpu-process" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    return mine
+
+
+def stand_back() -> None:
+    """Let the process that draws run when nothing else wants to; Chromium begins it with more right than others."""
+    drawing = [pid for pid in of_mine() if b"--type=gpu-process" in Path(f"/proc/{pid}/cmdline").read_bytes()]
     assert drawing
     for thread in Path(f"/proc/{drawing[0]}/task").iterdir():
         os.sched_setscheduler(int(thread.name), os.SCHED_IDLE, os.sched_param(0))
@@ -161,17 +222,6 @@ def stat(path: Path) -> list[str]:
         return []
 
 
-async def hold_on(headset: Headset) -> None:
-    """Hold the grip, anew where a busy machine let the scene stand still."""
-    while True:
-        held = await headset.state("held")
-        if not held:
-            await headset.squeeze("right", held=False)
-            await headset.frame()
-            await headset.squeeze("right", held=True)
-        await asyncio.sleep(0.3)
-
-
 async def show(headset: Headset, topics: list[str]) -> None:
     """Choose cameras, and wait for their pictures."""
     await headset.value("(topics) => macsXr.settings.set('cameras', topics)", topics)
@@ -179,16 +229,15 @@ async def show(headset: Headset, topics: list[str]) -> None:
     await until(lambda: headset.value(enough))
 
 
-async def with_two_cameras(site: Site, headset: Headset, offset: float, folder: Path) -> list[str]:
-    await headset.value("macsXr.links.pictureMs.length = 0; macsXr.frameMs.length = 0")
-    trace = folder / "trace.json"
-    browser = await site.chromium()
-    await browser.start_tracing(page=headset.page, path=trace, categories=["toplevel", "devtools.timeline"])
-    await asyncio.sleep(4)
-    await browser.stop_tracing()
-    ages = json.loads(await headset.value("JSON.stringify(macsXr.links.pictureMs)"))
-    frames = json.loads(await headset.value("JSON.stringify(macsXr.frameMs)"))
-    wall, cpu = work_per_frame(json.loads(trace.read_text()))
+async def with_two_cameras(page: LonePage) -> list[str]:
+    await page.evaluate("(() => { macsXr.links.pictureMs.length = macsXr.frameMs.length = 0 })()")
+    offset = float(await page.evaluate(CLOCK))
+    load = Load()
+    trace = await page.devtools.trace(["toplevel", "devtools.timeline"], TRACED_S)
+    taken = load.told()
+    ages = await page.evaluate("macsXr.links.pictureMs")
+    frames = await page.evaluate("macsXr.frameMs")
+    wall, cpu = work_per_frame(trace)
     assert len(ages) > 20
     assert len(wall) > 20
     return [
@@ -199,12 +248,12 @@ async def with_two_cameras(site: Site, headset: Headset, offset: float, folder: 
         told("main thread per frame, traced, on the clock", wall),
         told("main thread per frame, traced, of its processor", cpu),
         told("scene's own part of a frame, on the clock", frames),
+        taken,
     ]
 
 
-def work_per_frame(trace: dict[str, Any]) -> tuple[list[float], list[float]]:
+def work_per_frame(events: list[dict[str, Any]]) -> tuple[list[float], list[float]]:
     """Of each frame the sum of the main thread's tasks, by the clock and by its processor, in ms."""
-    events = trace["traceEvents"]
     names = {(each["pid"], each["tid"]): each["args"]["name"] for each in events if each.get("name") == "thread_name"}
     fired = [each for each in events if each.get("name") == "FireAnimationFrame"]
     assert fired, "no frame was traced"
