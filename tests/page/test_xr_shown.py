@@ -12,7 +12,7 @@ needs_three = pytest.mark.skipif(not THREE.is_file(), reason="three.js is missin
 
 
 @needs_node
-@pytest.mark.parametrize("part", ["sizes", "aged", "named"])
+@pytest.mark.parametrize("part", ["sizes", "aged", "named", "pixels", "room"])
 def test_what_holds(part: str) -> None:
     """Each check of this part of `xr_shown.mjs`."""
     assert ran("xr_shown.mjs", {"part": part}) == {"held": part}
@@ -20,7 +20,7 @@ def test_what_holds(part: str) -> None:
 
 @needs_node
 @needs_three
-@pytest.mark.parametrize("part", ["eyes", "map", "told"])
+@pytest.mark.parametrize("part", ["eyes", "bytes", "map", "told"])
 def test_what_is_drawn(part: str) -> None:
     """The same, of parts that draw."""
     assert ran("xr_shown.mjs", {"part": part}) == {"held": part}

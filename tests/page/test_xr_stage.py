@@ -24,8 +24,33 @@ FILL = """async ([topic, width, height, colours]) => {
     context.fillRect((at * width) / colours.length, 0, width / colours.length, height);
   });
   const screen = macsXr.room.screens.get(topic);
-  screen.show(await createImageBitmap(canvas, { imageOrientation: 'flipY' }));
+  screen.show(await createImageBitmap(canvas));
   screen.say({ figures: '', tone: 'good', veil: '' });
+}"""
+READ = """async (kind) => {
+  const { Pictures } = await import('/xr/pictures.js');
+  const [width, height] = [640, 480];
+  const context = new OffscreenCanvas(width, height).getContext('2d');
+  for (const [colour, y] of [['#c03030', 0], ['#3030c0', height / 2]]) {
+    context.fillStyle = colour;
+    context.fillRect(0, y, width, height / 2);
+  }
+  let message;
+  if (kind === 'rgb8') {
+    const { data: all } = context.getImageData(0, 0, width, height);
+    const data = all.filter((_, at) => at % 4 < 3);
+    message = { width, height, step: 3 * width, encoding: kind, data, is_bigendian: 0 };
+  } else {
+    const file = await context.canvas.convertToBlob({ type: kind });
+    message = { data: new Uint8Array(await file.arrayBuffer()) };
+  }
+  const given = await new Pictures().read(message, kind !== 'rgb8');
+  macsXr.telling.tell = macsXr.telling.tick = () => {};
+  macsXr.room.setPanels(['/one']);
+  const screen = macsXr.room.screens.get('/one');
+  screen.show(given.bitmap ?? { ...given, close() {} });
+  screen.say({ figures: '', tone: 'good', veil: '' });
+  return given.bitmap ? 'bitmap' : 'bytes';
 }"""
 STEREO = "device.stereoEnabled = true"
 AIM = """([hand, [x, y, z], [tx, ty, tz]]) => {
@@ -64,6 +89,16 @@ async def test_each_eye_has_its_half_of_a_wide_picture(gate: Gate) -> None:
     assert like(await headset.pixels(0.25, 0.45), red)
     assert like(await headset.pixels(0.75, 0.45), blue)
     await headset.shot("stereo")
+
+
+async def test_pictures_are_upright_and_have_their_colours(gate: Gate) -> None:
+    """A JPEG file and a raw picture as bytes, a PNG file as a bitmap: the upper half is above, in its colour."""
+    headset = await headset_at(gate)
+    await until(lambda: headset.value("Boolean(window.macsXr)"))
+    for kind, way in (("image/jpeg", "bytes"), ("image/png", "bitmap"), ("rgb8", "bytes")):
+        assert await headset.value(READ, kind) == way, kind
+        assert like(await headset.pixels(0.5, 0.27, 16), (0xC0, 0x30, 0x30)), kind
+        assert like(await headset.pixels(0.5, 0.45, 16), (0x30, 0x30, 0xC0)), kind
 
 
 async def test_its_screen_can_be_used_by_all(gate: Gate) -> None:

@@ -105,6 +105,55 @@ const parts = {
     assert.deepEqual([last.texture, larger.closed], [1, 1]);
   },
 
+  async pixels() {
+    const { decoded } = await load("page/pixels.js");
+    const data = Uint8Array.from({ length: 24 }, (_, at) => 10 * at);
+    const read = (encoding, step) => [...decoded({ width: 2, height: 2, step, encoding, data })];
+    assert.deepEqual(read("rgb8", 8), [0, 10, 20, 255, 30, 40, 50, 255, 80, 90, 100, 255, 110, 120, 130, 255]);
+    assert.deepEqual(read("bgr8", 8), [20, 10, 0, 255, 50, 40, 30, 255, 100, 90, 80, 255, 130, 120, 110, 255]);
+    assert.deepEqual(read("rgba8", 10), [0, 10, 20, 30, 40, 50, 60, 70, 100, 110, 120, 130, 140, 150, 160, 170]);
+    assert.deepEqual(read("bgra8", 10), [20, 10, 0, 30, 60, 50, 40, 70, 120, 110, 100, 130, 160, 150, 140, 170]);
+    assert.deepEqual(read("mono8", 5), [0, 0, 0, 255, 10, 10, 10, 255, 50, 50, 50, 255, 60, 60, 60, 255]);
+    assert.throws(() => read("rgb8", 5), /rows are shorter/);
+    assert.throws(() => read("rgb8", 13), /shorter than it says/);
+  },
+
+  async room() {
+    const { Pictures } = await load("xr/pictures.js");
+    const pictures = new Pictures();
+    const raw = (width, height) => ({ width, height, step: 3 * width, encoding: "rgb8", data: new Uint8Array(3 * width * height).fill(7) });
+    const first = await pictures.read(raw(4, 3), false);
+    assert.deepEqual([first.width, first.height, ...first.data.subarray(0, 4)], [4, 3, 7, 7, 7, 255]);
+    const second = await pictures.read(raw(4, 3), false);
+    assert.notEqual(second.data.buffer, first.data.buffer);
+    pictures.back([first.data.buffer]);
+    const larger = await pictures.read(raw(8, 3), false);
+    assert.equal(larger.data.length, 96);
+    assert.equal((await pictures.read(raw(4, 3), false)).data.buffer, first.data.buffer, "its room is used again");
+    pictures.back(Array.from({ length: 9 }, () => new ArrayBuffer(48)));
+    const rooms = new Set();
+    for (let at = 0; at < 9; at++) rooms.add((await pictures.read(raw(4, 3), false)).data.buffer);
+    assert.equal(rooms.size, 9, "each is used once");
+    await assert.rejects(pictures.read(raw(0, 3), false), /no picture/);
+  },
+
+  async bytes() {
+    drawn();
+    const { Screen } = await load("xr/screen.js");
+    const screen = new Screen("/left", { topic: "/left" });
+    const bytes = () => ({ ...picture(), data: new Uint8Array(48) });
+    const [first, second, bitmap] = [bytes(), bytes(), picture()];
+    screen.show(first);
+    const texture = screen.material.map;
+    assert.ok(texture.isDataTexture);
+    screen.show(second);
+    assert.equal(screen.material.map, texture, "the same texture has the next one");
+    assert.deepEqual([first.closed, second.closed], [1, 0]);
+    screen.show(bitmap);
+    assert.ok(!screen.material.map.isDataTexture);
+    assert.deepEqual([second.closed, bitmap.closed], [1, 0]);
+  },
+
   async map() {
     globalThis.navigator ??= {};
     const { Model } = await load("xr/model.js");

@@ -9,10 +9,23 @@ const NOTHING = { all: false, wanted: [], known: [] };
 const ON_ITS_WAY = "the stop is on its way";
 const UNHEARD = "THE STOP HAS NOT GONE OUT: what sends it does not answer. Stop the robot itself, and load this page anew";
 
+/** A picture as bytes, for a texture: its room is given back when another one has taken its place. */
+class Pixels {
+  constructor({ data, width, height }, spare) {
+    Object.assign(this, { data, width, height, spare });
+  }
+
+  close() {
+    this.spare.push(this.data.buffer);
+  }
+}
+
 export class Links extends EventTarget {
   #pictures = new Map();
   /** key → {at, stamp} of pictures that panels have, and of which it is not known that they were drawn. */
   #given = new Map();
+  /** Room of pictures that are shown no more. */
+  #spare = [];
   /** How many times the stop was pressed, and of how many of these the worker has heard. */
   #presses = 0;
   #heard = 0;
@@ -104,20 +117,21 @@ export class Links extends EventTarget {
   showPictures(room, wishes, frameS) {
     const panelOf = (key) => wishes.find((each) => each.key === key)?.panel;
     for (const key of shownNow([...this.#pictures.keys()].map((each) => [each, panelOf(each)]), frameS)) {
-      const { bitmap, at, stamp } = this.#pictures.get(key);
+      const { image, at, stamp } = this.#pictures.get(key);
       this.#pictures.delete(key);
       this.#given.set(key, { at, stamp });
       const wish = wishes.find((each) => each.key === key);
       const screen = wish && room.screens.get(wish.panel);
-      if (screen) screen.show(bitmap, wish.eye);
-      else bitmap.close();
+      if (screen) screen.show(image, wish.eye);
+      else image.close();
     }
   }
 
   /** The pictures that panels were given were drawn: ask for the next ones. */
   acknowledge() {
     for (const [key, { at, stamp }] of this.#given) {
-      this.sight.postMessage({ op: "shown", key });
+      const buffers = this.#spare.splice(0);
+      this.sight.postMessage({ op: "shown", key, buffers }, buffers);
       const now = performance.timeOrigin + performance.now();
       this.pictureMs.push({ key, sinceSocket: now - at, sinceStamp: now - stamp });
       if (this.pictureMs.length > 600) this.pictureMs.splice(0, 300);
@@ -150,8 +164,9 @@ export class Links extends EventTarget {
 
   #see(message) {
     if (message.op === "picture") {
-      this.#pictures.get(message.key)?.bitmap.close();
-      this.#pictures.set(message.key, message);
+      this.#pictures.get(message.key)?.image.close();
+      const { at, stamp, bitmap } = message;
+      this.#pictures.set(message.key, { at, stamp, image: bitmap ?? new Pixels(message, this.#spare) });
     } else if (message.op === "rates") {
       this.sightUp = message;
       this.guards.noteLeast(message.least);

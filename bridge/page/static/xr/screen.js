@@ -1,6 +1,6 @@
 /** A camera's panel: its newest picture, on a bent screen that can be grabbed, with what there is to say of it below. */
 
-import { Group, LinearFilter, Mesh, MeshBasicMaterial, SRGBColorSpace, Texture } from "../vendor/three.js";
+import { DataTexture, Group, LinearFilter, Mesh, MeshBasicMaterial, SRGBColorSpace, Texture } from "../vendor/three.js";
 import { COLOURS } from "./stage.js";
 import { FONT, Sheet, bent, fitted, roundRect, wrapped } from "./surface.js";
 
@@ -40,7 +40,10 @@ export class Screen {
     return this.width / this.ratio;
   }
 
-  /** A new picture, as a bitmap that is this panel's from now on. `eye` is where it goes when each eye has its own topic. */
+  /**
+   * A new picture, a bitmap or {data, width, height, close()}, that is this panel's from now on. `eye` is where it goes when each eye has
+   * its own topic.
+   */
   show(picture, eye = "left") {
     const wide = this.stereo === "side-by-side" || (this.stereo === "auto" && picture.width / picture.height >= STEREO_RATIO);
     const two = this.other || (this.stereo !== "off" && wide);
@@ -113,14 +116,15 @@ export class Screen {
 
   #put(material, picture) {
     let texture = material.map;
-    const other = texture && (texture.image.width !== picture.width || texture.image.height !== picture.height);
-    if (!texture || other) {
+    const before = texture?.image;
+    const same = before && before.width === picture.width && before.height === picture.height && !before.data === !picture.data;
+    if (!same) {
       drop(texture);
-      texture = new Texture();
+      texture = picture.data ? new DataTexture() : new Texture();
       texture.colorSpace = SRGBColorSpace;
       texture.minFilter = texture.magFilter = LinearFilter;
       texture.generateMipmaps = false;
-      texture.flipY = false; // it was turned when it was decoded
+      texture.flipY = false; // the panel is turned, which costs nothing
       material.map = texture;
       material.color.set(0xffffff);
       if (!this.other) {
@@ -129,10 +133,9 @@ export class Screen {
       }
       this.material.needsUpdate = this.rightMaterial.needsUpdate = true;
     }
-    const before = texture.image;
     texture.image = picture;
     texture.needsUpdate = true;
-    before?.close?.();
+    if (same) before.close?.();
   }
 
   #build() {
@@ -143,7 +146,7 @@ export class Screen {
       [this.right, half ? [0.5, 1] : [0, 1], 2],
     ]) {
       mesh.geometry?.dispose();
-      mesh.geometry = bent(width, height, curve, { part });
+      mesh.geometry = bent(width, height, curve, { part, upright: false });
       mesh.layers.set(layer);
     }
     this.right.visible = Boolean(this.two);

@@ -6,14 +6,13 @@
  */
 
 import { Headset } from "../macs.js";
-import { decoded } from "../page/pixels.js";
 import { Rate } from "../page/topics.js";
 import { Types, numberAt } from "../ros.js";
 import { persisted, soon } from "./asking.js";
 import { Frames, cloud, joints, map, poseOf, scan, stampMs } from "./decode.js";
 import { Freshness, WINDOW_MS } from "./freshness.js";
+import { Pictures } from "./pictures.js";
 import { Poke } from "./poke.js";
-import { bounded } from "./sizes.js";
 
 const SILENCE_MS = 3000;
 const RETRY_MS = [50, 100, 200, 500, 1000];
@@ -23,7 +22,6 @@ const OTHERS_MS = 33;
 const VALUE_LINES = 8;
 /** Of so many pictures it is known how late they come. */
 const LEASTS = 64;
-const BITMAP = { imageOrientation: "flipY", premultiplyAlpha: "none", colorSpaceConversion: "none" };
 
 /** One topic of a robot that is received. */
 class Watched {
@@ -56,6 +54,7 @@ export class SightLink {
     this.tell = tell;
     this.commands = commands;
     this.types = new Types("", soon);
+    this.pictures = new Pictures();
     this.points = 20000;
     this.headset = new Headset(url, { silenceMs: SILENCE_MS, retryMs: RETRY_MS });
     this.poking = new Poke(this.headset);
@@ -83,8 +82,9 @@ export class SightLink {
     for (const wish of wanted.values()) this.#begin(new Watched(wish, this.#leastOf(wish.key)));
   }
 
-  /** The scene has shown what it was given. */
-  shown(key) {
+  /** The scene has shown what it was given; of what it has shown before it gives back the room. */
+  shown(key, buffers = []) {
+    this.pictures.back(buffers);
     const one = this.#watched.get(key);
     if (!one) return;
     one.unshown = 0;
@@ -179,27 +179,18 @@ export class SightLink {
     const picture = one.reader.read(message.data);
     const stamp = stampMs(picture);
     const fresh = one.freshness.note(stamp, now);
-    const bitmap = await this.#bitmap(one, picture);
-    if (this.#watched.get(one.key) !== one) return bitmap.close();
+    const { bitmap, data, width, height } = await this.pictures.read(picture, one.type.endsWith("/CompressedImage"));
+    if (this.#watched.get(one.key) !== one) return bitmap?.close();
     if (fresh && one.guards) this.#tellAge(one, now);
     one.unshown += 1;
     const decodedMs = performance.now() - now;
-    this.tell({ op: "picture", key: one.key, bitmap, stamp, at: performance.timeOrigin + now, decodedMs }, [bitmap]);
+    const given = { bitmap, data, width, height };
+    this.tell({ op: "picture", key: one.key, ...given, stamp, at: performance.timeOrigin + now, decodedMs }, [bitmap ?? data.buffer]);
   }
 
   #tellAge(one, now) {
     const at = performance.timeOrigin + now;
     this.commands.postMessage({ key: one.key, at, late: one.freshness.ageMs(now) });
-  }
-
-  async #bitmap(one, picture) {
-    if (one.type.endsWith("/CompressedImage")) {
-      bounded(picture.data);
-      return createImageBitmap(new Blob([picture.data]), BITMAP);
-    }
-    const { width, height, step, encoding, data } = picture;
-    const pixels = decoded({ data, width, height, step, encoding, bigEndian: picture.is_bigendian });
-    return createImageBitmap(new ImageData(pixels, width, height), BITMAP);
   }
 
   async #giveOther(one, message, now) {

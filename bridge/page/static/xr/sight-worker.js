@@ -9,7 +9,7 @@ const ops = {
     link = new SightLink({ url, commands, least, tell: (message, transfer = []) => self.postMessage(message, transfer) });
   },
   watch: ({ wishes }) => link.watch(wishes),
-  shown: ({ key }) => link.shown(key),
+  shown: ({ key, buffers }) => link.shown(key, buffers),
   points: ({ most }) => (link.points = most),
   poke: () => link.poke(),
   drop: () => link.headset.drop(),

@@ -11,7 +11,12 @@ export function sizeOf(bytes) {
   if (bytes.length >= 24 && PNG.every((byte, at) => bytes[at] === byte)) {
     return { width: view.getUint32(16), height: view.getUint32(20) };
   }
-  return bytes.length >= 4 && view.getUint16(0) === 0xffd8 ? jpeg(bytes, view) : null;
+  return isJpeg(bytes) ? jpeg(bytes, view) : null;
+}
+
+/** Whether it begins as a JPEG file. */
+export function isJpeg(bytes) {
+  return bytes.length >= 4 && bytes[0] === 0xff && bytes[1] === 0xd8;
 }
 
 /** Throws Error for a picture that is too large to be shown. */

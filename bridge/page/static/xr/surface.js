@@ -10,9 +10,9 @@ export const FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", 
 /**
  * A rectangle of metres around its middle, bent about a vertical axis in front of it by `curve` (0: flat, 1: most). `whole`
  * is the width by which it is bent, so that a frame and what it frames have one axis. `part` is which part of a texture it
- * shows across, from 0 to 1.
+ * shows across, from 0 to 1; not `upright` is a texture whose first row is the upper one.
  */
-export function bent(width, height, curve, { whole = width, part = [0, 1], at = [0, 0, 0] } = {}) {
+export function bent(width, height, curve, { whole = width, part = [0, 1], at = [0, 0, 0], upright = true } = {}) {
   const geometry = new PlaneGeometry(width, height, COLUMNS, 1);
   const angle = curve * MOST_BEND;
   const { position, uv } = geometry.attributes;
@@ -23,6 +23,7 @@ export function bent(width, height, curve, { whole = width, part = [0, 1], at = 
     position.setX(each, radius ? (radius - at[2]) * Math.sin(x / radius) : x);
     position.setZ(each, radius ? radius - (radius - at[2]) * Math.cos(x / radius) : at[2]);
     uv.setX(each, part[0] + uv.getX(each) * (part[1] - part[0]));
+    if (!upright) uv.setY(each, 1 - uv.getY(each));
   }
   geometry.computeBoundingSphere();
   return geometry;
