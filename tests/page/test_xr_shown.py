@@ -20,7 +20,7 @@ def test_what_holds(part: str) -> None:
 
 @needs_node
 @needs_three
-@pytest.mark.parametrize("part", ["eyes", "bytes", "map", "told"])
+@pytest.mark.parametrize("part", ["eyes", "bytes", "joined", "map", "told"])
 def test_what_is_drawn(part: str) -> None:
     """The same, of parts that draw."""
     assert ran("xr_shown.mjs", {"part": part}) == {"held": part}

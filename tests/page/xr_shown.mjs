@@ -154,6 +154,22 @@ const parts = {
     assert.deepEqual([second.closed, bitmap.closed], [1, 0]);
   },
 
+  async joined() {
+    globalThis.navigator ??= {};
+    const { joined } = await load("xr/joined.js");
+    const { BoxGeometry, Mesh, MeshBasicMaterial } = await load("vendor/three.js");
+    const material = new MeshBasicMaterial();
+    const [one, other] = [new Mesh(new BoxGeometry(1, 1, 1), material), new Mesh(new BoxGeometry(1, 1, 1), material)];
+    other.position.set(10, 0, 0);
+    const found = joined(one, other);
+    assert.equal(found.material, material);
+    const { position, normal } = found.geometry.attributes;
+    assert.deepEqual([position.count, normal.count, found.geometry.index.count], [48, 48, 72]);
+    const xs = (from) => Array.from({ length: 24 }, (_, at) => position.getX(from + at));
+    assert.deepEqual([Math.min(...xs(0)), Math.max(...xs(0)), Math.min(...xs(24)), Math.max(...xs(24))], [-0.5, 0.5, 9.5, 10.5]);
+    assert.equal(Math.min(...found.geometry.index.array.subarray(36)), 24);
+  },
+
   async map() {
     globalThis.navigator ??= {};
     const { Model } = await load("xr/model.js");

@@ -15,6 +15,7 @@ import {
   SphereGeometry,
   TorusGeometry,
 } from "../vendor/three.js";
+import { joined } from "./joined.js";
 
 const JOINTS = 25;
 const RAY_M = 3;
@@ -107,6 +108,6 @@ function controller() {
   ring.rotation.x = Math.PI / 2 - 0.25;
   ring.position.set(0, 0.022, -0.03);
   group.userData.ring = ring;
-  group.add(handle, head, ring);
+  group.add(joined(handle, head), ring);
   return group;
 }

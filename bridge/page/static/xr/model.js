@@ -28,6 +28,7 @@ import {
   TorusGeometry,
 } from "../vendor/three.js";
 import { heading, toScene } from "./axes.js";
+import { joined } from "./joined.js";
 
 export const TABLE = { radius: 0.46, height: 0.86, away: 0.95 };
 const TRAIL_POINTS = 4000;
@@ -315,13 +316,14 @@ function table() {
   const metal = new MeshStandardMaterial({ color: 0x22303f, roughness: 0.5, metalness: 0.3 });
   const foot = new Mesh(new CylinderGeometry(0.05, 0.14, TABLE.height - 0.03, 32), metal);
   foot.position.y = -TABLE.height / 2 - 0.01;
+  const dim = new MeshBasicMaterial({ color: 0x2c4159 });
   const rings = [0.25, 0.5, 0.75].map((part) => {
-    const ring = new Mesh(new TorusGeometry(TABLE.radius * part, 0.0012, 6, 80), new MeshBasicMaterial({ color: 0x2c4159 }));
+    const ring = new Mesh(new TorusGeometry(TABLE.radius * part, 0.0012, 6, 80), dim);
     ring.rotation.x = Math.PI / 2;
     ring.position.y = -0.009;
     return ring;
   });
-  group.add(top, rim, foot, ...rings);
+  group.add(top, rim, foot, joined(...rings));
   return group;
 }
 
@@ -341,11 +343,11 @@ function robot() {
   nose.rotation.set(-Math.PI / 2, Math.PI / 4, 0, "XYZ");
   nose.position.set(0, 0.3, -0.58);
   const wheel = new CylinderGeometry(0.16, 0.16, 0.1, 24).rotateZ(Math.PI / 2);
-  for (const [x, z] of [[-0.36, -0.28], [0.36, -0.28], [-0.36, 0.28], [0.36, 0.28]]) {
+  const wheels = [[-0.36, -0.28], [0.36, -0.28], [-0.36, 0.28], [0.36, 0.28]].map(([x, z]) => {
     const each = new Mesh(wheel, dark);
     each.position.set(x, 0.16, z);
-    group.add(each);
-  }
-  group.add(hull, head, eyes, nose);
+    return each;
+  });
+  group.add(hull, joined(head, ...wheels), joined(eyes, nose));
   return group;
 }
