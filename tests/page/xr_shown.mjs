@@ -190,7 +190,8 @@ const parts = {
     let status = null;
     const room = { menu: { set: (content) => (menu = content) }, status: { set: (content) => (status = content) }, tellPictures() {} };
     const links = Object.assign(new EventTarget(), { rates: new Map(), sightUp: { connected: true } });
-    const overlay = { setState() {}, setStop() {}, tell() {} };
+    let written = 0;
+    const overlay = { setState: () => (written += 1), setStop() {}, tell() {} };
     const wishes = [{ shown: "battery", topic: "/battery" }];
     const settings = { get: () => 0 };
     const scene = { room, links, overlay, wishes, settings, me: { may: [] }, immersion: {}, waiting: "Waiting for robot 7" };
@@ -222,6 +223,12 @@ const parts = {
     scene.wishes = [];
     telling.tell();
     assert.equal(rows().Battery, undefined, "its topic has ended");
+    for (const [immersive, times] of [[true, 2], [false, 8]]) {
+      written = 0;
+      scene.stage = { immersive };
+      for (let tick = 0; tick < 8; tick++) telling.tick();
+      assert.equal(written, times, "who wears the headset does not see the page");
+    }
   },
 };
 

@@ -80,10 +80,13 @@ export class Telling {
     this.#tellMenu();
   }
 
-  /** Four times a second: of what has to be drawn and uploaded each part once, so that no frame has it all. */
+  /**
+   * Four times a second: of what has to be drawn and uploaded each part once, so that no frame has it all. Who wears the headset
+   * does not see the page: its figures are written as seldom then.
+   */
   tick() {
     this.turn = ((this.turn ?? 0) + 1) % 4;
-    this.#tellScreen();
+    if (this.turn === 1 || !this.scene.stage.immersive) this.#tellScreen();
     if (this.turn === 0) this.#tellStatus(performance.now());
     else if (this.turn === 2) this.#tellPictures();
   }
