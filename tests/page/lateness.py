@@ -11,13 +11,14 @@ from typing import Any
 
 import rclpy
 from geometry_msgs import msg
+from rclpy.signals import SignalHandlerOptions
 
 from bridge.cli.running import say_ready
 
 
 def main() -> int:
     """Until it is killed."""
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # with rclpy's it sometimes does not end
     node = rclpy.create_node("lateness")
 
     def listen(topic: str, kind: str) -> None:
