@@ -84,7 +84,7 @@ class Trial:
             else:
                 return True
 
-    async def _repeat(self, act: Callable[[], None], done: Callable[[], bool], wait_s: float) -> bool:
+    async def _repeat(self, act: Callable[[], object], done: Callable[[], bool], wait_s: float) -> bool:
         deadline = time.monotonic() + wait_s
         while not done():
             if time.monotonic() > deadline:

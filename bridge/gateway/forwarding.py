@@ -25,6 +25,7 @@ from macs_zenoh.protocol.tcp_agent import Sent, Streamed
 from .afar import Afar
 from .agents import Agents
 from .backpressure import ROBOT_HOLD_S, Backpressure
+from .command_counts import CommandCounts
 from .connection import Connection
 from .judged import JudgedFrames, Read
 from .latest import Latest
@@ -74,6 +75,7 @@ class Forwarding:
         self._apart = True
         """Whether no two of them can have a receiver in common, so that their order does not matter."""
         self._latest = Latest(lambda route, newest: self._put(route.keys, newest.frame.data, COMMAND))
+        self._counts = CommandCounts(mesh, directory)
         self._presses = Presses(mesh, directory)
         self._questions = Questions()
         self._flooding: dict[Connection, float] = {}
@@ -111,6 +113,7 @@ class Forwarding:
     def close(self) -> None:
         """Nothing is forwarded any more."""
         self._latest.close()
+        self._counts.close()
         self._questions.close()
         self._presses.close()
 
@@ -218,8 +221,8 @@ class Forwarding:
         for key in keys:
             if traffic is STREAM:
                 mesh.streams.put(key, payload)
-            else:
-                mesh.put(key, payload, traffic)
+            elif mesh.put(key, payload, traffic) and traffic is COMMAND:
+                self._counts.put(key)
         copies = mesh.looped - before
         if copies:
             if read is not None:

@@ -10,6 +10,7 @@ from collections import Counter
 from typing import NamedTuple
 
 from macs_zenoh.losses import Losses
+from macs_zenoh.protocol.came import Came
 from macs_zenoh.protocol.messages import Metadata, NodeType, decode_data
 from macs_zenoh.protocol.registrations import AgentKey
 from macs_zenoh.protocol.robot_state import StreamCount
@@ -18,35 +19,6 @@ SUBSCRIBER = int(NodeType.SUBSCRIBER)
 BEFORE = "before_gateway"
 KNOWN = ("topics_behind", "loop_behind", "missed")
 """By these names the session counts what did come, or was known to be missing."""
-
-
-class Came:
-    """How much of one topic has come, beside what its robot says that it has put. Pure.
-
-    Attributes:
-        samples: that have come; whoever takes them counts them.
-        lost: of what was put since the robot told for the first time.
-        since: when the robot's counting began, by its own clock; None while it has told nothing.
-        before: how much it had put by then that did not count here.
-    """
-
-    __slots__ = ("before", "lost", "samples", "since")
-
-    def __init__(self) -> None:
-        self.samples = 0
-        self.lost = 0
-        self.since: int | None = None
-        self.before = 0
-
-    def count(self, told: StreamCount) -> int:
-        """The robot has told, behind all that it counts: how much more is known to be lost. What it tells first says
-        where its counting and ours begin."""
-        ahead = told.put - self.samples - self.lost
-        if told.since != self.since:
-            self.since, self.before = told.since, ahead
-        more = max(0, ahead - self.before)
-        self.lost += more
-        return more
 
 
 class Stream(NamedTuple):

@@ -129,7 +129,9 @@ class RobotAgent:
         self.stop_line: StopLine | None = None
         self._stop_later: asyncio.Task[None] | None = None
         self._last_words: Handle | None = None
-        self._told = Told(lambda: status(self.nodes, session.full_name, agent.drops + agent.mesh.drops))
+        self._told = Told(
+            lambda: status(self.nodes, session.full_name, agent.drops + agent.mesh.drops, counts=guard is not None)
+        )
         self._mirrors: Mirrors | None = None
 
     def _graph_changed(self, topics: NamesAndTypes, services: NamesAndTypes) -> None:
@@ -167,6 +169,7 @@ class RobotAgent:
         self._let_stop()
         if self._guard is not None:
             self._guard.on_dropped = self.nodes.drops.note
+            self._guard.on_missing = self.agent.mesh.drops.note
             self._guard.on_command = self.nodes.deliver
 
     async def _open_stop(self, topic: str, level: int) -> bool:

@@ -55,10 +55,10 @@ def control(nodes: InterfaceNodes, sender: Registrant, request: ControlRequest, 
     return ControlReply(done, str(holder) if holder else "", reason)
 
 
-def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int]) -> bytes:
+def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int], *, counts: bool = False) -> bytes:
     """The robot's state as JSON: interface nodes with who registered, control and dead-man, the stop, drops.
 
-    ``lost_before`` counts what was lost between the mesh and the nodes.
+    ``lost_before`` counts what was lost between the mesh and the nodes; ``counts``: it counts which commands come.
     """
     stop = nodes.robot.stop
     state = RobotStatus(
@@ -78,6 +78,7 @@ def status(nodes: InterfaceNodes, ros_name: str, lost_before: Mapping[str, int])
         trips={topic: TripsStatus(*told) for topic, told in nodes.robot.trips.all().items()},
         drops={**lost_before, **nodes.drops},
         max_timed_command_age_s=nodes.robot.rules.settings.max_timed_command_age_s,
+        counts_commands=counts or UNSET,
     )
     return msgspec.json.encode(state)
 

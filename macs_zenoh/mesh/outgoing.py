@@ -166,6 +166,7 @@ class Outgoing:
         if traffic is COMMAND and self._is_for_thread(key, payload):
             if not self._commands.put(publisher, payload, key):
                 self.drops["backlog"] += 1
+                goes = False
         elif traffic is not CALL or (len(payload) < self.HERE_BYTES and self._sender.idle):
             self._loopback.put(publisher, payload)
         elif not kept:

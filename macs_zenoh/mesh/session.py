@@ -290,15 +290,15 @@ class Mesh:
 
     # -- publish and subscribe -----------------------------------------------------------------------------------
 
-    def put(self, key: str, payload: Payload, traffic: Traffic = Traffic.CALL) -> None:
-        """Publish. From any thread; never waits for more than a full link's ``block_limit_ms``.
+    def put(self, key: str, payload: Payload, traffic: Traffic = Traffic.CALL, *, beside: bool = False) -> bool:
+        """Publish; returns whether it goes. From any thread; waits for no more than a full link's ``block_limit_ms``.
 
         Kept traffic that is large, or that follows a large one, is sent by a thread of its own, so that 20 MiB over
         a slow link do not hold up the loop; between two agents of this program it is not copied at all.
 
         What is more than a traffic rule allows is dropped and counted; where `limited`, put each message by itself.
-        """
-        self._outgoing.put(key, payload, traffic)
+        What is said ``beside`` the traffic no rule counts, and no trace takes for it."""
+        return self._outgoing.put(key, payload, traffic, ruled=not beside, traced=not beside)
 
     def put_unasked(self, key: str, payload: Payload) -> None:
         """Put without having heard that anybody listens, past all traffic rules: it goes to the router in any case,

@@ -19,12 +19,14 @@ from typing import NamedTuple, Protocol
 
 from ..errors import WireError
 from .agent_id import AgentId
+from .came import CommandsCame
 from .command_clock import CommandClocks
 from .credit import Credit
 from .halts import halts
 from .keyexpr import CALLS, GROUP, UNICAST, sender_of, type_number
 from .messages import ROS, Metadata, NodeType
 from .reading import Message, Reader
+from .robot_state import CommandCount
 from .wire import Layout
 
 STOP_TOPIC = "/emergency_stop"
@@ -33,6 +35,8 @@ STOP_TYPES = frozenset({"std_msgs/Bool", "std_msgs/msg/Bool"})
 """Of emergency stops: what a robot's is called, only the robot knows."""
 COMMAND = int(NodeType.PUBLISHER)
 FLOODED = "it sends more than one agent may"
+BEFORE_ROBOT = "before_robot"
+"""The name of commands that were lost between a gateway and a robot."""
 Buffer = bytes | bytearray
 
 AGED_S = 0.01
@@ -306,6 +310,9 @@ class Guard:
         self._ages = Ages()
         self._fresh = Fresh(limits.max_command_age_s)
         self.clocks = CommandClocks(limits.max_timed_command_age_s)
+        self.on_missing: OnDropped = lambda name, sender, why, count=1: None
+        """Hears of commands that were put and have not come."""
+        self._came = CommandsCame()
         self._pressed: OrderedDict[str, float] = OrderedDict()
         """When somebody asked for a stop last; who did so last is at the end."""
         self._reader = Reader(layout, self._found_bad)
@@ -329,6 +336,8 @@ class Guard:
         with self._counting:
             requests = self._together if key.startswith(CALLS_KEYS) else self._requests
             admitted = (self._urgent if urgent else requests).take(sender, size, now)
+        if urgent and key.startswith(INBOX_KEYS):
+            self._came.has_come(key)
         if admitted:
             return True
         self.on_dropped("flooded", sender, FLOODED)
@@ -347,6 +356,9 @@ class Guard:
             return False
         with self._lock:  # of two threads each has its turn: what one sender put stays in order
             messages = self._read(key, payload)
+            if len(messages) == 1 and messages[0].metadata.message_manager == CommandCount.manager:
+                self._count(key, messages[0])
+                return True
             if self._bad or not messages or not all(_is_command(message) for message in messages):
                 for message in messages:
                     if self._stops(message):
@@ -359,8 +371,21 @@ class Guard:
                     command(message if max(age_s, most_s) <= AGED_S else _aged(message, age_s, most_s))
         return True
 
+    def _count(self, key: str, message: Message) -> None:
+        """A gateway has told how many commands of one sender it has put."""
+        try:
+            missing = self._came.told(key, message.data)
+        except WireError as error:
+            self.on_dropped("bad_request", sender_of(key), str(error))
+            return
+        if missing:
+            self.on_missing(BEFORE_ROBOT, sender_of(key), "some of its commands do not come here", missing)
+
     def covered(self, key: str, size: int, messages: list[Message], now: float) -> list[Message]:
         """Of a sample that comes to the loop: as many of its messages as its sender may send, and stops."""
+        if len(messages) == 1 and messages[0].metadata.message_manager == CommandCount.manager:
+            self._came.told_late(key)
+            return []
         return self._covered(self._requests, sender_of(key), size, messages, now)
 
     def _covered(

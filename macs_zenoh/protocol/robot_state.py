@@ -121,6 +121,8 @@ class RobotStatus(Struct, frozen=True):
     """What its agent cannot do for its safety, where that is a program beside the robot."""
     max_timed_command_age_s: float | UnsetType = UNSET
     """It asks what time commands were made, and how old they may be; 0: of any age."""
+    counts_commands: bool | UnsetType = UNSET
+    """It counts which commands come, and wants to be told how many were put (`CommandCount`)."""
 
 
 def added(before: int, now: int) -> int:
@@ -180,6 +182,13 @@ class StreamCount(Struct, frozen=True):
     manager: ClassVar[str] = "StreamCount"
     since: Count
     put: Count = 0
+
+
+class CommandCount(StreamCount, frozen=True):
+    """Gateway → a robot that counts commands (`RobotStatus.counts_commands`), behind those that one agent has sent to
+    it by its id: how many samples of them were put since. Others must not get it."""
+
+    manager: ClassVar[str] = "CommandCount"
 
 
 class ControlRequest(Struct, frozen=True, rename="camel"):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 from collections import Counter
 
-from bridge.gateway.on_the_way import BEFORE, Came, OnTheWay, Stream
+from bridge.gateway.on_the_way import BEFORE, OnTheWay, Stream
 from macs_zenoh.losses import Losses
+from macs_zenoh.protocol.came import Came
 from macs_zenoh.protocol.messages import encode_data
 from macs_zenoh.protocol.robot_state import StreamCount
 
