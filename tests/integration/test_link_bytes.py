@@ -33,7 +33,7 @@ async def test_a_program_tells_what_its_link_has_carried(router: str) -> None:
         answering = mesh.answer_pings()
         came: list[int] = []
         subscription = other.subscribe("macs/from/**", lambda batch: came.extend(len(data) for _, data in batch))
-        await until(lambda: mesh.put("macs/from/ros/7/nd__x", b"", Traffic.STREAM) or came)
+        await until(lambda: (mesh.put("macs/from/ros/7/nd__x", b"", Traffic.STREAM), came)[1])
         for _ in range(100):
             mesh.put("macs/from/ros/7/nd__x", bytes(SENT_BYTES // 100), Traffic.STREAM)
             await asyncio.sleep(0.001)

@@ -135,7 +135,7 @@ async def test_what_takes_long_in_a_program_is_shown_there(router: str) -> None:
                 came.append(bytes(payload))
 
         subscription = other.subscribe("macs/from/**", take)
-        await until(lambda: mesh.put("macs/from/ros/7/nd__x", b"", Traffic.STREAM) or came)
+        await until(lambda: (mesh.put("macs/from/ros/7/nd__x", b"", Traffic.STREAM), came)[1])
         other.tracing.answer(trace.encode_request(TraceRequest(seconds=60)))
         mesh.tracing.answer(trace.encode_request(TraceRequest(put="macs/from/ros/7/", look=False, seconds=60)))
         for number in range(100):
@@ -197,7 +197,7 @@ async def test_off_it_costs_no_byte(router: str) -> None:
             await until(lambda: len(came) >= before + 100)
             return link.up_bytes - link_before
 
-        await until(lambda: mesh.put("macs/from/ros/7/nd__x", b"", Traffic.STREAM) or came)
+        await until(lambda: (mesh.put("macs/from/ros/7/nd__x", b"", Traffic.STREAM), came)[1])
         await sent()
         off = await sent()
         mesh.tracing.answer(trace.encode_request(TraceRequest(put="macs/from/ros/7/", seconds=60)))
@@ -216,7 +216,7 @@ async def test_one_in_so_many_is_always_traced_if_wanted(router: str) -> None:
     async with await Mesh.open(settings) as mesh, await Mesh.open(settings) as other:
         came: list[bytes] = []
         subscription = other.subscribe("macs/**", lambda batch: came.extend(bytes(each) for _, each in batch))
-        await until(lambda: mesh.put("macs/from/ros/7/nd__x", b"", Traffic.STREAM) or came)
+        await until(lambda: (mesh.put("macs/from/ros/7/nd__x", b"", Traffic.STREAM), came)[1])
         before = len(trace.decode_answer(other.tracing.answer(trace.encode_request(TraceRequest()))).reports)
         for number in range(1, 101):
             mesh.put("macs/from/ros/7/nd__x", b"x", Traffic.STREAM)
@@ -228,7 +228,7 @@ async def test_one_in_so_many_is_always_traced_if_wanted(router: str) -> None:
         assert {report.key for report in reports} == {"macs/from/ros/7/nd__x"}
         for _ in range(20):  # what tells how much there was is no topic data
             await until(lambda: mesh.streams.put_here("macs/from/ros/7/nd__x", b"z", traced=False))
-        await until(lambda: mesh.put("macs/to/ros/0/7/unity/2", b"end", Traffic.COMMAND) or b"end" in came)
+        await until(lambda: (mesh.put("macs/to/ros/0/7/unity/2", b"end", Traffic.COMMAND), b"end" in came)[1])
         again = trace.decode_answer(other.tracing.answer(trace.encode_request(TraceRequest()))).reports
         assert len(again) == len(reports)
         subscription.close()
