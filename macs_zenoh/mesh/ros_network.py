@@ -49,7 +49,6 @@ from .leaving import leave
 from .opening import open_session
 from .panics import call, unwatched, watched
 from .threads import keep_attached
-from .token_news import TokenChange, watch
 
 log = logging.getLogger("macs.rmw_zenoh")
 
@@ -184,11 +183,12 @@ class RosNetwork:
     def watch_tokens(self, domain: int | None, receive: OnToken) -> Subscription:
         """Call ``receive(token, alive)`` for each token of a domain, or of all."""
 
-        def told(tokens: list[TokenChange]) -> None:
-            for token, alive in tokens:
-                receive(token, alive)
+        def on_sample(sample: zenoh.Sample) -> None:
+            keep_attached()
+            receive(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-        return watch(self.session.liveliness(), every_token(domain), told)
+        callback = zenoh.handlers.Callback(on_sample, indirect=False)
+        return Subscription(self.session.liveliness().declare_subscriber(every_token(domain), callback, history=True))
 
     def on_change(self, callback: OnChange) -> Handle:
         """Call back for whoever comes and goes in the graphs that are followed."""

@@ -35,7 +35,7 @@ from .outgoing import Outgoing
 from .panics import call, end_on_panics, last_words, watched
 from .reliable import Recovered
 from .streams import Streams
-from .token_news import TokenNews, watch
+from .token_news import TokenNews
 from .tracing import Tracing
 from .zenoh_config import check_files, first_line, id_is_chosen, insert, warn_of_lowered, zenoh_config
 
@@ -486,7 +486,11 @@ class Mesh:
     def watch_tokens(self, key: str, on_change: Callable[[str, bool], None]) -> Subscription:
         """Call ``on_change(key, alive)`` for every token that exists, comes or goes."""
         news = TokenNews(self._loop, self._from_thread, on_change)
-        return watch(self._liveliness, key, news.receive)
+        return Subscription(
+            self._liveliness.declare_subscriber(
+                key, zenoh.handlers.Callback(news.receive, indirect=False), history=True
+            )
+        )
 
     async def tokens(self, key: str, *, timeout_s: float = 2.0) -> list[str]:
         """The tokens that exist now, as the routers know them: this session's own for certain, what another one has

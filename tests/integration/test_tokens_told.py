@@ -1,72 +1,111 @@
-"""Watchers of tokens hear of each, and hold up nothing else that comes over their link."""
+"""Watchers of tokens hear of each, whichever of Zenoh's threads brings it."""
 
 from __future__ import annotations
 
-import asyncio
-import sys
 import threading
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
 
-from macs_zenoh.mesh import Mesh
-from macs_zenoh.mesh.token_news import TokenChange, watch
+import pytest
+import zenoh
+
+from macs_zenoh.errors import MacsError
+from macs_zenoh.mesh import Mesh, token_news
+from macs_zenoh.presence import Presence
+from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.keyexpr import LEASE
+from macs_zenoh.protocol.messages import UNITY
 from tests.support.local import patient
-from tests.support.programs import finished
-from tests.support.waiting import first_of, until
+from tests.support.waiting import PATIENCE_S, until
 
-MANY = 500
+
+class Token:
+    """What Zenoh gives to a watcher."""
+
+    kind = zenoh.SampleKind.PUT
+
+    def __init__(self, key: str) -> None:
+        self.key_expr = key
+
+
+async def test_two_threads_bring_one_each_in_the_same_moment(router: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both are told, and so is what comes later: none of the two threads leaves it to the other to wake the loop."""
+    met = threading.Barrier(2)
+
+    class Meeting(deque[Any]):
+        """In which each has put its own before any of them looks; where that cannot be, it goes on alone."""
+
+        def append(self, item: Any) -> None:
+            super().append(item)
+            with suppress(threading.BrokenBarrierError):
+                met.wait(0.5)
+
+    told: set[str] = set()
+    receives: list[Callable[[Token], None]] = []
+    called = zenoh.handlers.Callback
+
+    def callback(receive: Any, **arguments: Any) -> Any:
+        receives.append(receive)
+        return called(receive, **arguments)
+
+    async with await Mesh.open(patient(router)) as mesh:
+        monkeypatch.setattr(token_news, "deque", Meeting)
+        monkeypatch.setattr(zenoh.handlers, "Callback", callback)
+        watching = mesh.watch_tokens(LEASE.every(), lambda key, alive: told.add(key))
+        monkeypatch.undo()
+        (receive,) = receives
+        threads = [threading.Thread(target=receive, args=(Token(key),)) for key in ("one", "other")]
+        for thread in threads:
+            thread.start()
+        await until(lambda: told == {"one", "other"})
+        token = mesh.declare_token(LEASE.of(block=9, zid="later"))
+        await until(lambda: len(told) == 3)
+        for thread in threads:
+            thread.join()
+        token.close()
+        watching.close()
 
 
 async def test_many_that_come_together_are_told_of_in_their_order(router: str) -> None:
     """And those that end as well; nothing is told twice."""
-    told: list[tuple[str, bool]] = []
+    many, told = 500, list[tuple[str, bool]]()
     async with await Mesh.open(patient(router)) as mesh, await Mesh.open(patient(router)) as other:
-        keys = [LEASE.of(block=number % 256, zid=str(number)) for number in range(MANY)]
+        keys = [LEASE.of(block=number % 256, zid=str(number)) for number in range(many)]
         watching = mesh.watch_tokens(LEASE.every(), lambda key, alive: told.append((key, alive)))
         tokens = [other.declare_token(key) for key in keys]
-        await until(lambda: len(told) == MANY)
+        await until(lambda: len(told) == many)
         for token in tokens:
             token.close()
-        await until(lambda: len(told) == 2 * MANY)
+        await until(lambda: len(told) == 2 * many)
         watching.close()
     assert told == [(key, True) for key in keys] + [(key, False) for key in keys]
 
 
-async def test_who_is_told_of_tokens_holds_up_no_message(router: str) -> None:
-    """A message comes over the same link while a watcher is busy with a token that came before it."""
-    busy, came = threading.Event(), threading.Event()
-    heard: list[bool] = []
-
-    def told(_tokens: list[TokenChange]) -> None:
-        busy.set()
-        heard.append(came.wait(10))
-
+async def test_what_an_agent_asks_comes_behind_its_presence(router: str) -> None:
+    """A robot forgets what was registered under an id when another has it: news that came late would undo what that
+    one has registered already."""
     async with await Mesh.open(patient(router)) as mesh, await Mesh.open(patient(router)) as other:
-        watching = watch(mesh._session.liveliness(), LEASE.every(), told)
-        messages: asyncio.Queue[bytes] = asyncio.Queue()
-        listening = mesh.subscribe("a/b", lambda batch: [messages.put_nowait(bytes(item[1])) for item in batch])
-        token = other.declare_token(LEASE.of(block=9, zid="other"))
-        await until(busy.is_set)
-        await first_of(messages.get(), lambda: other.put("a/b", b"a command"))
-        came.set()
-        await until(lambda: bool(heard))
-        for each in (token, listening, watching):
-            each.close()
-    assert heard[0]
+        presence = Presence(mesh, lambda changes: None, lambda contested: None)
+        await presence.start()
+
+        async def answer(key: str, _payload: bytes) -> bytes:
+            return b"seen" if (UNITY, int(key.rpartition("/")[2])) in presence.directory else b"not seen"
+
+        serving = mesh.serve("asked/*", answer)
+        await until(lambda: _served(other))
+        tokens = []
+        for number in range(2, 200):
+            tokens.append(other.declare_token(AgentInfo(UNITY, number, 0, other.zid).presence))
+            assert await other.query(f"asked/{number}", b"", timeout_s=PATIENCE_S) == b"seen"
+        presence.close()
+        serving.close()
 
 
-LEFT_OPEN = """
-import sys
-import zenoh
-from macs_zenoh.mesh.token_news import watch
-from macs_zenoh.mesh.zenoh_config import zenoh_config
-from tests.support.local import patient
-
-session = zenoh.open(zenoh_config(patient(sys.argv[1])))
-watching = watch(session.liveliness(), "some/**", print)
-"""
-
-
-async def test_a_program_that_closes_nothing_ends_properly(router: str) -> None:
-    """Python ends its threads, and this one must not be in Zenoh then: that would abort the program."""
-    code, _, err = await finished(sys.executable, "-c", LEFT_OPEN, router)
-    assert code == 0, err
+async def _served(mesh: Mesh) -> bool:
+    """Whether the router knows who answers."""
+    try:
+        return bool(await mesh.query("asked/1", b"", timeout_s=1))
+    except MacsError:
+        return False
