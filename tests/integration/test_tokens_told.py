@@ -68,8 +68,8 @@ async def test_two_threads_bring_one_each_in_the_same_moment(router: str, monkey
         watching.close()
 
 
-async def test_many_that_come_together_are_told_of_in_their_order(router: str) -> None:
-    """And those that end as well; nothing is told twice."""
+async def test_of_many_that_come_together_each_is_told_once(router: str) -> None:
+    """And those that end as well; in the first moments of a watcher in any order."""
     many, told = 500, list[tuple[str, bool]]()
     async with await Mesh.open(patient(router)) as mesh, await Mesh.open(patient(router)) as other:
         keys = [LEASE.of(block=number % 256, zid=str(number)) for number in range(many)]
@@ -80,7 +80,8 @@ async def test_many_that_come_together_are_told_of_in_their_order(router: str) -
             token.close()
         await until(lambda: len(told) == 2 * many)
         watching.close()
-    assert told == [(key, True) for key in keys] + [(key, False) for key in keys]
+    assert sorted(told[:many]) == sorted((key, True) for key in keys)
+    assert sorted(told[many:]) == sorted((key, False) for key in keys)
 
 
 async def test_what_an_agent_asks_comes_behind_its_presence(router: str) -> None:
