@@ -69,9 +69,3 @@ class CommandsCame:
                 return 0
             came.samples -= 1
             return came.count(decode_data(CommandCount, data))
-
-    def told_late(self, key: str) -> None:
-        """The same where others may have come since: it says nothing any more."""
-        with self._lock:
-            if (came := self._of.get(key)) is not None:
-                came.samples -= 1

@@ -50,20 +50,6 @@ def test_each_sender_is_counted_by_itself() -> None:
         came.told(KEY, b"{}")
 
 
-def test_a_count_that_comes_late_says_nothing() -> None:
-    """Others may have come since: it is taken off, and the next one tells."""
-    came = CommandsCame()
-    for _ in range(2):
-        came.has_come(KEY)
-    came.told(KEY, count(1))
-    came.has_come(KEY)
-    came.told_late(KEY)
-    came.has_come(KEY)
-    assert came.told(KEY, count(3)) == 2
-    came.told_late(OTHER)
-    assert came.told(OTHER, count(3)) == 0
-
-
 def test_names_that_somebody_makes_up_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     """So many senders are remembered: those that sent last."""
     monkeypatch.setattr(CommandsCame, "SENDERS", 3)
@@ -108,3 +94,24 @@ def test_a_count_is_no_message_to_a_robot() -> None:
     assert guard.covered(KEY, 10, [message], 0.0) == []
     other = message._replace(metadata=Metadata(message_manager="x"))
     assert guard.covered(KEY, 10, [other], 0.0) == [other]
+
+
+def test_counts_that_a_headset_makes_up_are_no_losses() -> None:
+    """They come as its other messages do, with the largest and the least number, and change nothing of what a gateway
+    tells behind its commands."""
+    guard, missing = Guard(Limits(1000, 1000, 0.5), MACS), []
+    guard.me, guard.on_command = (ROS, 7), lambda message: None
+    guard.on_missing = lambda name, sender, why, count=1: missing.append((name, sender, count))
+
+    def commands(put: int, at: float) -> None:
+        for payload in (COMMAND, told(put)):
+            assert guard.admits(KEY, len(payload), True, at)
+            assert guard.first(KEY, payload, 0.0, at)
+
+    commands(1, 0.0)
+    metadata = Metadata(message_manager=CommandCount.manager)
+    for number, put in enumerate((2**63 - 1, 0) * 50):
+        assert guard.admits(KEY, 10, False, 1.0 + number)
+        assert guard.covered(KEY, 10, [Message("unity", 300, metadata, count(put))], 1.0 + number) == []
+    commands(2, 200.0)
+    assert missing == []
