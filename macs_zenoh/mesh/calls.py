@@ -142,6 +142,7 @@ class Calls:
         self,
         key: str,
         handler: Handler,
+        *,
         stand_in: bool,
         first: Callable[[str, bytes], None] | None,
         gate: Admits | None,

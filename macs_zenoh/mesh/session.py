@@ -297,7 +297,8 @@ class Mesh:
         a slow link do not hold up the loop; between two agents of this program it is not copied at all.
 
         What is more than a traffic rule allows is dropped and counted; where `limited`, put each message by itself.
-        What is said ``beside`` the traffic no rule counts, and no trace takes for it."""
+        What is said ``beside`` the traffic no rule counts, and no trace takes for it.
+        """
         return self._outgoing.put(key, payload, traffic, ruled=not beside, traced=not beside)
 
     def put_unasked(self, key: str, payload: Payload) -> None:
@@ -443,12 +444,15 @@ class Mesh:
     ) -> Subscription:
         """Answer queries on ``key`` with ``await handler(key, payload)``; raise Refused in it to refuse. What brings
         more than ``most_bytes`` is refused unread.
+
         With ``stand_in`` it is asked only where nobody else serves the key. ``first`` is called at once with every
         query, in a thread of Zenoh's; unless it raises Refused, the answer is the handler's, on the loop. What the
         ``gate`` does not admit has no answer. A handler ``in_order`` is no coroutine: it is called before anybody does
         anything about later queries, raises nothing, and returns what is awaited.
         """
-        return self._calls.serve(key, handler, stand_in, first, gate, most_bytes, in_order)
+        return self._calls.serve(
+            key, handler, stand_in=stand_in, first=first, gate=gate, most_bytes=most_bytes, in_order=in_order
+        )
 
     def answer_pings(self) -> Subscription:
         """Let `macs doctor` measure the way to this program, and learn its clock and version."""
