@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 import time
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
@@ -39,9 +40,20 @@ class Heard:
     """What came on a topic of Twists: when, and linear x, or z where that is the stop message's."""
 
     values: list[tuple[float, float]] = field(default_factory=list)
+    _from_ns: int = 0
+    """What was published before is not taken any more: a busy machine hands it over late."""
+    _taking: threading.Lock = field(default_factory=threading.Lock)
 
-    def take(self, twist: Any) -> None:
-        self.values.append((time.monotonic(), twist.linear.x or twist.linear.z))
+    def take(self, twist: Any, info: dict[str, Any]) -> None:
+        with self._taking:
+            if info["source_timestamp"] >= self._from_ns:
+                self.values.append((time.monotonic(), twist.linear.x or twist.linear.z))
+
+    def forget(self) -> None:
+        """All that was published until now, also what has not come yet."""
+        with self._taking:
+            self._from_ns = time.time_ns()
+            self.values.clear()
 
     def since(self, moment: float) -> list[float]:
         return [value for at, value in self.values if at > moment]

@@ -141,7 +141,7 @@ async def ready(headset: Headset, between: Relay, heard: Heard, mesh: Mesh) -> S
 
     await until(arrives, every_s=0.1)
     site.before = await site.lost()  # whatever was sent before this has come
-    heard.values.clear()
+    heard.forget()
     return site
 
 
@@ -241,7 +241,7 @@ async def test_a_client_that_lies_only_harms_itself(domain: int, peer: Peer, tmp
                 await until(lambda: 2.0 in site.carried_out)
                 assert await site.drops()
                 assert 1.0 not in site.carried_out
-                site.heard.values.clear()
+                site.heard.forget()
 
 
 async def test_a_headset_on_the_command_line_tells_the_time(domain: int, peer: Peer, tmp_path: Path) -> None:

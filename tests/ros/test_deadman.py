@@ -21,7 +21,7 @@ from bridge.headset.nodes import Publisher
 from tests.support.delays import Delays
 from tests.support.programs import Program, free_port
 from tests.support.ros_peer import Peer
-from tests.support.waiting import get
+from tests.support.waiting import PATIENCE_S, get
 
 SILENCE_S = 0.5
 LEASE_S = 1.0
@@ -98,12 +98,20 @@ async def _drive(commands: Publisher) -> None:
 
 
 async def _stop_message(driving: Driving, since: float) -> tuple[float, float]:
-    """When the stop message arrived, and how much later than on an idle machine that may have been. One from before
-    is of a machine that stood still while somebody drove."""
+    """When the stop message arrived, and how much later than on an idle machine that may have been. One from before,
+    of a machine that stood still while somebody drove, counts if nothing was carried out behind it: then there is none
+    to come."""
+    before: float | None = None
     while True:
-        at, twist = await get(driving.heard)
-        if twist.linear.z == -1 and at > since:
-            return float(at), driving.delays.s()
+        try:
+            at, twist = await get(driving.heard, PATIENCE_S if before is None else 5 * LEASE_S)
+        except asyncio.TimeoutError:
+            if before is None:
+                raise
+            return before, driving.delays.s()
+        before = at if twist.linear.z == -1 else None
+        if before is not None and at > since:
+            return at, driving.delays.s()
 
 
 @pytest.mark.parametrize("driving", ["/cmd_vel", "/arm"], indirect=True)
