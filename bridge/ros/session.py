@@ -154,10 +154,11 @@ class RosSession(RclpySide):
         while self._spinning:
             try:
                 self._executor.spin_once()
-            except ExternalShutdownException:
-                log.warning("ROS was shut down from outside")
-                break
-            except Exception:
+            except Exception as error:
+                # rclpy says so only to who waits at that moment; who comes later is told that he cannot wait, for ever
+                if isinstance(error, ExternalShutdownException) or not self.context.ok():
+                    log.warning("ROS was shut down from outside")
+                    break
                 # one callback that failed must not end the others
                 log.exception("error in a ROS callback")
         with self._lock:

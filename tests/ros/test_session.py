@@ -96,6 +96,15 @@ async def test_ros_shut_down_from_outside_is_noticed(domain: int, caplog: pytest
     assert "ROS was shut down from outside" in caplog.text
 
 
+async def test_ros_shut_down_while_nobody_waits_is_noticed(domain: int, caplog: pytest.LogCaptureFixture) -> None:
+    """It is no error of a callback that comes again for ever, where the thread is not waiting just then."""
+    session = RosSession(domain_id=domain)
+    await session.run(session.context.try_shutdown)
+    await until(lambda: not session._thread.is_alive())
+    session.close()
+    assert [record.message for record in caplog.records] == ["ROS was shut down from outside"]
+
+
 def test_ros_arguments_name_the_node(domain: int) -> None:
     """Remapping of name and namespace works as for every ROS node."""
     with RosSession(domain_id=domain, ros_args=["--ros-args", "-r", "__node:=left", "-r", "__ns:=/arm"]) as session:
