@@ -23,8 +23,11 @@ from tests.support import tiers, tools
 from tests.support.thorough import THOROUGH
 
 CORES = os.cpu_count() or 1
-WORKERS = min(3 * CORES, 8)
-"""More than there are cores, for most tests wait most of the time; with ten on two cores some waited for a minute."""
+WORKERS = min(5 * CORES, 12)
+"""More than there are cores: most tests wait most of the time."""
+
+ALL_WORKERS = min(3 * CORES, 8)
+"""Beside those that take minutes: they take the cores, and with ten workers others waited for a minute."""
 
 FEW_WORKERS = max(2, min(CORES, 3))
 """Of those that measure time, and bear some others."""
@@ -78,7 +81,8 @@ def run(asked: argparse.Namespace) -> list[Part]:
         os.environ[THOROUGH] = "1"
     tier = TIERS if asked.all else f"{TIERS} and not soak"
     compile_once()
-    parts = [part("together", "-m", f"{tier} and not alone and not few", *order, workers=WORKERS)]
+    workers = ALL_WORKERS if asked.all else WORKERS
+    parts = [part("together", "-m", f"{tier} and not alone and not few", *order, workers=workers)]
     os.environ.pop("MACS_NEED_ROS_TESTS", None)  # judged by the first part
     parts += [part("few", *tiers.files("few"), "-m", f"{tier} and few", *order, workers=FEW_WORKERS)]
     return [*parts, part("alone", *tiers.files("alone"), "-m", f"{tier} and alone", *order)]
