@@ -134,6 +134,11 @@ class Presence:
         """Let the agent with this token be online before its turn."""
         self._gathered.declare_now(token)
 
+    def unseen(self, token: Token) -> AgentInfo | None:
+        """The agent with this token, while it is not online yet since it is not its turn."""
+        key = self._gathered.waiting(token)
+        return None if key is None else AgentInfo.parse(key)
+
     def elsewhere(self, agent_type: int) -> list[AgentInfo]:
         """The online agents of a type whose token is not only ours."""
         return [agent for agent in self.directory.of_type(agent_type) if agent.zid != self._mesh.zid]

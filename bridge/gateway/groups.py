@@ -7,10 +7,12 @@ import logging
 
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.keyexpr import GROUP
+from macs_zenoh.protocol.messages import UNITY
 
 from .agents import Agents, Group
 from .connection import Connection
 from .delivery import Delivery
+from .departures import Departures
 from .roll import Roll
 from .subscriptions import Subscriptions
 
@@ -27,13 +29,20 @@ class Groups:
     """Those in which agents of one gateway are."""
 
     def __init__(
-        self, agents: Agents, presence: Presence, subscriptions: Subscriptions, delivery: Delivery, roll: Roll
+        self,
+        agents: Agents,
+        presence: Presence,
+        subscriptions: Subscriptions,
+        delivery: Delivery,
+        roll: Roll,
+        departures: Departures,
     ) -> None:
         self._agents = agents
         self._presence = presence
         self._subscriptions = subscriptions
         self._delivery = delivery
         self._roll = roll
+        self._departures = departures
 
     def enter(self, connection: Connection) -> None:
         """Let others see an agent, in the group that it has told."""
@@ -75,13 +84,19 @@ class Groups:
             log.debug("%s is in group %d", connection, connection.peer.group)
 
     def leave(self, connection: Connection) -> bool:
-        """An agent has left; whether it was online. Who was told so is told that it is no more: it is not left out for
-        having been there for a moment only."""
-        if connection.unseen:
-            self.show(connection)
+        """An agent has left; whether it was online. One whom others have not seen yet they never see; agents here may
+        have been told of it, and are told that it is gone."""
+        token = self._agents.presence(connection)
+        if token is not None and (unseen := self._presence.unseen(token)) is not None:
+            self._departures.tell([unseen], [])
         was_online, emptied = self._agents.leave(connection)
         self.emptied(emptied)
         return was_online
+
+    def may_leave_late(self, connection: Connection) -> bool:
+        """Whether nothing but what others see depends on its being gone: a headset without interface nodes."""
+        is_headset = connection.key[0] == UNITY
+        return is_headset and not connection.recipient.node_count and self._agents.presence(connection) is not None
 
     def emptied(self, group: Group | None) -> None:
         """Nobody of ours is in this group any more."""

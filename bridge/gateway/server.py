@@ -123,7 +123,7 @@ class Gateway:
         self._requests = together(settings.max_requests_per_s, time.monotonic())
         """Of all who send robots much."""
         self._leaving = Pieces(self._has_closed, self.agents.end_presences)
-        self._departures = Departures(self.agents.online, lambda gone: self._roll.telling(gone))
+        self._departures = departures = Departures(self.agents.online, lambda gone: self._roll.telling(gone))
         self._subscriptions = Subscriptions(mesh)
         self._record = record = Record(self._drops)
         self._door = Door(
@@ -145,7 +145,7 @@ class Gateway:
         self._delivery = Delivery(*known, stead, mesh.drops, judged, self._forwarding.afar, rounds)
         self._declarations = AgentDeclarations(mesh, self.agents, self.directory, self._delivery, self._layout, stead)
         self._roll = Roll(self._presence, self.agents)
-        self._groups = Groups(self.agents, self._presence, self._subscriptions, self._delivery, self._roll)
+        self._groups = Groups(self.agents, self._presence, self._subscriptions, self._delivery, self._roll, departures)
         self._sleepers = Sleepers(
             settings.resume_s, self.agents, self._presence, on_asleep=self._falls_asleep, note=record.agent
         )
@@ -262,6 +262,7 @@ class Gateway:
         self._registry.robots.close()
         connections = [*self.agents.connections(), *self._entry]
         self._entry.close()
+        self._leaving.hurry()
         if connections:
             for connection in connections:
                 if connection.greeted and connection.peer.extensions:
@@ -338,7 +339,7 @@ class Gateway:
 
     def closed(self, connection: Connection) -> None:
         """Forget a connection; its presence ends at once, or as soon as those have ended that left just before."""
-        self._leaving.put(connection)
+        self._leaving.put(connection, may_wait=self._groups.may_leave_late(connection))
 
     def _has_closed(self, connection: Connection) -> None:
         self._door.leave(connection)
@@ -362,10 +363,9 @@ class Gateway:
         was_online = self._groups.leave(connection)
         self._leases.give_back(connection.agent_id)
         self._credits.leave(connection.host, connection.peer.credit, time.monotonic())
-        if was_online:
-            self._declarations.undeclare(connection.key)
         self._registry.leave(connection, was_online=was_online)
         if was_online:
+            self._declarations.undeclare(connection.key)
             self._record.agent("left", connection)
             log.debug("%s is offline", connection)
         if not self.agents:

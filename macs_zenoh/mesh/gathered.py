@@ -54,6 +54,10 @@ class GatheredTokens:
         except Exception:  # one that cannot be declared must not cost others theirs, nor what one of them says
             log.exception("%s cannot be declared", key)
 
+    def waiting(self, token: Token) -> str | None:
+        """Its key, while it is not declared yet."""
+        return self._waiting.get(token)
+
     def close(self) -> None:
         """Declare nothing any more."""
         if self._gathering is not None:

@@ -250,6 +250,17 @@ def every_slot(target: Target) -> None:
 
 
 @attack(2, "headset")
+def many_that_leave_together(target: Target) -> None:
+    """As many configured headsets as come within a second, seen by others, that all end at once; and again."""
+    while target.running():
+        agents = crowd(target, 1000, lambda: Agent(target.port))
+        target.rest(2.0)
+        for agent in agents:
+            agent.close(reset=True)
+        target.rest(0.5)
+
+
+@attack(2, "headset")
 def coming_and_going(target: Target) -> None:
     """Connections at full rate that end at once: properly, with a reset, half closed."""
     number = 0

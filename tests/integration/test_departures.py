@@ -8,8 +8,10 @@ from contextlib import AsyncExitStack
 
 import pytest
 
+from bridge.gateway import departures
 from bridge.gateway.connection import Connection
 from bridge.gateway.departures import Departures, Pieces
+from macs_zenoh.mesh import gathered
 from macs_zenoh.protocol.directory import AgentInfo
 from macs_zenoh.protocol.messages import AgentsGone, decode_data
 from tests.integration.test_gateway import socket
@@ -90,6 +92,55 @@ async def test_work_for_many_is_done_in_pieces_and_in_order() -> None:
     assert together[0] == 1
     assert together[-1] == 30
     assert 4 in together
+
+
+async def test_who_may_wait_waits_for_nobody_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of those that may wait so many go at once, the others in their order, so many each time; who may not does not,
+    and in the end all are hurried."""
+    monkeypatch.setattr(departures, "EVERY_S", 0.05)
+    done: list[int] = []
+    pieces = Pieces(done.append, lambda: None)  # type: ignore[arg-type]
+    for number in range(20):
+        pieces.put(number, may_wait=True)  # type: ignore[arg-type]
+    pieces.put(99)  # type: ignore[arg-type]
+    await until(lambda: 99 in done)
+    assert len(done) < 20
+    await until(lambda: len(done) > 15)
+    assert [number for number in done if number != 99] == list(range(len(done) - 1))
+    for number in range(20, 40):
+        pieces.put(number, may_wait=True)  # type: ignore[arg-type]
+    pieces.hurry()
+    pieces.put(40, may_wait=True)  # type: ignore[arg-type]
+    pieces.finish()
+    assert [number for number in done if number != 99] == list(range(41))
+
+
+async def test_who_leaves_before_others_see_it_is_never_seen(
+    start_gateway: StartGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody on the mesh needs to know of it. Agents here may know of it, and are told that it is gone."""
+    monkeypatch.setattr(gathered, "GATHER_S", 3600.0)
+    gateway = await start_gateway()
+    seen: list[AgentInfo] = []
+    tell = gateway._tell
+    monkeypatch.setattr(
+        gateway._presence, "_on_changes", lambda changes: (seen.extend(c.agent for c in changes), tell(changes))
+    )
+    async with socket(gateway) as stays:
+        stays.configure()
+        await until(lambda: [agent.id for agent in seen] == [stays.id])
+        async with socket(gateway) as goes:
+            goes.configure()
+            await until(lambda: len(list(gateway.agents.online())) == 2)
+            assert (await stays.online())[1] == sorted([stays.id, goes.id])
+        metadata, body = await stays.message()
+        assert metadata.message_manager == AgentsGone.manager
+        assert [agent.agent_id for agent in decode_data(AgentsGone, body).agents] == [goes.id]
+        assert (await stays.online())[1] == [stays.id]
+        async with socket(gateway) as speaks:
+            speaks.configure()
+            assert speaks.id in (await speaks.online())[1]
+        await until(lambda: [agent.id for agent in seen] == [stays.id, speaks.id, speaks.id])
 
 
 async def test_who_has_left_is_told_of_nobody(
