@@ -154,18 +154,23 @@ async def started(
     gateway: tuple[str, ...] = (),
     rules: str = ROBOT,
     agent: tuple[str, ...] = (),
+    *,
+    router: bool = True,
 ) -> Site:
-    """A site; ``gateway`` and ``agent`` are words for these."""
+    """A site; ``gateway`` and ``agent`` are words for these. Without a ``router`` of its own the gateway is one."""
     domain = next(_domains)
     environment = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     endpoint, web_port = f"tcp/127.0.0.1:{free_port()}", free_port()
     settings = folder / f"robot-{domain}.toml"
     settings.write_text(rules)
-    words = ["--port", str(free_port()), "--web-port", str(web_port), "-e", endpoint, *gateway]
+    joins = ("-e", endpoint) if router else ("--mode", "router", "-l", endpoint)
+    words = ["--port", str(free_port()), "--web-port", str(web_port), *joins, *gateway]
+    routers = [await stack.enter_async_context(Program("router", "-l", endpoint))] if router else []
+    one = await stack.enter_async_context(Program("gateway", *words))
     robot = ["--id", "1", "--settings", str(settings), "-e", endpoint, *agent]
     return Site(
-        await stack.enter_async_context(Program("router", "-l", endpoint)),
-        await stack.enter_async_context(Program("gateway", *words)),
+        (routers or [one])[0],
+        one,
         await stack.enter_async_context(Program("agent", *robot, env=environment)),
         await stack.enter_async_context(Process(sys.executable, "-m", "bridge.cli.demo_robot", env=environment)),
         web_port,

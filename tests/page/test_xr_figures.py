@@ -29,7 +29,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from tests.page.conftest import Site
+from tests.page.conftest import Shared, Site, StartSite
 from tests.page.headsets import PATIENT_ROBOT, UNDRAWN, Headset, needs_headset, scripts
 from tests.page.polls import until
 from tests.support.browser import needs_browser
@@ -37,8 +37,6 @@ from tests.support.devtools import LonePage, lone_page
 from tests.support.processes import Process
 
 pytestmark = [needs_browser, needs_headset, pytest.mark.alone, pytest.mark.soak, pytest.mark.timeout(280)]
-RULES = PATIENT_ROBOT
-"""The robot is patient."""
 
 MEASURED_S = 8.0
 TRACED_S = 5.0
@@ -165,10 +163,13 @@ def ros(site: Site) -> dict[str, str]:
     return {"ROS_DOMAIN_ID": str(site.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
-async def test_how_late_and_how_dear(site: Site, tmp_path: Path) -> None:
+@pytest.mark.parametrize("router", [True, False], ids=["router_beside", "gateway_is_router"])
+async def test_how_late_and_how_dear(start_site: StartSite, shared: Shared, tmp_path: Path, *, router: bool) -> None:
     """Commands and poses to a ROS node, alone and beside raw pictures that fill the other socket; pictures of two
     cameras from their stamp to the scene; the main thread's work per frame, as Chromium traces it."""
-    lines = [f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"]
+    await shared.stop()  # its robot publishes all the time
+    site = await start_site(rules=PATIENT_ROBOT, router=router)
+    lines = [f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; {'router' if router else 'no router'} beside"]
     settings = {"head": HEAD, "poseHz": 90, "hz": 30, "driveTopic": DRIVEN, "cameras": []}
     async with Late(site) as late, lone_page(tmp_path / "browser", width=160, height=120) as page:
         headset = Headset(page)
