@@ -94,9 +94,9 @@ class Groups:
         return was_online
 
     def may_leave_late(self, connection: Connection) -> bool:
-        """Whether nothing but what others see depends on its being gone: a headset without interface nodes."""
-        is_headset = connection.key[0] == UNITY
-        return is_headset and not connection.recipient.node_count and self._agents.presence(connection) is not None
+        """Whether nothing but what others see depends on its being gone: a headset that only listens."""
+        listens = connection.key[0] == UNITY and connection.recipient.only_listens
+        return listens and self._agents.presence(connection) is not None
 
     def emptied(self, group: Group | None) -> None:
         """Nobody of ours is in this group any more."""

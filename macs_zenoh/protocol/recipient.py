@@ -111,6 +111,11 @@ class Recipient:
             self._depths[node_name] = node.buffer_size, node.drop_new
             self._topic_types[node_name] = data_type
 
+    @property
+    def only_listens(self) -> bool:
+        """Whether all its nodes take messages of topics: nothing that it said before goes on."""
+        return not any(types - {NodeType.SUBSCRIBER} for types in self._nodes.values())
+
     def is_registered(self, node: AddNode) -> bool:
         """Whether the agent has this interface node already."""
         return node.node_type in self._nodes.get(node.node_name, ())

@@ -62,6 +62,18 @@ def test_what_is_taken_back_is_judged_anew() -> None:
     assert (recipient.has(sent()), recipient.depth_of("nd__pose"), recipient.node_count) == (False, (10, False), 0)
 
 
+@pytest.mark.parametrize("kind", [kind for kind in NodeType if kind != NodeType.SUBSCRIBER])
+def test_who_commands_or_serves_does_not_only_listen(kind: NodeType) -> None:
+    """However much it listens to; until it has taken that back, also under a name that is a topic's as well."""
+    recipient = headset()
+    assert recipient.only_listens
+    for topic in ("/pose", "/other"):
+        recipient.registered(adding(topic, kind))
+        assert not recipient.only_listens
+        recipient.unregistered(node_name(topic), kind)
+        assert recipient.only_listens
+
+
 def test_of_two_nodes_under_one_name_an_existing_headset_has_the_last() -> None:
     """Another type under a name takes the first one's place, and the gateway knows which that was."""
     recipient = headset()
