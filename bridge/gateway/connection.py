@@ -24,7 +24,7 @@ from macs_zenoh.protocol.decoders import FrameDecoder
 from macs_zenoh.protocol.kept import Kept
 from macs_zenoh.protocol.keyexpr import type_name
 from macs_zenoh.protocol.limits import REQUESTS_PER_S, UNFINISHED_FREE_BYTES
-from macs_zenoh.protocol.messages import ROS, AgentsGone, GoneAgent, SessionResumed
+from macs_zenoh.protocol.messages import ROS, UNITY, AgentsGone, GoneAgent, SessionResumed
 from macs_zenoh.protocol.outbox import Chunk, Outbox
 from macs_zenoh.protocol.rate_limit import Pace
 from macs_zenoh.protocol.recipient import Recipient, to_agent
@@ -611,6 +611,11 @@ class Connection(asyncio.BufferedProtocol):
             self._transport.abort()
 
     # -- sleep ---------------------------------------------------------------------------------------------------
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether others wait to hear that it is gone: of a robot, of who commands or serves."""
+        return self.greeted and not (self.key[0] == UNITY and self.recipient.only_listens)
 
     @property
     def returns(self) -> bool:

@@ -2,8 +2,8 @@
 
 What ends with a connection, and telling each agent here who has left, costs a fraction of a millisecond each. A
 thousand that leave together are a second, in which the event loop does nothing else unless that is done in pieces; and
-to a router they cost as much, so that those whom nobody waits for leave at its pace: when a thousand ended at once a
-robot's dead-man was 0.37 s late.
+to a router they cost as much, so that they leave at its pace: when a thousand ended at once a robot's dead-man was
+0.37 s late.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from .connection import Connection
 
 PIECE_S = 0.001
 """Work of so long is done at once; then others have their turn."""
-AT_ONCE, EVERY_S = 5, 0.01
-"""So many leave in so many seconds of those with whom nothing ends but that others see them: a router takes up to a
-millisecond for each, in the thread that brings commands as well."""
+AT_ONCE, EVERY_S = 2, 0.01
+"""So many that others see leave, or fall asleep, in so many seconds: a router takes up to a millisecond for each, in
+the thread that brings commands as well."""
+MORE = 300
+"""For so many that wait one more each time: what waits has an end however many come and go."""
 GATHER_S = 0.02
 """Who leaves so soon after others is told of together with those that follow."""
 
@@ -39,10 +41,10 @@ class Pieces:
         self._waiting: deque[Connection] = deque()
         self._turn: asyncio.Handle | None = None
 
-    def put(self, connection: Connection, *, may_wait: bool = False) -> None:
-        """One more; one that may wait comes later where there are many of its kind."""
-        if may_wait:
-            self._turnstile.put(connection)
+    def put(self, connection: Connection, *, seen: bool = False, first: bool = False) -> None:
+        """One more; those that others see come later where they are many, ``first`` those that are needed."""
+        if seen:
+            self._turnstile.put(connection, first=first)
         else:
             self._put(connection)
 
@@ -75,39 +77,40 @@ class Pieces:
 
 
 class Turnstile:
-    """Lets through so many connections in a second as a router can bear; the first at once, others in their order."""
+    """Lets through so many connections in a second as a router can bear: at once while that is not too many, then in
+    their order, ``first`` those on which something depends."""
 
     def __init__(self, do: Callable[[Connection], None]) -> None:
         self._do = do
-        self._waiting: deque[Connection] = deque()
+        self._first: deque[Connection] = deque()
+        self._others: deque[Connection] = deque()
         self._left = AT_ONCE
         self._timer: asyncio.TimerHandle | None = None
         self._is_open = False
 
-    def put(self, connection: Connection) -> None:
+    def put(self, connection: Connection, *, first: bool) -> None:
         """One more."""
+        (self._first if first else self._others).append(connection)
+        self._let_through()
         if self._timer is None and not self._is_open:
             self._timer = asyncio.get_running_loop().call_later(EVERY_S, self._again)
-        if self._left or self._is_open:
-            self._left -= 1
-            self._do(connection)
-        else:
-            self._waiting.append(connection)
 
     def open(self) -> None:
         """Let all through from now on."""
         self._is_open = True
         if self._timer is not None:
             self._timer.cancel()
-        while self._waiting:
-            self._do(self._waiting.popleft())
+        self._let_through()
+
+    def _let_through(self) -> None:
+        while (self._left or self._is_open) and (waiting := self._first or self._others):
+            self._left -= 1
+            self._do(waiting.popleft())
 
     def _again(self) -> None:
-        was_used, self._left = self._left < AT_ONCE, AT_ONCE
+        was_used, self._left = self._left < AT_ONCE, AT_ONCE + (len(self._first) + len(self._others)) // MORE
         self._timer = asyncio.get_running_loop().call_later(EVERY_S, self._again) if was_used else None
-        while self._left and self._waiting:
-            self._left -= 1
-            self._do(self._waiting.popleft())
+        self._let_through()
 
 
 class Departures:

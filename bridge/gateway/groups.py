@@ -7,7 +7,6 @@ import logging
 
 from macs_zenoh.presence import Presence
 from macs_zenoh.protocol.keyexpr import GROUP
-from macs_zenoh.protocol.messages import UNITY
 
 from .agents import Agents, Group
 from .connection import Connection
@@ -93,10 +92,10 @@ class Groups:
         self.emptied(emptied)
         return was_online
 
-    def may_leave_late(self, connection: Connection) -> bool:
-        """Whether nothing but what others see depends on its being gone: a headset that only listens."""
-        listens = connection.key[0] == UNITY and connection.recipient.only_listens
-        return listens and self._agents.presence(connection) is not None
+    def is_seen(self, connection: Connection) -> bool:
+        """Whether others see it."""
+        token = self._agents.presence(connection)
+        return token is not None and self._presence.unseen(token) is None
 
     def emptied(self, group: Group | None) -> None:
         """Nobody of ours is in this group any more."""

@@ -339,7 +339,7 @@ class Gateway:
 
     def closed(self, connection: Connection) -> None:
         """Forget a connection; its presence ends at once, or as soon as those have ended that left just before."""
-        self._leaving.put(connection, may_wait=self._groups.may_leave_late(connection))
+        self._leaving.put(connection, seen=self._groups.is_seen(connection), first=connection.is_needed)
 
     def _has_closed(self, connection: Connection) -> None:
         self._door.leave(connection)

@@ -31,6 +31,7 @@ from macs_zenoh.protocol.tcp_agent import Resume, Resumed, TcpAgent
 
 from .agents import Agents
 from .connection import Connection
+from .departures import Turnstile
 
 CALM_S = 0.25
 """So long after it fell asleep an agent is seen awake again. An agent's presence that changes sooner than routers tell
@@ -70,6 +71,9 @@ class Sleepers:
         """Who is awake and not yet seen so."""
         self._naps: dict[Connection, int] = {}
         """How often who has slept has."""
+        self._shown_at: dict[Connection, float] = {}
+        """Since when who has slept is seen as it is."""
+        self._seen_late = Turnstile(self._show_late)
         self._closed = False
 
     def __len__(self) -> int:
@@ -98,6 +102,7 @@ class Sleepers:
         self._sessions.close(connection)
         self._up(connection)
         self._naps.pop(connection, None)
+        self._shown_at.pop(connection, None)
         if (showing := self._showing.pop(connection, None)) is not None:
             showing.cancel()
 
@@ -134,10 +139,9 @@ class Sleepers:
         assert connection is not None
         if not connection.asleep:  # its old socket has not ended yet, or nobody has noticed
             self._lay_down(connection)
-        laid_down_s = self._resume_s - self._up(connection)
+        self._up(connection)
         connection.wake(newcomer, event.received, event.heard)
-        delay_s = max(0.0, CALM_S - laid_down_s)
-        self._showing[connection] = asyncio.get_running_loop().call_later(delay_s, self._show, connection, 0)
+        self._show_soon(connection)
         log.info("%s is there again", connection)
         self._note("resumed", connection)
         return connection
@@ -147,31 +151,42 @@ class Sleepers:
     def _lay_down(self, connection: Connection) -> None:
         self._on_asleep(connection)
         connection.fall_asleep()
-        naps = self._naps[connection] = self._naps.get(connection, 0) + 1
-        self._show(connection, naps)
+        self._naps[connection] = self._naps.get(connection, 0) + 1
         self._asleep.set(connection, connection.host, 1)
         loop = asyncio.get_running_loop()
         self._timers[connection] = loop.call_later(self._resume_s, self._has_overslept, connection)
+        self._show_soon(connection)
 
-    def _up(self, connection: Connection) -> float:
-        """It sleeps no more. For how long it still might have."""
-        timer = self._timers.pop(connection, None)
-        if timer is None:
-            return 0.0
-        timer.cancel()
-        self._asleep.set(connection, connection.host, 0)
-        return timer.when() - asyncio.get_running_loop().time()
+    def _up(self, connection: Connection) -> None:
+        """It sleeps no more."""
+        if (timer := self._timers.pop(connection, None)) is not None:
+            timer.cancel()
+            self._asleep.set(connection, connection.host, 0)
 
     def _has_overslept(self, connection: Connection) -> None:
         log.info("%s leaves: it has not come back within %g s", connection, self._resume_s)
         connection.abort()
 
-    def _show(self, connection: Connection, asleep: int) -> None:
-        """Let others see that it sleeps, or does not. In no moment it seems to be gone, and no longer than that it is
-        seen as before: robots stop what it was moving."""
+    def _show_soon(self, connection: Connection) -> None:
+        """Let others see that it sleeps, or does not. Many can fall asleep in one moment, and a router takes a while
+        for each: first those that robots stop what they were moving for."""
         if (showing := self._showing.pop(connection, None)) is not None:
             showing.cancel()
+        self._seen_late.put(connection, first=connection.is_needed)
+
+    def _show_late(self, connection: Connection) -> None:
+        """What is so by now. In no moment it seems to be gone, and no longer than that it is seen as before."""
+        asleep = self._naps.get(connection, 0) if connection in self._timers else 0
+        if connection.seen_asleep == asleep or self._agents.presence(connection) is None:
+            return
+        loop = asyncio.get_running_loop()
+        calm_at = self._shown_at.get(connection, 0.0) + CALM_S
+        if not asleep and loop.time() < calm_at:
+            if connection not in self._showing:
+                self._showing[connection] = loop.call_at(calm_at, self._show_soon, connection)
+            return
         connection.seen_asleep = asleep
+        self._shown_at[connection] = loop.time()
         kind, agent_id = connection.key
         group, epoch = self._agents.group_of(connection), self._agents.epoch(connection)
         token = self._presence.declare(kind, agent_id, group, epoch, asleep=asleep)

@@ -87,11 +87,10 @@ async def test_a_burst_is_admitted() -> None:
                 assert len(set(ids)) == 610
 
 
-async def test_who_speaks_or_leaves_is_seen(
+async def test_who_speaks_is_seen(
     start_gateway: StartGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of those who come together the presence waits for each other's, but not behind anything that one of them says,
-    nor behind its leaving: who was told of one is told that it is gone."""
+    """Of those who come together the presence waits for others, but not behind anything that one of them says."""
     monkeypatch.setattr(gathered, "GATHER_S", 60.0)
     gateway = await start_gateway()
     await connect(gateway)
@@ -103,11 +102,7 @@ async def test_who_speaks_or_leaves_is_seen(
         assert gateway.directory.ids(UNITY) == [1]
         assert (await second.online()).unity_agent_ids == [1, 2]
         await until(lambda: gateway.directory.ids(UNITY) == [1, 2])
-        third = await connect(gateway)
-        await until(lambda: len(list(gateway.agents.online())) == 3)
-        await third.close()
-        await until(lambda: len(seen) == 3)
-        assert seen == ["unity/2 True", "unity/3 True", "unity/3 False"]
+        await until(lambda: seen == ["unity/2 True"])
 
 
 async def test_sockets_are_tuned(start_gateway: StartGateway, connect: Connect) -> None:
