@@ -16,7 +16,7 @@ class Churn:
     registered. Who makes many waits before the next is greeted, and others do not."""
 
     SOON_S = 2.0
-    FREE = 500
+    FREE = 100
     PER_S = 50.0
     MOST_S = 3.0
     """An existing headset waits for its greeting no longer than 5."""

@@ -261,6 +261,20 @@ def many_that_leave_together(target: Target) -> None:
 
 
 @attack(2, "headset")
+def listeners_that_vanish(target: Target) -> None:
+    """Two hundred headsets that register a topic at the robot and end, again and again."""
+
+    def make() -> Agent:
+        agent = Agent(target.port)
+        agent.send(registration("nd__odom", "/odom", "nav_msgs/Odometry", me=agent.id))
+        return agent
+
+    while target.running():
+        for agent in crowd(target, 200, make):
+            agent.close(reset=True)
+
+
+@attack(2, "headset")
 def coming_and_going(target: Target) -> None:
     """Connections at full rate that end at once: properly, with a reset, half closed."""
     number = 0
