@@ -71,8 +71,8 @@ class Sleepers:
         """Who is awake and not yet seen so."""
         self._naps: dict[Connection, int] = {}
         """How often who has slept has."""
-        self._shown_at: dict[Connection, float] = {}
-        """Since when who has slept is seen as it is."""
+        self._seen: dict[Connection, tuple[int, float]] = {}
+        """Of who has slept: which of its naps others know of, and since when they see it as they do."""
         self._seen_late = Turnstile(self._show_late)
         self._closed = False
 
@@ -102,7 +102,7 @@ class Sleepers:
         self._sessions.close(connection)
         self._up(connection)
         self._naps.pop(connection, None)
-        self._shown_at.pop(connection, None)
+        self._seen.pop(connection, None)
         if (showing := self._showing.pop(connection, None)) is not None:
             showing.cancel()
 
@@ -175,19 +175,26 @@ class Sleepers:
         self._seen_late.put(connection, first=connection.is_needed)
 
     def _show_late(self, connection: Connection) -> None:
-        """What is so by now. In no moment it seems to be gone, and no longer than that it is seen as before."""
-        asleep = self._naps.get(connection, 0) if connection in self._timers else 0
+        """What is so by now. In no moment it seems to be gone, and no longer than that it is seen as before. Who was
+        moving something and is back before it was its turn is seen asleep all the same: robots stop that."""
+        is_asleep, nap = connection in self._timers, self._naps.get(connection, 0)
+        seen_nap, seen_at = self._seen.get(connection, (0, 0.0))
+        asleep = nap if is_asleep or (connection.is_needed and nap != seen_nap) else 0
         if connection.seen_asleep == asleep or self._agents.presence(connection) is None:
             return
-        loop = asyncio.get_running_loop()
-        calm_at = self._shown_at.get(connection, 0.0) + CALM_S
-        if not asleep and loop.time() < calm_at:
-            if connection not in self._showing:
-                self._showing[connection] = loop.call_at(calm_at, self._show_soon, connection)
+        now = asyncio.get_running_loop().time()
+        if not asleep and now < seen_at + CALM_S:
+            self._show_at(connection, seen_at + CALM_S)
             return
         connection.seen_asleep = asleep
-        self._shown_at[connection] = loop.time()
+        self._seen[connection] = nap, now
         kind, agent_id = connection.key
         group, epoch = self._agents.group_of(connection), self._agents.epoch(connection)
         token = self._presence.declare(kind, agent_id, group, epoch, asleep=asleep)
         self._agents.replace_token(connection, token).close()
+        if asleep and not is_asleep:
+            self._show_at(connection, now + CALM_S)
+
+    def _show_at(self, connection: Connection, when: float) -> None:
+        if connection not in self._showing:
+            self._showing[connection] = asyncio.get_running_loop().call_at(when, self._show_soon, connection)

@@ -17,7 +17,8 @@ from typing import get_args
 import pytest
 
 import macs_zenoh
-from bridge.gateway import Gateway
+from bridge.gateway import Gateway, departures
+from bridge.gateway.sleepers import CALM_S
 from bridge.headset import frames
 from bridge.headset.client import Headset, Link
 from bridge.headset.nodes import Incoming
@@ -295,6 +296,32 @@ async def test_who_does_not_come_back_leaves(start_site: StartSite, robot: Robot
             assert robot.slept == ([True] if reconnect and not goodbye else [])
         assert len(site.gateway.agents) == 1
         assert site.gateway._sleepers.kept_bytes == 0
+
+
+async def test_who_was_moving_something_is_seen_asleep_even_if_it_is_back(
+    start_site: StartSite, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where many fall asleep it may be the turn of one when it is back already: robots stop what it was moving all the
+    same. Of one that only listens nobody needs to see that."""
+    monkeypatch.setattr(departures, "AT_ONCE", 0)
+    monkeypatch.setattr(departures, "MORE", 1)
+    monkeypatch.setattr(departures, "EVERY_S", 3600.0)
+    site = await start_site()
+    turnstile = site.gateway._sleepers._seen_late
+    async with site.headset("plain") as (listens, its_net), site.headset("plain") as (drives, net):
+        await drives.advertise("/cmd_vel", STRING, agents=[1])
+        await until(lambda: robot.asked)
+        await back(listens, its_net, "reset")
+        await back(drives, net, "reset")
+        assert robot.slept == []
+
+        def is_seen() -> bool:
+            turnstile._again()
+            return robot.slept == [True, False]
+
+        await until(is_seen)
+        await asyncio.sleep(2 * CALM_S)
+        assert is_seen()
 
 
 async def test_the_secret_alone_opens_nothing(start_site: StartSite, tmp_path: Path) -> None:
