@@ -46,6 +46,18 @@ def crowd(target: Target, count: int, make: Callable[[], Agent | None]) -> list[
     return here
 
 
+def vanish(
+    target: Target, count: int, make: Callable[[], Agent | None], *, there_s: float = 0.0, gone_s: float = 0.0
+) -> None:
+    """So many come, end at once after a while, and come again after another."""
+    while target.running():
+        agents = crowd(target, count, make)
+        target.rest(there_s)
+        for agent in agents:
+            agent.close(reset=True)
+        target.rest(gone_s)
+
+
 # -- work ------------------------------------------------------------------------------------------------------------
 
 
@@ -252,12 +264,7 @@ def every_slot(target: Target) -> None:
 @attack(2, "headset")
 def many_that_leave_together(target: Target) -> None:
     """As many configured headsets as come within a second, seen by others, that all end at once; and again."""
-    while target.running():
-        agents = crowd(target, 1000, lambda: Agent(target.port))
-        target.rest(2.0)
-        for agent in agents:
-            agent.close(reset=True)
-        target.rest(0.5)
+    vanish(target, 1000, lambda: Agent(target.port), there_s=2.0, gone_s=0.5)
 
 
 @attack(2, "headset")
@@ -269,9 +276,7 @@ def listeners_that_vanish(target: Target) -> None:
         agent.send(registration("nd__odom", "/odom", "nav_msgs/Odometry", me=agent.id))
         return agent
 
-    while target.running():
-        for agent in crowd(target, 200, make):
-            agent.close(reset=True)
+    vanish(target, 200, make)
 
 
 @attack(2, "headset")
@@ -521,12 +526,7 @@ def a_thousand_leave_at_once(target: Target) -> None:
         agent.send(registration("nd__cmd_vel", "/cmd_vel", "geometry_msgs/Twist", node_type=2, me=agent.id))
         return agent
 
-    while target.running():
-        agents = crowd(target, 1000, make)
-        target.rest(0.5)
-        for agent in agents:
-            agent.close(reset=True)
-        target.rest(0.5)
+    vanish(target, 1000, make, there_s=0.5, gone_s=0.5)
 
 
 @attack(3, "tcp robot")

@@ -8,7 +8,7 @@ import struct
 import threading
 from contextlib import suppress
 
-from tests.attack.floods import crowd
+from tests.attack.floods import vanish
 from tests.attack.raw import UNITY, Agent, frame, management, metadata, node_data, registration
 from tests.attack.table import Target, attack
 
@@ -75,9 +75,7 @@ def sleepers(target: Target) -> None:
         agent.drives()
         return agent
 
-    while target.running():
-        for agent in crowd(target, 200, make):
-            agent.close(reset=True)
+    vanish(target, 200, make)
 
 
 @attack(2, "headset")

@@ -165,12 +165,12 @@ async def started(
     settings.write_text(rules)
     joins = ("-e", endpoint) if router else ("--mode", "router", "-l", endpoint)
     words = ["--port", str(free_port()), "--web-port", str(web_port), *joins, *gateway]
-    routers = [await stack.enter_async_context(Program("router", "-l", endpoint))] if router else []
-    one = await stack.enter_async_context(Program("gateway", *words))
+    own = await stack.enter_async_context(Program("router", "-l", endpoint)) if router else None
+    started_gateway = await stack.enter_async_context(Program("gateway", *words))
     robot = ["--id", "1", "--settings", str(settings), "-e", endpoint, *agent]
     return Site(
-        (routers or [one])[0],
-        one,
+        own or started_gateway,
+        started_gateway,
         await stack.enter_async_context(Program("agent", *robot, env=environment)),
         await stack.enter_async_context(Process(sys.executable, "-m", "bridge.cli.demo_robot", env=environment)),
         web_port,
